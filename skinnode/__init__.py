@@ -1,0 +1,66 @@
+"""skinnode: robot skin on a CAN bus. ``import skinnode as sk`` and use the names below.
+
+Names are loaded on first use, so that importing the package, and every ``--help``, stays fast.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from skinnode.host import Host
+    from skinnode.model.forward import jacobian, resistance_ohm
+    from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, SolveStats
+    from skinnode.model.layout import PatchLayout
+    from skinnode.model.status import Status
+    from skinnode.solve.homotopy import Uniform, solve_path
+    from skinnode.solve.system import solve_system
+    from skinnode.solve.tracker import Tracker
+
+_HOME = {
+    "Host": "skinnode.host",
+    "PatchLayout": "skinnode.model.layout",
+    "resistance_ohm": "skinnode.model.forward",
+    "jacobian": "skinnode.model.forward",
+    "FieldFrame": "skinnode.model.frames",
+    "ResistanceFrame": "skinnode.model.frames",
+    "ScanStamp": "skinnode.model.frames",
+    "SolveStats": "skinnode.model.frames",
+    "Status": "skinnode.model.status",
+    "Uniform": "skinnode.solve.homotopy",
+    "solve_path": "skinnode.solve.homotopy",
+    "solve_system": "skinnode.solve.system",
+    "Tracker": "skinnode.solve.tracker",
+}
+
+__all__ = [
+    "FieldFrame",
+    "Host",
+    "PatchLayout",
+    "ResistanceFrame",
+    "ScanStamp",
+    "SolveStats",
+    "Status",
+    "Tracker",
+    "Uniform",
+    "__version__",
+    "jacobian",
+    "resistance_ohm",
+    "solve_path",
+    "solve_system",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'skinnode' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

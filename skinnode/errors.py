@@ -1,0 +1,88 @@
+"""Every exception this project raises.
+
+::
+
+    SkinError
+     ├ ConfigError(ValueError)     which key, what it got, what is allowed
+     │  ├ ProfileError             an EDS that contradicts itself or the profile
+     │  └ BusLoadError             bus load needed against available
+     ├ BusError                    a CAN interface that does not open, send or receive
+     │  └ NodeError                one node misbehaves
+     │     ├ NodeTimeout(TimeoutError)
+     │     └ SdoAbort              code and text of CiA 301
+     ├ CodecError(ValueError)      a payload that is not what its COB-ID promises
+     └ SolveError                  only where the caller asked to raise
+
+A lost chunk, a stale patch or a solve that did not converge are normal life: they are statuses and
+counters, never exceptions. Arguments of the wrong shape are plain ``ValueError``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class SkinError(Exception):
+    """Root of all errors of this project. ``str(error)`` is one line fit for a technician."""
+
+
+class ConfigError(SkinError, ValueError):
+    """A configuration value that cannot be used.
+
+    ``key`` is the dotted path of the value (``patches[1].node_id``), ``got`` what was found there and
+    ``allowed`` a phrase that says what would have been accepted.
+    """
+
+    def __init__(self, key: str, got: object, allowed: str, *, where: str = "") -> None:
+        self.key, self.got, self.allowed, self.where = key, got, allowed, where
+        prefix = f"{where}: " if where else ""
+        super().__init__(f"{prefix}{key}: got {got!r}, allowed: {allowed}")
+
+
+class ProfileError(ConfigError):
+    """An EDS that contradicts itself or the patch profile."""
+
+
+class BusLoadError(ConfigError):
+    """A plan that needs more of the bus than it may use."""
+
+
+class BusError(SkinError):
+    """A CAN interface that does not open, send or receive. Raised ``from`` the library's own error."""
+
+
+class NodeError(BusError):
+    """One node does not do what it should."""
+
+    def __init__(self, node_id: int, message: str) -> None:
+        self.node_id = node_id
+        super().__init__(f"node {node_id}: {message}")
+
+
+class NodeTimeout(NodeError, TimeoutError):
+    """A node did not answer in time."""
+
+
+class SdoAbort(NodeError):
+    """An SDO transfer was aborted; ``code`` is the abort code of CiA 301 table 22."""
+
+    def __init__(self, node_id: int, code: int, text: str) -> None:
+        self.code = code
+        super().__init__(node_id, f"SDO abort 0x{code:08X}: {text}")
+
+
+class CodecError(SkinError, ValueError):
+    """A payload that cannot be decoded. Carries ``cob_id`` and the bytes."""
+
+    def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
+        self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed
+        shown = self.data.hex(" ") or "nothing"
+        super().__init__(f"COB-ID 0x{cob_id:03X}: got {len(self.data)} bytes ({shown}), allowed: {allowed}")
+
+
+class SolveError(SkinError):
+    """A solve that did not converge, where the caller asked for an exception. Carries the result."""
+
+    def __init__(self, message: str, result: Any) -> None:
+        self.result = result
+        super().__init__(message)

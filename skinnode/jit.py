@@ -1,0 +1,75 @@
+"""The one way kernels are compiled here: ``@njit`` with a cache that cannot go stale.
+
+Numba's file cache notices an edit to the file of a function, not to the functions it calls in other
+files. So the cache lives in a folder named after a digest of every file that holds kernels: an edit to any
+of them compiles all of them anew. The folder is below ``$SKINNODE_CACHE_DIR``, else the user's cache
+folder, else the system's temporary folder, whichever can be written first; with none, nothing is cached.
+
+``error_model="numpy"`` because a division by zero must become inf (a status), not an exception; ``nogil``
+because patches are solved side by side on a thread pool. ``fastmath`` stays off: results must not depend on
+how a compiler reorders sums.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+_KERNEL_FILES = ("jit.py", "model/kernels.py", "solve/*.py")
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if folder.stat().st_uid != os.getuid():  # a shared temporary folder must not feed us code
+            return False
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+@functools.cache
+def cache_dir() -> Path | None:
+    """Folder of the compiled kernels, or None where no folder can be written."""
+    package = Path(__file__).parent
+    digest = hashlib.sha256(numba.__version__.encode())
+    for pattern in _KERNEL_FILES:
+        for file in sorted(package.glob(pattern)):
+            digest.update(file.read_bytes())
+    leaf = f"numba-{digest.hexdigest()[:16]}"
+    roots = [os.environ.get("SKINNODE_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME")]
+    candidates = [Path(root) / "skinnode" / leaf for root in roots if root]
+    try:
+        candidates.append(Path.home() / ".cache" / "skinnode" / leaf)
+    except RuntimeError:  # no home directory
+        pass
+    candidates.append(Path(tempfile.gettempdir()) / f"skinnode-{os.getuid()}" / leaf)
+    return next((folder for folder in candidates if _writable(folder)), None)
+
+
+def is_cold() -> bool:
+    """True when the kernels still have to be compiled, so that a command can say why it takes its time."""
+    folder = cache_dir()
+    return folder is None or not any(folder.rglob("*.nbc"))
+
+
+def njit(function: _F) -> _F:
+    """Compile ``function`` on its first call; the compiled code is kept in :func:`cache_dir`."""
+    folder = cache_dir()
+    kept = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder or "")
+    try:  # the cache folder is read here, at decoration; other users of numba keep theirs
+        options = {"cache": folder is not None, "nogil": True, "error_model": "numpy"}
+        compiled: _F = numba.njit(**options)(function)
+    finally:
+        numba.config.CACHE_DIR = kept
+    return compiled

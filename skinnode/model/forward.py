@@ -1,0 +1,48 @@
+"""Forward model of a patch: electrode positions to wire-to-wire resistances (NumPy reference).
+
+The rubber between two electrodes is a resistor ρ d; the N·M paths between an upper and a lower wire are in
+parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F is the potential of the
+lower wire's M unit charges summed over the N electrodes of the upper wire, and
+∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
+
+These functions say what the compiled twins in ``kernels`` must compute; they are written for reading.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skinnode.model.layout import Float, PatchLayout, require_array
+
+
+def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
+    """x_i − x̄_jk for every pair of electrodes, (U, K, M, N, 3)."""
+    upper = require_array("upper_m", upper_m, layout.upper_m.shape)
+    return upper[:, None, None, :, :] - layout.lower_m[None, :, :, None, :]
+
+
+def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
+    """F, (U, K) in 1/m. Inf where two electrodes coincide."""
+    distance = np.linalg.norm(_offsets(layout, upper_m), axis=-1)
+    with np.errstate(divide="ignore"):
+        return np.asarray((1.0 / distance).sum(axis=(2, 3)))
+
+
+def resistance_ohm(layout: PatchLayout, upper_m: ArrayLike) -> Float:
+    """Wire-to-wire resistances R = ρ / F, (U, K) in ohm, for electrodes at ``upper_m`` (U, N, 3) in metres.
+
+    Raises ValueError for an array of the wrong shape or with NaN.
+    """
+    return layout.resistivity_ohm_per_m / potential_per_m(layout, upper_m)
+
+
+def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
+    """∂F/∂x, (U, K, N, 3) in 1/m², of F = ρ / R for electrodes at ``upper_m`` (U, N, 3) in metres.
+
+    Raises ValueError for an array of the wrong shape or with NaN.
+    """
+    offset = _offsets(layout, upper_m)
+    distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(-(offset / distance**3).sum(axis=2))

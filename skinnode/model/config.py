@@ -116,7 +116,7 @@ class PatchConfig(_Table):
     )
     """Serial number the node must have (0x1018:4); None takes any."""
     relative_noise: _Ratio = 3e-6
-    """Standard deviation of the analogue noise of a resistance, relative; quantisation is added by the host."""
+    """Standard deviation of the analogue noise of a resistance, relative, without quantisation."""
 
     @field_validator("eds")
     @classmethod
@@ -240,11 +240,9 @@ class HandConfig(_Table):
             if patch.bus not in names:
                 raise ConfigError(f"patches[{i}].bus", patch.bus, f"a bus of this file: {', '.join(names)}")
             if patch.frames_per_scan > 257:  # the chunk index is a byte
-                raise ConfigError(
-                    f"patches[{i}].layout",
-                    patch.layout.n_codes,
-                    f"at most {256 * (3 if patch.code_bits == 16 else 2)} wire pairs at {patch.code_bits} bits",
-                )
+                most = 256 * (3 if patch.code_bits == 16 else 2)
+                allowed = f"at most {most} wire pairs at {patch.code_bits} bits"
+                raise ConfigError(f"patches[{i}].layout", patch.layout.n_codes, allowed)
             try:
                 patch.layout.build()
             except ValueError as error:
@@ -387,7 +385,7 @@ def _marks_in(annotation: Any) -> list[str]:
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
-    """tomllib says the place at the end of its message: ``… (at line 3, column 5)`` or ``(at end of document)``."""
+    """tomllib ends its message with the place: ``(at line 3, column 5)`` or ``(at end of document)``."""
     match = re.fullmatch(r"(?P<what>.*) \(at (?P<place>.*)\)", message, flags=re.DOTALL)
     what, place = (match["what"], match["place"]) if match else (message, "somewhere")
     line = re.match(r"line (\d+)", place)

@@ -12,6 +12,7 @@ how a compiler reorders sums.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -48,10 +49,8 @@ def cache_dir() -> Path | None:
     leaf = f"numba-{digest.hexdigest()[:16]}"
     roots = [os.environ.get("SKINNODE_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME")]
     candidates = [Path(root) / "skinnode" / leaf for root in roots if root]
-    try:
+    with contextlib.suppress(RuntimeError):  # there may be no home directory
         candidates.append(Path.home() / ".cache" / "skinnode" / leaf)
-    except RuntimeError:  # no home directory
-        pass
     candidates.append(Path(tempfile.gettempdir()) / f"skinnode-{os.getuid()}" / leaf)
     return next((folder for folder in candidates if _writable(folder)), None)
 

@@ -69,7 +69,9 @@ class PatchLayout:
         upper = require_array("upper_m", self.upper_m, ("U", "N", 3)).copy()
         lower = require_array("lower_m", self.lower_m, ("K", "M", 3)).copy()
         if not (math.isfinite(self.resistivity_ohm_per_m) and self.resistivity_ohm_per_m > 0):
-            raise ValueError(f"resistivity_ohm_per_m: got {self.resistivity_ohm_per_m}, must be positive and finite")
+            raise ValueError(
+                f"resistivity_ohm_per_m: got {self.resistivity_ohm_per_m}, must be positive and finite"
+            )
         gaps = upper.reshape(-1, 1, 3) - lower.reshape(1, -1, 3)
         closest = float(np.sqrt(np.min(np.einsum("abi,abi->ab", gaps, gaps))))
         if closest < _HASH_RESOLUTION_M:
@@ -96,8 +98,8 @@ class PatchLayout:
         """A named flat layout. ``lower_wires`` defaults to 3 per electrode of an upper wire (square systems),
         ``lower_electrodes`` to one per upper wire.
 
-        ``aligned``    straight wires along y, x over the patch, electrodes a quarter pitch off the upper wires:
-                       the plain reading of the paper's figure
+        ``aligned``    straight wires along y, x over the patch, electrodes a quarter pitch off the upper
+                       wires: the plain reading of the paper's figure
         ``symmetric``  as ``aligned`` without the quarter pitch; its Jacobian is close to singular
         ``staggered``  half a pitch wider than the patch, electrode pitch 1.2, wires shifted in y by
                        0.43 (k mod 3 − 1) pitches: measured to be up to a thousand times better conditioned
@@ -161,7 +163,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and all coordinates in nanometres: object 0x2000 of the node, checked by the host."""
+        """CRC-32 of the sizes and all coordinates in nanometres: in object 0x2000, checked by the host."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

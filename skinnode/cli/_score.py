@@ -1,0 +1,129 @@
+"""Holds decoded fields against the truth: error, reported uncertainty, and what the codes allow.
+
+The bound is the Cramér-Rao bound of one scan: with S the deviations of the relative residuals F/b − 1 and J
+their Jacobian at the true position, no unbiased estimate of a wire's electrodes has a covariance below
+J⁻¹ S Sᵀ J⁻ᵀ. It is computed here from the NumPy reference model, independently of the solver.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from skinnode.model.forward import jacobian, potential_per_m
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float, PatchLayout
+
+OUTLIER_DEVIATIONS = 6.0
+"""An error beyond this many reported deviations is a fault. A run scores some 1e5 coordinates, of which a
+normal distribution puts 2e-4 beyond six deviations: one false alarm in 5,000 runs."""
+
+EXCESS_LIMIT = 1.15
+"""RMS error over RMS reported deviation that a run may reach; the accuracy line this project sets itself."""
+
+
+def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
+    """Cramér-Rao bound of every coordinate, (U, N, 3) in metres, for electrodes at ``upper_m`` and relative
+    deviations ``relative_std`` (U, K) of the resistances. Inf for a wire whose Jacobian is singular."""
+    potential = potential_per_m(layout, upper_m)
+    slopes = jacobian(layout, upper_m).reshape(*layout.shape, layout.unknowns)
+    bound = np.full((layout.shape[0], layout.unknowns), np.inf)
+    for wire, slope in enumerate(slopes):
+        whitened = slope / (potential[wire] * relative_std[wire])[:, None]
+        _, singular, right = np.linalg.svd(whitened, full_matrices=False)
+        if len(singular) == layout.unknowns and singular[-1] > 1e-14 * singular[0]:
+            bound[wire] = np.linalg.norm(right / singular[:, None], axis=0)
+    return bound.reshape(layout.upper_m.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """A patch's run in figures; lengths in metres, NaN without a scored scan."""
+
+    scans: int
+    untrusted: int
+    """Scans in which a wire did not converge; they count for nothing else here."""
+    deepest_m: float
+    """Largest true displacement of an electrode."""
+    error_rms_m: float
+    reported_rms_m: float
+    bound_rms_m: float
+    """What the codes alone allow on this layout (the converter's own noise not counted)."""
+    error_max_m: float
+    relative_error: float
+    """‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
+    coverage95: float
+    """Share of coordinates whose error is within 1.96 reported deviations."""
+    worst_deviations: float
+    """Largest error of a coordinate in reported deviations."""
+
+    @property
+    def within_uncertainty(self) -> bool:
+        """False when the error is above what was reported, over the run or anywhere by far."""
+        return (
+            self.scans > 0
+            and self.untrusted == 0
+            and self.error_rms_m <= EXCESS_LIMIT * self.reported_rms_m
+            and self.worst_deviations <= OUTLIER_DEVIATIONS
+        )
+
+
+@dataclass
+class Scorer:
+    """Accumulates one patch's run. ``code_std`` is the deviation of R / R0 that quantisation makes."""
+
+    layout: PatchLayout
+    code_std: float
+    bound_every: int = 10
+    """The bound changes slowly; it is computed for one scan in this many."""
+    _scans: int = 0
+    _untrusted: int = 0
+    _squares: float = 0.0
+    _variances: float = 0.0
+    _bounds: list[float] = field(default_factory=list)
+    _largest: float = 0.0
+    _covered: int = 0
+    _worst: float = 0.0
+    _deepest: tuple[float, float] = (0.0, float("nan"))
+
+    def add(self, frame: FieldFrame, true_upper_m: Float) -> float:
+        """Score one scan against the true positions (U, N, 3); returns its RMS error in metres."""
+        truth = true_upper_m - self.layout.upper_m
+        error = frame.displacement_m - truth
+        rms = float(np.sqrt(np.mean(error**2)))
+        if not frame.trusted:
+            self._untrusted += 1
+            return rms
+        std = frame.displacement_std_m
+        deviations = np.abs(error) / std
+        if self._scans % self.bound_every == 0:
+            at_rest = potential_per_m(self.layout, self.layout.upper_m)
+            relative = self.code_std * potential_per_m(self.layout, true_upper_m) / at_rest  # R0 / R = F / F0
+            self._bounds.append(float(np.mean(bound_std_m(self.layout, true_upper_m, relative) ** 2)))
+        self._scans += 1
+        self._squares += float(np.mean(error**2))
+        self._variances += float(np.mean(std**2))
+        self._covered += int((deviations <= 1.96).sum())
+        self._largest = max(self._largest, float(np.abs(error).max()))
+        self._worst = max(self._worst, float(deviations.max()))
+        depth = float(np.abs(truth).max())
+        if depth > self._deepest[0]:
+            self._deepest = depth, float(np.linalg.norm(error) / np.linalg.norm(truth))
+        return rms
+
+    def score(self) -> Score:
+        """The figures so far."""
+        count = self._scans or float("nan")
+        return Score(
+            scans=self._scans,
+            untrusted=self._untrusted,
+            deepest_m=self._deepest[0],
+            error_rms_m=float(np.sqrt(self._squares / count)),
+            reported_rms_m=float(np.sqrt(self._variances / count)),
+            bound_rms_m=float(np.sqrt(np.mean(self._bounds))) if self._bounds else float("nan"),
+            error_max_m=self._largest,
+            relative_error=self._deepest[1],
+            coverage95=self._covered / (count * self.layout.upper_m.size),
+            worst_deviations=self._worst,
+        )

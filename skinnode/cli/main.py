@@ -1,0 +1,60 @@
+"""The ``skinnode`` command: names the subcommands, turns errors into one line and an exit status.
+
+Exit status: 0 fine, 1 a fault was found, 2 could not run (bad input, no bus, no node). One file a subcommand;
+each imports what it needs when it runs, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Annotated
+
+import typer
+
+from skinnode.cli import bench, demo, eds, host
+from skinnode.errors import SkinError
+
+app = typer.Typer(
+    name="skinnode",
+    help="Robot skin on a CAN bus: pressed patches in, displacement fields out.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command(name="demo")(demo.demo)
+app.command(name="host")(host.host)
+app.command(name="eds")(eds.eds)
+app.add_typer(bench.app, name="bench")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from skinnode import __version__
+
+        typer.echo(f"skinnode {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def run(command: Callable[[Sequence[str] | None], object], argv: Sequence[str] | None = None) -> None:
+    """Run ``command``; an error of ours or of an argument ends as one line on stderr and status 2."""
+    try:
+        command(argv)
+    except (SkinError, ValueError, OSError) as error:
+        line = " ".join(str(error).split())
+        print(f"error: {line}", file=sys.stderr)
+        sys.exit(2)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    run(lambda arguments: app(args=arguments), argv)

@@ -1,0 +1,94 @@
+"""An object dictionary as plain data: what a CANopen device offers, before anything holds values.
+
+Numbers and words are those of CiA 301 (object codes, data types) and CiA 306 (access types).
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+Value = int | float | str
+
+
+class ObjectType(enum.IntEnum):
+    """Object codes of CiA 301."""
+
+    DOMAIN = 0x02
+    VAR = 0x07
+    ARRAY = 0x08
+    RECORD = 0x09
+
+
+class DataType(enum.IntEnum):
+    """Indices of the static data types used here."""
+
+    UNSIGNED8 = 0x05
+    UNSIGNED16 = 0x06
+    UNSIGNED32 = 0x07
+    REAL32 = 0x08
+    VISIBLE_STRING = 0x09
+    DOMAIN = 0x0F
+    UNSIGNED24 = 0x16
+
+    @property
+    def bits(self) -> int:
+        """Length of a value; 0 where it varies."""
+        return _BITS[self]
+
+
+_BITS = {
+    DataType.UNSIGNED8: 8,
+    DataType.UNSIGNED16: 16,
+    DataType.UNSIGNED32: 32,
+    DataType.REAL32: 32,
+    DataType.VISIBLE_STRING: 0,
+    DataType.DOMAIN: 0,
+    DataType.UNSIGNED24: 24,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One value: an index and a sub-index."""
+
+    index: int
+    subindex: int
+    name: str
+    data_type: DataType
+    access: str
+    """ro, rw, wo, const, or rww: read and written, and mappable into an RPDO."""
+    default: Value | None = None
+    """None where only the device knows (a serial number)."""
+    plus_node_id: bool = False
+    """The value at start-up is ``default`` plus the node-ID: COB-IDs."""
+    mappable: bool = False
+    low: int | None = None
+    high: int | None = None
+
+    @property
+    def mapping(self) -> int:
+        """The entry as PDO mapping parameters name it: index, sub-index, length in bits."""
+        return self.index << 16 | self.subindex << 8 | self.data_type.bits
+
+    def value_at_start(self, node_id: int) -> Value | None:
+        """``default`` on the node ``node_id``."""
+        if self.plus_node_id and isinstance(self.default, int):
+            return self.default + node_id
+        return self.default
+
+
+@dataclass(frozen=True, slots=True)
+class Object:
+    """One index with all its entries, by ascending sub-index; VAR and DOMAIN have the single sub-index 0."""
+
+    index: int
+    name: str
+    type: ObjectType
+    entries: tuple[Entry, ...]
+
+    def __getitem__(self, subindex: int) -> Entry:
+        for entry in self.entries:
+            if entry.subindex == subindex:
+                return entry
+        raise KeyError(f"0x{self.index:04X} has no sub-index {subindex}")

@@ -1,0 +1,255 @@
+"""Rubber as an elastic half-space: loads on its surface to displacements of its surface.
+
+The body fills z < 0, its surface is z = 0, z points out of it as everywhere in this project; a press is a
+load with a negative z component. With d = (x, y) from load to point, r = |d|, shear modulus G and Poisson's
+ratio ν, a unit point load displaces the surface by (Boussinesq 1885, Cerruti 1882; Johnson, Contact
+Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, turned into our axes)
+
+    ⎡ u_x ⎤      1   ⎡ (1−ν)/r + ν x²/r³    ν x y/r³              (½−ν) x/r² ⎤ ⎡ f_x ⎤
+    ⎢ u_y ⎥  =  ───  ⎢ ν x y/r³             (1−ν)/r + ν y²/r³     (½−ν) y/r² ⎥ ⎢ f_y ⎥
+    ⎣ u_z ⎦     2πG  ⎣ −(½−ν) x/r²          −(½−ν) y/r²           (1−ν)/r    ⎦ ⎣ f_z ⎦
+
+Everything here is that matrix: at a point (:func:`point_compliance`), integrated over a rectangle of uniform
+traction (:func:`rectangle_compliance`) or over the pressure below a sphere (:class:`HertzContact`).
+
+What the model leaves out: a finite thickness of the rubber (a bonded layer pushes back sooner and its
+displacement decays faster than 1/r), large strain and curvature of the skin.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skinnode.model.layout import Float, require_array
+
+
+@dataclass(frozen=True, slots=True)
+class Rubber:
+    """A linear elastic, isotropic material.
+
+    Args:
+        young_pa: Young's modulus. The default is that of a soft silicone of about 20 Shore A.
+        poisson: Poisson's ratio. Rubber keeps its volume, so the default is 0.5; then normal and tangential
+            loads do not couple on the surface and Hertz's theory is exact under friction as well.
+
+    Raises ValueError for a modulus that is not positive and a ratio outside 0 … 0.5.
+    """
+
+    young_pa: float = 0.7e6
+    poisson: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.young_pa) and self.young_pa > 0):
+            raise ValueError(f"young_pa: got {self.young_pa}, must be positive and finite")
+        if not 0 <= self.poisson <= 0.5:
+            raise ValueError(f"poisson: got {self.poisson}, must be from 0 to 0.5")
+
+    @property
+    def shear_modulus_pa(self) -> float:
+        """G = E / 2(1 + ν)."""
+        return self.young_pa / (2 * (1 + self.poisson))
+
+    @property
+    def contact_modulus_pa(self) -> float:
+        """E* = E / (1 − ν²), of the rubber against something rigid (Johnson eq. 4.17)."""
+        return self.young_pa / (1 - self.poisson**2)
+
+
+def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float = 0.0) -> Float:
+    """Displacement of surface points per unit point load, m/N.
+
+    Args:
+        offset_m: (P, 2) from the load to each point, metres.
+        softening_m: ε in r → √(r² + ε²); spreads the load over a spot of about that radius, so that the
+            displacement stays finite at the load. 0 is the point load itself.
+
+    Returns (P, 3, 3), last axis: component of the load, the axis before: component of the displacement. Inf
+    and NaN at the load itself where nothing softens it.
+    Raises ValueError for an array of the wrong shape or with NaN, and a negative softening.
+    """
+    offset = require_array("offset_m", offset_m, ("P", 2))
+    if not (math.isfinite(softening_m) and softening_m >= 0):
+        raise ValueError(f"softening_m: got {softening_m}, must be finite and at least 0")
+    x, y = offset.T
+    r2 = x * x + y * y + softening_m**2
+    r = np.sqrt(r2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r3 = r2 * r
+        return _compliance(rubber, 1 / r, x * x / r3, y * y / r3, x * y / r3, x / r2, y / r2)
+
+
+def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
+    """Displacement of surface points per unit traction on a rectangle, m/Pa. Finite everywhere.
+
+    The closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the normal part;
+    Johnson eq. 3.25): each kernel of the module's matrix has an elementary antiderivative in x and y, taken
+    between the corners.
+
+    Args:
+        offset_m: (P, 2) from the centre of the rectangle to each point, metres.
+        size_m: lengths of the rectangle in x and y, metres.
+
+    Returns (P, 3, 3), axes as in :func:`point_compliance`.
+    Raises ValueError for an array of the wrong shape or with NaN, and lengths that are not positive.
+    """
+    offset = require_array("offset_m", offset_m, ("P", 2))
+    if not all(math.isfinite(length) and length > 0 for length in size_m):
+        raise ValueError(f"size_m: got {size_m}, must be positive and finite")
+    total = np.zeros((5, offset.shape[0]))
+    for sign_x in (1, -1):
+        for sign_y in (1, -1):
+            x = offset[:, 0] + sign_x * 0.5 * size_m[0]
+            y = offset[:, 1] + sign_y * 0.5 * size_m[1]
+            total += sign_x * sign_y * _antiderivatives(x, y)
+    return _compliance(rubber, total[0] + total[1], *total)
+
+
+def _antiderivatives(x: Float, y: Float) -> Float:
+    """Functions whose mixed derivative ∂²/∂x∂y is x²/r³, y²/r³, xy/r³, x/r² and y/r²: (5, P)."""
+    r = np.hypot(x, y)
+    ax, ay = np.abs(x), np.abs(y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # asinh(x/|y|) is ln(x + r) − ln|y|; the second term drops out between the corners, and without it
+        # nothing cancels
+        xx = np.where(ay > 0, y * np.arcsinh(x / ay), 0.0)
+        yy = np.where(ax > 0, x * np.arcsinh(y / ax), 0.0)
+        log_r = np.where(r > 0, np.log(r), 0.0)
+        angle = np.arctan(y / x)
+        x_r2 = y * log_r + np.where(ax > 0, x * angle, 0.0)
+        y_r2 = x * log_r + np.where(ay > 0, y * np.arctan(x / y), 0.0)
+    return np.stack([xx, yy, -r, x_r2, y_r2])
+
+
+def _compliance(
+    rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
+) -> Float:
+    """The matrix of the module's docstring from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
+    nu = rubber.poisson
+    matrix = np.empty((*inverse.shape, 3, 3))
+    matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx
+    matrix[..., 1, 1] = (1 - nu) * inverse + nu * yy
+    matrix[..., 2, 2] = (1 - nu) * inverse
+    matrix[..., 0, 1] = matrix[..., 1, 0] = nu * xy
+    matrix[..., 0, 2] = (0.5 - nu) * x_r2
+    matrix[..., 1, 2] = (0.5 - nu) * y_r2
+    matrix[..., 2, 0] = -matrix[..., 0, 2]
+    matrix[..., 2, 1] = -matrix[..., 1, 2]
+    matrix /= 2 * math.pi * rubber.shear_modulus_pa
+    return matrix
+
+
+@dataclass(frozen=True)
+class HertzContact:
+    """A rigid sphere pressed into the rubber and dragged over it: Hertz's pressure, full sliding friction.
+
+    The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. Its
+    surface displacement is a closed form everywhere: p is symmetric, so all of the matrix's integrals follow
+    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P = load within r. That the shear
+    leaves the pressure alone is exact for incompressible rubber and an approximation below (Johnson 7.1).
+
+    Args:
+        radius_m: of the sphere.
+        indentation_m: approach δ of the sphere, which is the normal displacement at the centre of a contact
+            without shear (with ν = 0.5: of any). 0 is no contact.
+        center_m: (x, y) of the contact circle.
+        traction_ratio: (t_x, t_y) shear the rubber feels as a share of the pressure; the coefficient of
+            friction along the direction in which the sphere slides.
+
+    Raises ValueError for values that are not finite, a radius that is not positive, a negative indentation.
+    """
+
+    rubber: Rubber
+    radius_m: float
+    indentation_m: float
+    center_m: tuple[float, float] = (0.0, 0.0)
+    traction_ratio: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.radius_m) and self.radius_m > 0):
+            raise ValueError(f"radius_m: got {self.radius_m}, must be positive and finite")
+        if not (math.isfinite(self.indentation_m) and self.indentation_m >= 0):
+            raise ValueError(f"indentation_m: got {self.indentation_m}, must be finite and at least 0")
+        for name, pair in (("center_m", self.center_m), ("traction_ratio", self.traction_ratio)):
+            if len(pair) != 2 or not all(map(math.isfinite, pair)):
+                raise ValueError(f"{name}: got {pair}, must be two finite numbers")
+
+    @property
+    def contact_radius_m(self) -> float:
+        """a = √(R δ) (Johnson eq. 4.23)."""
+        return math.sqrt(self.radius_m * self.indentation_m)
+
+    @property
+    def peak_pressure_pa(self) -> float:
+        """p₀ = 2 E* a / πR (Johnson eqs. 4.22 and 4.24)."""
+        return 2 * self.rubber.contact_modulus_pa * self.contact_radius_m / (math.pi * self.radius_m)
+
+    @functools.cached_property
+    def force_n(self) -> tuple[float, float, float]:
+        """Total load on the rubber; its normal part is −4/3 E* √R δ^{3/2}."""
+        normal = 2 / 3 * math.pi * self.peak_pressure_pa * self.contact_radius_m**2
+        return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
+
+    def traction_pa(self, points_m: ArrayLike) -> Float:
+        """(P, 3) load per area on the rubber at the surface points (P, 2). Zero outside the contact."""
+        offset = require_array("points_m", points_m, ("P", 2)) - self.center_m
+        a = self.contact_radius_m
+        if a == 0:
+            return np.zeros((offset.shape[0], 3))
+        inside = np.clip(1 - np.einsum("pi,pi->p", offset, offset) / (a * a), 0, None)
+        pressure = self.peak_pressure_pa * np.sqrt(inside)
+        return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
+
+    def displacement_m(self, points_m: ArrayLike) -> Float:
+        """(P, 3) displacement of the surface points (P, 2); exactly zero where there is no contact.
+
+        Raises ValueError for an array of the wrong shape or with NaN.
+        """
+        offset = require_array("points_m", points_m, ("P", 2)) - self.center_m
+        if self.indentation_m == 0:
+            return np.zeros((offset.shape[0], 3))
+        # ∫ p/|d| = phi, ∫ p d/|d|² = enclosed d, ∫ p d dᵀ/|d|³ = isotropic I + radial d dᵀ
+        phi, isotropic, radial, enclosed = _hertz_integrals(
+            offset, self.contact_radius_m, self.peak_pressure_pa
+        )
+        nu, shear = self.rubber.poisson, np.array(self.traction_ratio)
+        along = offset @ shear
+        moved = np.empty((offset.shape[0], 3))
+        moved[:, :2] = ((1 - nu) * phi + nu * isotropic)[:, None] * shear
+        moved[:, :2] += (nu * radial * along - (0.5 - nu) * enclosed)[:, None] * offset
+        moved[:, 2] = -(1 - nu) * phi - (0.5 - nu) * enclosed * along
+        moved /= 2 * math.pi * self.rubber.shear_modulus_pa
+        return moved
+
+
+def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float, Float, Float]:
+    """Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of p = peak √(1 − r²/a²).
+
+    χ = ∫ p |d| has the Laplacian Φ, so its gradient is d S with S = ∫₀ʳ Φ s ds / r², its second derivatives
+    are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a flat charge, by
+    Gauss's law in the plane d P/r².
+    """
+    r2 = np.einsum("pi,pi->p", offset, offset)
+    near = r2 <= a * a
+    c = math.pi**2 * peak / (4 * a)
+    s2 = np.minimum(r2, a * a) / (a * a)
+    phi = c * a * a * (2 - s2)
+    isotropic = c * a * a * (1 - 0.75 * s2)
+    radial = np.full_like(r2, 0.5 * c)
+    # 1 − (1 − s²)^{3/2} over s², without the cancellation at the centre
+    root = np.sqrt(1 - s2)
+    enclosed = 2 / 3 * math.pi * peak * (1 + root + (1 - s2)) / (1 + root)
+    far = ~near
+    q2 = r2[far]
+    w = np.sqrt(q2 - a * a)
+    angle = np.arctan2(a, w)  # arcsin(a/r), without its loss of digits next to the edge
+    c = math.pi * peak / (2 * a)
+    outside = c * ((2 * a * a - q2) * angle + a * w)
+    mean = c * ((a * a - 0.25 * q2) * angle + (0.75 * a * a + 0.25 * w * w) * a * w / q2)
+    phi[far], isotropic[far], radial[far] = outside, outside - mean, (2 * mean - outside) / q2
+    enclosed[far] = 2 / 3 * math.pi * peak * a * a / q2
+    return phi, isotropic, radial, enclosed

@@ -1,0 +1,158 @@
+"""What happens on the skin: a sphere presses, slides and lifts, again and again, and the rubber follows.
+
+The displacement of the electrodes is the closed form of a sliding Hertz contact on a half-space
+(:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and owes nothing to a solver's
+discretisation. A scene is a pure function of scene time: it can be asked for any instant, in any order, and
+the same seed gives the same scene.
+
+The onset of sliding is simplified: shear grows in proportion to the pressure from none to full friction while
+the sphere gathers speed; a real contact slips from its rim inwards (Cattaneo, Mindlin).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.config import SimulationConfig
+from skinnode.model.elastic import HertzContact, Rubber
+from skinnode.model.layout import Float, PatchLayout
+
+LEAD_S: Final = 0.8
+"""Rest before the first press, so that a viewer, and a baseline, has something to start from."""
+
+PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
+"""Shares of a cycle; what is left is rest. In a cycle of 4 s a press takes 1.4 s."""
+
+_RAMP: Final = 0.2
+"""Share of a slide in which the sphere gathers, and at the end loses, its speed."""
+
+_GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times in s since first touch."""
+
+    radius_m: float
+    depth_m: float
+    friction: float
+    start_m: tuple[float, float]
+    heading: tuple[float, float]
+    slide_m: float
+    press_s: float
+    slide_s: float
+    lift_s: float
+
+    def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
+        """The contact at ``t_s``, None where the sphere does not touch."""
+        lifting = t_s - self.press_s - self.slide_s
+        depth = self.depth_m * _ease(t_s / self.press_s) * (1.0 - _ease(lifting / self.lift_s))
+        if depth <= 0.0:
+            return None
+        sliding = (t_s - self.press_s) / self.slide_s
+        way = self.slide_m * _glide(sliding)
+        shear = self.friction * _ease(sliding / _RAMP) if self.slide_m > 0.0 else 0.0
+        return HertzContact(
+            rubber,
+            self.radius_m,
+            depth,
+            (self.start_m[0] + way * self.heading[0], self.start_m[1] + way * self.heading[1]),
+            (shear * self.heading[0], shear * self.heading[1]),
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Strokes of a sphere over one patch.
+
+    Args:
+        layout: the patch at rest. Its electrodes lie on the surface of the rubber; a curved skin is treated
+            as the flat one below its x and y.
+        simulation: seed, sphere, depth, friction, speed and pace.
+        number: number of the patch in the hand. Each has strokes and a phase of its own.
+        rubber: what the skin is made of. Displacement does not depend on its Young's modulus, force does.
+    """
+
+    layout: PatchLayout
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
+    number: int = 0
+    rubber: Rubber = field(default_factory=Rubber)
+
+    @property
+    def lead_s(self) -> float:
+        """Scene time of the first touch. Patches differ by up to a quarter of a cycle."""
+        return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
+
+    def stroke(self, index: int) -> Stroke:
+        """The stroke that begins at ``lead_s + index * cycle_s``."""
+        options = self.simulation
+        random = np.random.default_rng([options.seed, self.number, index])
+        press_s, slide_s, lift_s = (share * options.cycle_s for share in (PRESS, SLIDE, LIFT))
+        low, high = self._field_m
+        angle = random.uniform(0.0, 2.0 * math.pi)
+        heading = np.array([math.cos(angle), math.sin(angle)])
+        with np.errstate(divide="ignore"):
+            room = float(np.min((high - low) / np.abs(heading)))
+        slide_m = min(options.slide_speed_m_per_s * (1.0 - _RAMP) * slide_s, room)
+        way = slide_m * heading
+        start = random.uniform(low - np.minimum(way, 0.0), high - np.maximum(way, 0.0))
+        return Stroke(
+            radius_m=options.indenter_radius_m,
+            depth_m=options.depth * self.layout.height_m,
+            friction=options.shear_ratio,
+            start_m=(float(start[0]), float(start[1])),
+            heading=(float(heading[0]), float(heading[1])),
+            slide_m=slide_m,
+            press_s=press_s,
+            slide_s=slide_s,
+            lift_s=lift_s,
+        )
+
+    def contacts(self, t_s: float) -> tuple[HertzContact, ...]:
+        """What touches the patch at scene time ``t_s``."""
+        index, since = divmod(t_s - self.lead_s, self.simulation.cycle_s)
+        if index < 0:
+            return ()
+        contact = self.stroke(int(index)).contact(self.rubber, since)
+        return () if contact is None else (contact,)
+
+    def upper_m(self, t_s: float) -> Float:
+        """(U, N, 3) electrodes at scene time ``t_s``, metres; exactly ``layout.upper_m`` out of contact."""
+        contacts = self.contacts(t_s)
+        if not contacts:
+            return self.layout.upper_m
+        moved = sum(contact.displacement_m(self._surface_m) for contact in contacts)
+        return np.asarray(self.layout.upper_m + np.reshape(moved, self.layout.upper_m.shape))
+
+    @functools.cached_property
+    def _surface_m(self) -> Float:
+        return np.ascontiguousarray(self.layout.upper_m[..., :2].reshape(-1, 2))
+
+    @functools.cached_property
+    def _field_m(self) -> tuple[Float, Float]:
+        """Corners of the rectangle the centre of the sphere keeps to: a pitch inside the outermost
+        electrodes, or their middle on a patch too small for that."""
+        low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
+        inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))
+        return low + inset, high - inset
+
+
+def _ease(share: float) -> float:
+    """0 to 1 with speed and acceleration zero at both ends: the path of least jerk (Flash and Hogan 1985)."""
+    s = min(max(share, 0.0), 1.0)
+    return s * s * s * (10.0 + s * (6.0 * s - 15.0))
+
+
+def _glide(share: float) -> float:
+    """0 to 1 at constant speed but for smooth ramps of ``_RAMP`` at both ends."""
+    s = min(max(share, 0.0), 1.0)
+    if s > 0.5:
+        return 1.0 - _glide(1.0 - s)
+    ramped = min(s / _RAMP, 1.0)
+    gained = _RAMP * ramped**3 * (1.0 - 0.5 * ramped)  # integral of the speed 3 s² − 2 s³
+    return (gained + max(s - _RAMP, 0.0)) / (1.0 - _RAMP)

@@ -343,24 +343,8 @@ def _communication_objects(profile: PatchProfile) -> tuple[Object, ...]:
             SDO_SERVER,
             "SDO server parameter",
             (
-                Entry(
-                    SDO_SERVER,
-                    1,
-                    "COB-ID client to server",
-                    _U32,
-                    "ro",
-                    sdo_request_cob_id(0),
-                    plus_node_id=True,
-                ),
-                Entry(
-                    SDO_SERVER,
-                    2,
-                    "COB-ID server to client",
-                    _U32,
-                    "ro",
-                    sdo_response_cob_id(0),
-                    plus_node_id=True,
-                ),
+                Entry(SDO_SERVER, 1, "COB-ID client to server", _U32, "ro", request, plus_node_id=True),
+                Entry(SDO_SERVER, 2, "COB-ID server to client", _U32, "ro", response, plus_node_id=True),
             ),
         ),
         _record(

@@ -1,0 +1,269 @@
+"""Ohm to code to PDO payload and back. Pure functions of numbers and bytes; all payloads are little-endian.
+
+code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements; the three above them are
+reserved, in ascending order: over-range, short, open.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skinnode.errors import CodecError, ConfigError
+from skinnode.model.layout import Float
+from skinnode.wire.profile import DEFAULT_CODE_HI, DEFAULT_CODE_LO, TARE_SIGNATURE, PatchProfile
+
+Codes = NDArray[np.uint32]
+
+MISSING: Final = 0xFFFF_FFFF
+"""Stands where no code was received. Wider than any code, so it is never on the wire and never decodes."""
+
+PDO_BYTES: Final = 8
+_CODE_BITS: Final = (16, 24)
+
+
+@dataclass(frozen=True)
+class CodeScale:
+    """How R/R0 maps to codes. ``lo`` and ``hi`` are rounded to REAL32, as the object dictionary keeps them.
+
+    Raises ConfigError for a width other than 16 and 24 bits, or a range that is not 0 ≤ lo < hi < ∞.
+    """
+
+    bits: int = 16
+    lo: float = DEFAULT_CODE_LO
+    hi: float = DEFAULT_CODE_HI
+
+    def __post_init__(self) -> None:
+        if self.bits not in _CODE_BITS:
+            raise ConfigError("code_bits", self.bits, "16 or 24")
+        lo, hi = float(np.float32(self.lo)), float(np.float32(self.hi))
+        if not 0.0 <= lo < hi < math.inf:
+            raise ConfigError("code range", (self.lo, self.hi), "0 <= lo < hi, both finite")
+        object.__setattr__(self, "lo", lo)
+        object.__setattr__(self, "hi", hi)
+
+    @functools.cached_property
+    def steps(self) -> int:
+        """The highest measurement, at ``hi``."""
+        return (1 << self.bits) - 4
+
+    @property
+    def over_range(self) -> int:
+        """Reserved: R/R0 outside lo … hi, or no baseline yet."""
+        return self.steps + 1
+
+    @property
+    def short(self) -> int:
+        """Reserved: no resistance between the wires."""
+        return self.steps + 2
+
+    @property
+    def open(self) -> int:
+        """Reserved: no connection between the wires."""
+        return self.steps + 3
+
+    @functools.cached_property
+    def step(self) -> float:
+        """One code as a share of R0."""
+        return (self.hi - self.lo) / self.steps
+
+    @property
+    def relative_std(self) -> float:
+        """RMS of the rounding error as a share of R0: a uniform error of one step, step / √12."""
+        return self.step / math.sqrt(12.0)
+
+
+def _baseline(baseline_ohm: ArrayLike) -> Float:
+    """R0 as both ends of the bus know it: REAL32."""
+    return np.asarray(baseline_ohm, dtype=np.float32).astype(np.float64)
+
+
+def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
+    """Codes of resistances, any shape; ``baseline_ohm`` (R0) of the same shape or broadcast to it.
+
+    +inf and NaN become open, zero and below short, R/R0 outside lo … hi over-range, and so does a measurement
+    without a baseline (R0 not positive and finite). A value within half a step of the range is in the range.
+    """
+    resistance = np.asarray(resistance_ohm, dtype=np.float64)
+    baseline = _baseline(baseline_ohm)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        code = np.rint((resistance / baseline - scale.lo) / scale.step)
+        measured = (code >= 0) & (code <= scale.steps) & (baseline > 0)
+        codes = np.where(measured, code, scale.over_range)
+        codes = np.where(resistance <= 0, scale.short, codes)
+        codes = np.where(resistance < np.inf, codes, scale.open)  # NaN is not below inf either
+    return codes.astype(np.uint32)
+
+
+def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple[Float, NDArray[np.bool_]]:
+    """Resistances in ohm and which of them are measurements, both of the shape of ``codes``.
+
+    A reserved code, :data:`MISSING` or a baseline that is not positive and finite gives NaN and False.
+    """
+    code = np.asarray(codes)
+    baseline = _baseline(baseline_ohm)
+    valid = (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
+    resistance = np.where(valid, (scale.lo + code * scale.step) * baseline, np.nan)
+    return resistance, valid
+
+
+# --- chunk (TPDO1)
+
+
+class Chunk(NamedTuple):
+    """A chunk of a scan as it is on the wire."""
+
+    index: int
+    scan: int
+    codes: tuple[int, ...]
+
+
+def pack_chunk(index: int, scan: int, codes: Sequence[int], bits: int = 16) -> bytes:
+    """Payload of TPDO1. ``codes``: up to 3 of 16 bits or 2 of 24; the rest is 0.
+
+    Raises ValueError for a number that does not fit its field.
+    """
+    width = bits // 8
+    try:
+        head = bytes((index, scan))
+        body = b"".join(int(code).to_bytes(width, "little") for code in codes)
+    except OverflowError:
+        raise ValueError(f"codes: got {list(codes)}, must be from 0 to {(1 << bits) - 1}") from None
+    if len(body) > PDO_BYTES - 2:
+        raise ValueError(f"codes: got {len(codes)} of {bits} bits, must be at most {6 // width}")
+    return head + body.ljust(PDO_BYTES - 2, b"\0")
+
+
+def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = 0x180) -> Chunk:
+    """The chunk in the payload of TPDO1. Raises CodecError (naming ``cob_id``) when it is not 8 bytes long."""
+    _require_length(data, PDO_BYTES, cob_id, "chunk")
+    width = bits // 8
+    codes = tuple(int.from_bytes(data[at : at + width], "little") for at in range(2, PDO_BYTES, width))
+    return Chunk(data[0], data[1], codes)
+
+
+def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]:
+    """Payloads of all chunks of a scan, by chunk index. ``codes``: (U, K); ``scan``: its u8 counter.
+
+    Raises ValueError for another shape or a code wider than the profile's.
+    """
+    array = np.asarray(codes, dtype=np.uint32)
+    if array.shape != (profile.rows, profile.columns):
+        raise ValueError(f"codes: got shape {array.shape}, must be ({profile.rows}, {profile.columns})")
+    if int(array.max()) >> profile.code_bits:
+        raise ValueError(f"codes: got {int(array.max())}, must be below {1 << profile.code_bits}")
+    width = profile.code_bits // 8
+    padded = np.zeros(profile.n_chunks * profile.codes_per_chunk, dtype="<u4")
+    padded[: profile.n_codes] = array.ravel()
+    frames = np.empty((profile.n_chunks, PDO_BYTES), dtype=np.uint8)
+    frames[:, 0] = np.arange(profile.n_chunks)
+    frames[:, 1] = scan
+    frames[:, 2:] = padded.view(np.uint8).reshape(-1, 4)[:, :width].reshape(profile.n_chunks, -1)
+    payload = frames.tobytes()
+    return [payload[at : at + PDO_BYTES] for at in range(0, len(payload), PDO_BYTES)]
+
+
+def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
+    """(U, K) codes from the payloads of all chunks of a scan in ascending order, one after the other."""
+    payload = np.frombuffer(frames, dtype=np.uint8).reshape(profile.n_chunks, PDO_BYTES)
+    width = profile.code_bits // 8
+    narrow = payload[:, 2:].reshape(-1, width)[: profile.n_codes]
+    wide = np.zeros((profile.n_codes, 4), dtype=np.uint8)
+    wide[:, :width] = narrow
+    codes: Codes = wide.view("<u4").reshape(profile.rows, profile.columns)
+    return codes
+
+
+# --- scan summary (TPDO2)
+
+
+class SummaryFlag(enum.IntFlag):
+    """Flags of a scan summary. Bits not named here are sent as 0 and ignored."""
+
+    CHANGED_ONLY = 0x01
+    """Only chunks that changed were sent: any other is as in the scan before."""
+    OVERRUN = 0x02
+    """The next SYNC came first: chunks were left out, and nothing is known about them."""
+    WIRE_FAULT = 0x04
+    """A wire is open or shorted: see 0x2030 and 0x2031."""
+    BASELINE_CHANGED = 0x08
+    """The codes of this scan are the first of a new baseline: read 0x2200 … again."""
+
+
+class Summary(NamedTuple):
+    """A scan summary as it is on the wire."""
+
+    scan: int
+    flags: int
+    chunks: int
+    """Chunks sent in this scan."""
+    device_time_us: int
+
+
+_SUMMARY: Final = struct.Struct("<BBHI")
+
+
+def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
+    """Payload of TPDO2. ``device_time_us`` wraps at 2³². Raises ValueError for a number that does not fit."""
+    try:
+        return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
+    except struct.error as error:
+        raise ValueError(f"summary: got scan {scan}, flags {flags}, chunks {chunks}: {error}") from None
+
+
+def unpack_summary(data: bytes, *, cob_id: int = 0x280) -> Summary:
+    """The summary in the payload of TPDO2. Raises CodecError (naming ``cob_id``) when it is not 8 bytes long."""
+    _require_length(data, PDO_BYTES, cob_id, "scan summary")
+    return Summary(*_SUMMARY.unpack(data))
+
+
+# --- command (RPDO1)
+
+
+class SendMode(enum.IntEnum):
+    """0x2020:1, which chunks of a scan are sent."""
+
+    FULL = 0
+    CHANGED = 1
+
+
+class Command(NamedTuple):
+    """A command as it is on the wire."""
+
+    tare: int
+    """:data:`~skinnode.wire.profile.TARE_SIGNATURE` to tare, anything else does nothing."""
+    single_scan: int
+    send_mode: int
+
+
+_COMMAND: Final = struct.Struct("<IBB")
+
+
+def pack_command(
+    *, tare: bool = False, single_scan: bool = False, send_mode: SendMode = SendMode.FULL
+) -> bytes:
+    """Payload of RPDO1. It always carries the send mode, which stays until told otherwise."""
+    return _COMMAND.pack(TARE_SIGNATURE if tare else 0, single_scan, send_mode)
+
+
+def unpack_command(data: bytes, *, cob_id: int = 0x200) -> Command:
+    """The command in the payload of RPDO1, of which bytes beyond the mapped six are ignored (CiA 301).
+
+    Raises CodecError (naming ``cob_id``) when it is shorter.
+    """
+    if len(data) < _COMMAND.size:
+        raise CodecError(cob_id, data, f"at least {_COMMAND.size} bytes (command)")
+    return Command(*_COMMAND.unpack_from(data))
+
+
+def _require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
+    if len(data) != length:
+        raise CodecError(cob_id, data, f"{length} bytes ({what})")

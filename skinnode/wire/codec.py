@@ -1,7 +1,7 @@
 """Ohm to code to PDO payload and back. Pure functions of numbers and bytes; all payloads are little-endian.
 
-code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements; the three above them are
-reserved, in ascending order: over-range, short, open.
+code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements; the three above them
+are reserved, in ascending order: over-range, short, open.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     baseline = _baseline(baseline_ohm)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         code = np.rint((resistance / baseline - scale.lo) / scale.step)
-        measured = (code >= 0) & (code <= scale.steps) & (baseline > 0)
+        measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
         codes = np.where(measured, code, scale.over_range)
         codes = np.where(resistance <= 0, scale.short, codes)
         codes = np.where(resistance < np.inf, codes, scale.open)  # NaN is not below inf either
@@ -121,29 +121,31 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
 class Chunk(NamedTuple):
     """A chunk of a scan as it is on the wire."""
 
-    index: int
+    chunk: int
+    """Chunk index: its first code is the ``chunk · codes_per_chunk``-th of the scan."""
     scan: int
     codes: tuple[int, ...]
 
 
-def pack_chunk(index: int, scan: int, codes: Sequence[int], bits: int = 16) -> bytes:
+def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> bytes:
     """Payload of TPDO1. ``codes``: up to 3 of 16 bits or 2 of 24; the rest is 0.
 
     Raises ValueError for a number that does not fit its field.
     """
     width = bits // 8
+    if not (0 <= chunk <= 255 and 0 <= scan <= 255):
+        raise ValueError(f"chunk, scan: got {chunk}, {scan}, must be from 0 to 255")
     try:
-        head = bytes((index, scan))
         body = b"".join(int(code).to_bytes(width, "little") for code in codes)
     except OverflowError:
         raise ValueError(f"codes: got {list(codes)}, must be from 0 to {(1 << bits) - 1}") from None
     if len(body) > PDO_BYTES - 2:
         raise ValueError(f"codes: got {len(codes)} of {bits} bits, must be at most {6 // width}")
-    return head + body.ljust(PDO_BYTES - 2, b"\0")
+    return bytes((chunk, scan)) + body.ljust(PDO_BYTES - 2, b"\0")
 
 
 def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = 0x180) -> Chunk:
-    """The chunk in the payload of TPDO1. Raises CodecError (naming ``cob_id``) when it is not 8 bytes long."""
+    """The chunk in the payload of TPDO1. Raises CodecError, naming ``cob_id``, unless it is 8 bytes long."""
     _require_length(data, PDO_BYTES, cob_id, "chunk")
     width = bits // 8
     codes = tuple(int.from_bytes(data[at : at + width], "little") for at in range(2, PDO_BYTES, width))
@@ -186,7 +188,10 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
 
 class SummaryFlag(enum.IntFlag):
-    """Flags of a scan summary. Bits not named here are sent as 0 and ignored."""
+    """The lower four flags of a scan summary; the upper four are :attr:`Summary.baseline_generation`.
+
+    Flags not named here are sent as 0 and ignored.
+    """
 
     CHANGED_ONLY = 0x01
     """Only chunks that changed were sent: any other is as in the scan before."""
@@ -194,8 +199,6 @@ class SummaryFlag(enum.IntFlag):
     """The next SYNC came first: chunks were left out, and nothing is known about them."""
     WIRE_FAULT = 0x04
     """A wire is open or shorted: see 0x2030 and 0x2031."""
-    BASELINE_CHANGED = 0x08
-    """The codes of this scan are the first of a new baseline: read 0x2200 … again."""
 
 
 class Summary(NamedTuple):
@@ -207,20 +210,31 @@ class Summary(NamedTuple):
     """Chunks sent in this scan."""
     device_time_us: int
 
+    @property
+    def baseline_generation(self) -> int:
+        """Which baseline the codes refer to, modulo 16: where it changed, 0x2200 … must be read again. A
+        number and not an event, so that a lost summary delays the news and does not swallow it."""
+        return self.flags >> 4
+
 
 _SUMMARY: Final = struct.Struct("<BBHI")
 
 
-def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
-    """Payload of TPDO2. ``device_time_us`` wraps at 2³². Raises ValueError for a number that does not fit."""
+def pack_summary(
+    scan: int, flags: int, chunks: int, device_time_us: int, *, baseline_generation: int = 0
+) -> bytes:
+    """Payload of TPDO2. ``flags``: of :class:`SummaryFlag`. ``device_time_us`` wraps at 2³² and
+    ``baseline_generation`` at 16. Raises ValueError for another number that does not fit.
+    """
     try:
+        flags |= (baseline_generation & 0xF) << 4
         return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
     except struct.error as error:
         raise ValueError(f"summary: got scan {scan}, flags {flags}, chunks {chunks}: {error}") from None
 
 
 def unpack_summary(data: bytes, *, cob_id: int = 0x280) -> Summary:
-    """The summary in the payload of TPDO2. Raises CodecError (naming ``cob_id``) when it is not 8 bytes long."""
+    """The summary in a payload of TPDO2. Raises CodecError, naming ``cob_id``, unless it is 8 bytes long."""
     _require_length(data, PDO_BYTES, cob_id, "scan summary")
     return Summary(*_SUMMARY.unpack(data))
 
@@ -257,7 +271,7 @@ def pack_command(
 def unpack_command(data: bytes, *, cob_id: int = 0x200) -> Command:
     """The command in the payload of RPDO1, of which bytes beyond the mapped six are ignored (CiA 301).
 
-    Raises CodecError (naming ``cob_id``) when it is shorter.
+    Raises CodecError, naming ``cob_id``, when it is shorter.
     """
     if len(data) < _COMMAND.size:
         raise CodecError(cob_id, data, f"at least {_COMMAND.size} bytes (command)")

@@ -1,0 +1,353 @@
+"""The run behind ``skinnode demo``: play the scene, watch the stream, hold it against the truth."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import os
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from skinnode import jit
+from skinnode.cli._plot import PatchTrace
+from skinnode.cli._score import Score, Scorer
+from skinnode.cli._view import BusView, PatchView, render
+from skinnode.errors import ConfigError
+from skinnode.host import Host
+from skinnode.model.config import HandConfig, PatchConfig
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float
+from skinnode.wire.codec import CodeScale
+from vcan_sim.fleet import Fleet
+
+BITRATE_BPS: Final = 1_000_000
+_REDRAW_S: Final = 0.125
+_LINE_S: Final = 1.0
+_FIELD_WAIT_S: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class PatchReport:
+    """One patch's line of the report."""
+
+    patch: str
+    node_id: int
+    scans_sent: int
+    scans_solved: int
+    scans_skipped: int
+    """Overtaken by a newer scan before a solver was free."""
+    scans_torn: int
+    latency_p50_ms: float
+    latency_p99_ms: float
+    score: Score
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The whole run in figures."""
+
+    seconds: float
+    scan_rate_hz: float
+    patches: tuple[PatchReport, ...]
+    frames_sent: int
+    """By the nodes, SDO and heartbeats included."""
+    frames_received: int
+    frames_lost: int
+    bus_load: float
+    """Share of a 1 Mbit/s bus that all frames of the scan phase would have taken, stuff bits counted."""
+    faults: tuple[str, ...]
+    """What makes the exit status 1; empty when all is well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a run leaves behind."""
+
+    report: Report
+    traces: tuple[PatchTrace, ...]
+
+
+def require_writable(option: str, file: Path) -> None:
+    """Raises ConfigError, before any work is done, where ``file`` could not be written."""
+    if file.is_dir():
+        raise ConfigError(option, str(file), "the name of a file, not a folder")
+    target = file if file.exists() else file.absolute().parent
+    if not os.access(target, os.W_OK):
+        raise ConfigError(option, str(file), "a file in an existing folder that can be written")
+
+
+@dataclass
+class _Watch:
+    """One patch as it is followed during the run. Owned by the main thread."""
+
+    config: PatchConfig
+    scorer: Scorer
+    arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
+    latency_ms: list[float] = field(default_factory=list)
+    history: list[tuple[float, float, float, float]] = field(default_factory=list)
+    """Time, true depth, RMS error, RMS reported deviation of each scan."""
+    deepest: tuple[float, Float, Float] | None = None
+    newest: FieldFrame | None = None
+
+    def take(self, frame: FieldFrame, true_upper_m: Float, t_start_ns: int) -> None:
+        stamp = frame.stamp
+        assert stamp is not None  # the host stamps every field
+        truth = true_upper_m - self.scorer.layout.upper_m
+        error_m = self.scorer.add(frame, true_upper_m)
+        depth_m = float(-truth[..., 2].min())
+        reported_m = float(np.sqrt(np.mean(frame.displacement_std_m**2)))
+        self.newest = frame
+        self.arrivals_s.append(stamp.t_solved_ns * 1e-9)
+        self.latency_ms.append((stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6)
+        self.history.append(((stamp.t_receive_ns - t_start_ns) * 1e-9, depth_m, error_m, reported_m))
+        if self.deepest is None or depth_m > self.deepest[0]:
+            self.deepest = depth_m, truth, frame.displacement_m
+
+    @property
+    def rate_hz(self) -> float:
+        if len(self.arrivals_s) < 2:
+            return 0.0
+        return (len(self.arrivals_s) - 1) / (self.arrivals_s[-1] - self.arrivals_s[0])
+
+    def view(self, health: str, torn: int) -> PatchView:
+        frame = self.newest
+        return PatchView(
+            name=self.config.name,
+            health=health,
+            displacement_m=None if frame is None else frame.displacement_m,
+            peak_std_m=math.nan if frame is None else float(frame.displacement_std_m.max()),
+            error_m=self.history[-1][2] if self.history else math.nan,
+            rate_hz=self.rate_hz,
+            torn=torn,
+        )
+
+    def trace(self) -> PatchTrace | None:
+        if self.deepest is None:
+            return None
+        time_s, depth_m, error_m, reported_m = np.array(self.history).T
+        _, truth, decoded = self.deepest
+        rest = self.scorer.layout.upper_m
+        return PatchTrace(self.config.name, rest, time_s, depth_m, error_m, reported_m, truth, decoded)
+
+
+class _Progress:
+    """Shows the run: a live view on a terminal, a line a second elsewhere."""
+
+    def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
+        self._console, self._watches, self._seconds = console, watches, seconds
+        self._full_scale_m = max(p.layout.height_m for p in hand.patches) * hand.simulation.depth
+        self._live = (
+            Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+        )
+        self._due_s = 0.0
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[None]:
+        with self._live or contextlib.nullcontext():
+            yield
+
+    def update(self, host: Host, elapsed_s: float, load: float, lost: int) -> None:
+        if elapsed_s < self._due_s:
+            return
+        stats = host.stats()
+        torn = {name: lane.assembler.scans_torn for name, lane in stats.patches.items()}
+        latency = np.concatenate([watch.latency_ms for watch in self._watches] or [[]])
+        p50, p99 = np.percentile(latency, (50, 99)) if latency.size else (math.nan, math.nan)
+        received = sum(bus.received for bus in stats.buses.values())
+        if self._live is not None:
+            self._due_s = elapsed_s + _REDRAW_S
+            views = [
+                watch.view(host.health(watch.config.name).condition, torn[watch.config.name])
+                for watch in self._watches
+            ]
+            bus = BusView(elapsed_s, self._seconds, load, received, lost, float(p50), float(p99))
+            self._live.update(render(views, bus, self._full_scale_m), refresh=True)
+            return
+        self._due_s = elapsed_s + _LINE_S
+        errors = [watch.history[-1] for watch in self._watches if watch.history]
+        shown = "  ".join(f"{1e6 * depth:.0f} µm ± {1e6 * std:.1f}" for _, depth, _, std in errors)
+        self._console.print(
+            f"{elapsed_s:5.1f} s  {received} frames, {lost} lost, {sum(torn.values())} torn, "
+            f"load {100 * load:.0f} %, last frame to field p99 {p99:.1f} ms, depth {shown}",
+            soft_wrap=True,
+        )
+
+
+def play(hand: HandConfig, seconds: float, console: Console) -> Run:
+    """Play ``hand`` for ``seconds`` of scans and score what was decoded. Raises SkinError where it cannot."""
+    if jit.is_cold():
+        console.print("compiling the kernels, once; the next start is immediate")
+    layouts = {patch.name: patch.layout.build() for patch in hand.patches}
+    watches = {
+        patch.name: _Watch(patch, Scorer(layouts[patch.name], CodeScale(patch.code_bits).relative_std))
+        for patch in hand.patches
+    }
+    count = len(hand.patches)
+    console.print(
+        f"bringing up {count} simulated {'patch' if count == 1 else 'patches'} on a virtual CAN bus: "
+        "boot-up, identity, configuration, start"
+    )
+    with _responsive_threads(), Fleet(hand) as fleet:
+        with Host.from_config(hand) as host:
+            bits_before = _bits(host)
+            t_start_ns = time.monotonic_ns()
+            progress = _Progress(console, hand, list(watches.values()), seconds)
+            subscription = host.fields(capacity=64 * count)
+            with progress.shown():
+                elapsed_s = 0.0
+                while elapsed_s < seconds:
+                    frame = subscription.get(min(_FIELD_WAIT_S, seconds - elapsed_s))
+                    if frame is not None:
+                        _take(frame, watches, fleet, t_start_ns)
+                    elapsed_s = (time.monotonic_ns() - t_start_ns) * 1e-9
+                    load = (_bits(host) - bits_before) / (BITRATE_BPS * elapsed_s)
+                    progress.update(host, elapsed_s, load, host_losses(host))
+            bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
+        while (frame := subscription.get(0.0)) is not None:  # what was under way when the host closed
+            _take(frame, watches, fleet, t_start_ns)
+        stats, nodes = host.stats(), {node.patch: node for node in fleet.report()}
+    rows = tuple(
+        PatchReport(
+            patch=name,
+            node_id=watch.config.node_id,
+            scans_sent=nodes[name].scans_sent,
+            scans_solved=stats.patches[name].solved,
+            scans_skipped=stats.patches[name].skipped,
+            scans_torn=stats.patches[name].assembler.scans_torn,
+            latency_p50_ms=_percentile(watch.latency_ms, 50),
+            latency_p99_ms=_percentile(watch.latency_ms, 99),
+            score=watch.scorer.score(),
+        )
+        for name, watch in watches.items()
+    )
+    sent = sum(node.frames_sent for node in nodes.values())
+    received = sum(bus.received for bus in stats.buses.values())
+    report = Report(
+        seconds=elapsed_s,
+        scan_rate_hz=1.0 / hand.sync.period_s,
+        patches=rows,
+        frames_sent=sent,
+        frames_received=received,
+        frames_lost=sent - received,
+        bus_load=bits / (BITRATE_BPS * elapsed_s),
+        faults=_faults(rows, sent - received),
+    )
+    traces = (watch.trace() for watch in watches.values())
+    return Run(report, tuple(trace for trace in traces if trace is not None))
+
+
+@contextlib.contextmanager
+def _responsive_threads() -> Iterator[None]:
+    """Node and host share one interpreter here; at Python's 5 ms a thread could wait longer than a scan takes
+    to solve. The two of a real hand do not share one."""
+    kept = sys.getswitchinterval()
+    sys.setswitchinterval(5e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(kept)
+
+
+def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
+    assert frame.stamp is not None  # the host stamps every field
+    true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
+    watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
+
+
+def _bits(host: Host) -> int:
+    return sum(bus.bits for bus in host.stats().buses.values())
+
+
+def host_losses(host: Host) -> int:
+    """Losses the host itself knows of: frames its queue had no room for and chunks that never came."""
+    stats = host.stats()
+    dropped = sum(bus.dropped for bus in stats.buses.values())
+    return dropped + sum(lane.assembler.chunks_lost for lane in stats.patches.values())
+
+
+def _percentile(values: Sequence[float], percent: float) -> float:
+    return float(np.percentile(values, percent)) if values else math.nan
+
+
+def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
+    found = []
+    if lost:
+        found.append(f"{lost} frames lost")
+    for row in rows:
+        if row.scans_torn:
+            found.append(f"{row.patch}: {row.scans_torn} scans torn")
+        if row.score.scans == 0:
+            found.append(f"{row.patch}: no scan solved")
+        elif not row.score.within_uncertainty:
+            score = row.score
+            found.append(
+                f"{row.patch}: error {1e6 * score.error_rms_m:.2f} µm RMS, "
+                f"{score.worst_deviations:.1f} deviations at worst, {score.untrusted} scans not converged; "
+                f"reported ± {1e6 * score.reported_rms_m:.2f} µm"
+            )
+    return tuple(found)
+
+
+def print_report(console: Console, report: Report) -> None:
+    """The table at the end, and one line for each fault."""
+    table = Table(box=None, header_style="dim", padding=(0, 1))
+    table.add_column("patch")
+    for heading in (
+        "scans sent\nsolved / torn",
+        "deepest\nµm",
+        "error RMS\nµm",
+        "reported\n± µm",
+        "16-bit codes\nallow ± µm",
+        "error at\ndeepest",
+        "in 95 %\ninterval",
+        "last frame to field\np50 / p99 ms",
+    ):
+        table.add_column(heading, justify="right")
+    for row in report.patches:
+        score = row.score
+        table.add_row(
+            row.patch,
+            f"{row.scans_sent}\n{row.scans_solved} / {row.scans_torn}",
+            f"{1e6 * score.deepest_m:.0f}",
+            f"{1e6 * score.error_rms_m:.2f}",
+            f"{1e6 * score.reported_rms_m:.2f}",
+            f"{1e6 * score.bound_rms_m:.2f}",
+            f"{100 * score.relative_error:.1f} %",
+            f"{100 * score.coverage95:.1f} %",
+            f"{row.latency_p50_ms:.1f} / {row.latency_p99_ms:.1f}",
+        )
+    console.print(table)
+    console.print(
+        f"{report.frames_sent} frames sent by the nodes, {report.frames_lost} lost; "
+        f"{report.scan_rate_hz:.1f} scans/s a patch; "
+        f"a 1 Mbit/s bus would have been loaded to {100 * report.bus_load:.0f} %"
+    )
+    for fault in report.faults:
+        console.print(f"[bold red]fault:[/] {fault}")
+    if not report.faults:
+        console.print("[green]no scan torn, no frame lost, every error within its reported uncertainty[/]")
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The report as plain data; a figure that could not be had is null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    result: dict[str, Any] = plain(dataclasses.asdict(report))
+    return result

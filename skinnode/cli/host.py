@@ -1,0 +1,207 @@
+"""``skinnode host hand.toml``: bring a hand up, solve what it feels, say every second how it does."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Protocol
+
+import typer
+
+if TYPE_CHECKING:
+    from skinnode.host import Host, HostStats
+    from skinnode.model.frames import FieldFrame
+
+_LONGEST_WAIT_S = 0.1
+"""How long Ctrl-C may go unnoticed."""
+
+
+def host(
+    hand: Annotated[Path, typer.Argument(help="The hand to run.", metavar="HAND.toml")],
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
+) -> None:
+    """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
+
+    Ctrl-C ends it; the nodes are left pre-operational. Exit status 2 if the hand could not be run, or if a
+    node sent frames that are not what their identifier promises.
+    """
+    from skinnode.host import BringUpCancelled, Host
+    from skinnode.jit import is_cold
+    from skinnode.model.config import load_hand
+
+    plan = load_hand(hand).on(interface, channel)
+    report: _Report = _JsonReport() if as_json else _TextReport()
+    if is_cold():
+        report.note("compiling the kernels, once: takes some seconds")
+    with _until_told() as told:
+        try:
+            with Host.from_config(plan, cancelled=told.is_set) as running:
+                where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
+                report.note(
+                    f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends"
+                )
+                _watch(running, told, seconds, report)
+                malformed = running.stats().malformed
+        except BringUpCancelled:
+            return
+    report.note("nodes are pre-operational")
+    if malformed:
+        raise malformed[0]
+
+
+@contextmanager
+def _until_told() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, so that both end the program the ordinary way."""
+    told = threading.Event()
+
+    def tell(_signal: int, _frame: FrameType | None) -> None:
+        told.set()
+
+    kept = {number: signal.signal(number, tell) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield told
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+def _watch(running: Host, told: threading.Event, seconds: float | None, report: _Report) -> None:
+    """Follow the fields, a report a second, until told to end or time is up."""
+    start_s = time.monotonic()
+    end_s = float("inf") if seconds is None else start_s + seconds
+    latencies_s: list[float] = []
+    with running.fields() as fields:
+        before, due_s = running.stats(), start_s + 1.0
+        while not told.is_set():
+            now_s = time.monotonic()
+            if now_s >= min(due_s, end_s):
+                now = running.stats()
+                report.second(_Second(running, now_s - start_s, before, now, latencies_s, fields.dropped))
+                before, latencies_s, due_s = now, [], due_s + 1.0
+                if now_s >= end_s:
+                    return
+            field = fields.get(max(0.0, min(due_s, end_s, now_s + _LONGEST_WAIT_S) - now_s))
+            if field is not None and field.stamp is not None:
+                latencies_s.append((field.stamp.t_solved_ns - field.stamp.t_receive_ns) * 1e-9)
+
+
+class _Second:
+    """What happened in a second, as data."""
+
+    def __init__(
+        self,
+        running: Host,
+        elapsed_s: float,
+        before: HostStats,
+        now: HostStats,
+        latencies_s: Sequence[float],
+        dropped: int,
+    ) -> None:
+        ordered = sorted(latencies_s)
+        self.elapsed_s = elapsed_s
+        self.latency_p50_ms = _percentile(ordered, 0.50)
+        self.latency_p99_ms = _percentile(ordered, 0.99)
+        self.fields_dropped = dropped
+        self.patches = {
+            name: _patch(running, name, before, now)
+            for name in (patch.name for patch in running.hand.patches)
+        }
+        self.buses = {
+            name: {
+                "frames": new.received - before.buses[name].received,
+                "dropped": new.dropped,
+                "malformed": new.malformed,
+                "foreign": new.foreign,
+                "load": (new.bits - before.buses[name].bits)
+                / (max(1e-9, now.t_ns - before.t_ns) * 1e-9 * running.hand.bus(name).bitrate_bps),
+            }
+            for name, new in now.buses.items()
+        }
+
+
+def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[str, object]:
+    new, old, field = now.patches[name], before.patches[name], running.latest(name)
+    return {
+        "condition": str(running.health(name).condition),
+        "solved": new.solved - old.solved,
+        "skipped": new.skipped,
+        "torn": new.assembler.scans_torn,
+        "missed": new.assembler.scans_missed,
+        "chunks_lost": new.assembler.chunks_lost,
+        "trusted": field.trusted if field is not None else None,
+        "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
+        "deepest_m": _deepest_m(field),
+    }
+
+
+def _deepest_m(field: FieldFrame | None) -> float | None:
+    """Deepest displacement into the skin; a press moves electrodes to −z."""
+    if field is None:
+        return None
+    deepest = -float(field.displacement_m[..., 2].min())
+    return deepest if math.isfinite(deepest) else None
+
+
+def _percentile(ordered: Sequence[float], share: float) -> float | None:
+    """In milliseconds; None of nothing."""
+    return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
+
+
+class _Report(Protocol):
+    """How a person or a program is told."""
+
+    def note(self, text: str) -> None: ...
+
+    def second(self, second: _Second) -> None: ...
+
+
+class _TextReport:
+    """A line a second."""
+
+    def note(self, text: str) -> None:
+        print(text, flush=True)
+
+    def second(self, second: _Second) -> None:
+        patches = "  ".join(_patch_text(name, facts) for name, facts in second.patches.items())
+        buses = "  ".join(
+            f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
+            for name, facts in second.buses.items()
+        )
+        latency = ""
+        if second.latency_p50_ms is not None:
+            latency = f"  latency {second.latency_p50_ms:.1f} ms, p99 {second.latency_p99_ms:.1f} ms"
+        print(f"{second.elapsed_s:6.1f} s  {patches}  {buses}{latency}", flush=True)
+
+
+def _patch_text(name: str, facts: Mapping[str, object]) -> str:
+    deepest_m = facts["deepest_m"]
+    deepest = f" {deepest_m * 1e6:.0f} µm" if isinstance(deepest_m, float) else ""
+    worst = "".join(f" {facts[key]} {key}" for key in ("torn", "missed", "skipped") if facts[key])
+    doubt = " untrusted" if facts["trusted"] is False else ""
+    return f"{name} {facts['condition']} {facts['solved']} fields{deepest}{worst}{doubt}"
+
+
+class _JsonReport:
+    """An object a line: {"note": …} or the figures of a second."""
+
+    def note(self, text: str) -> None:
+        print(json.dumps({"note": text}), flush=True)
+
+    def second(self, second: _Second) -> None:
+        print(json.dumps(vars(second)), flush=True)

@@ -1,0 +1,256 @@
+"""From a node that may be there to one that is known, configured and ready to start.
+
+Nothing is written to a node before its identity and its layout are what the hand file says: it could be a
+drive. What is written is read back.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from skinnode.errors import NodeError, NodeTimeout, ProfileError
+from skinnode.host.network import RemoteOd
+from skinnode.model.config import PatchConfig, SyncConfig
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.wire import profile as od
+from skinnode.wire.codec import CodeScale
+from skinnode.wire.profile import PatchProfile
+
+BOOT_DEADLINE_S: Final = 3.0
+"""How long a node may take to answer for the first time; controllers boot and tare within a second."""
+
+HEARTBEAT_S: Final = 0.25
+"""Heartbeat the nodes are told to send: a lost node shows within a second, at 0.1 % of the bus for four."""
+
+SCAN_SHARE: Final = 0.8
+"""Part of the SYNC period in which a node paces its scan; the rest is slack for SDO, EMCY and late frames."""
+
+_NMT_START: Final = 0x01
+_NMT_PRE_OPERATIONAL: Final = 0x80
+_INVALID: Final = 1 << 31
+"""Bit of a PDO's COB-ID that switches it off while its parameters are changed."""
+
+_POLL_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NodeFacts:
+    """What bring-up learned about a patch."""
+
+    config: PatchConfig
+    layout: PatchLayout
+    profile: PatchProfile
+    scale: CodeScale
+    baseline_ohm: Float
+    """(U, K) resistances at rest, as the node encodes with them."""
+    serial: int
+
+
+class Abandoned(Exception):
+    """Somebody gave up on the bring-up; this node stops where it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bringer:
+    """Brings up one node after the other, or several side by side, until ``abandoned`` says so.
+
+    ``on_answer`` hears of each node that answered at all.
+    """
+
+    send: Callable[[int, bytes], None]
+    sync: SyncConfig
+    boot_deadline_s: float
+    abandoned: Callable[[], bool]
+    on_answer: Callable[[PatchConfig], None]
+
+    def bring_up(self, patch: PatchConfig, layout: PatchLayout, remote: RemoteOd) -> NodeFacts:
+        """Wait for the node, check who it is, configure it; it ends up pre-operational.
+
+        Raises NodeTimeout where it does not answer in time, NodeError where it is not the patch of the file
+        or does not keep its configuration, SdoAbort where it refuses.
+        """
+        profile = PatchProfile.from_layout(layout, patch.code_bits)
+        self._wait_for(patch, remote)
+        self.on_answer(patch)
+        serial = self._identify(patch, remote)
+        self._check_layout(patch, layout, profile, remote)
+        stand_by(self.send, patch.node_id)
+        self._configure(patch, profile, remote)
+        scale = CodeScale(
+            patch.code_bits,
+            remote.read(od.DESCRIPTOR, od.CODE_LO, "f32"),
+            remote.read(od.DESCRIPTOR, od.CODE_HI, "f32"),
+        )
+        baseline_ohm = self._read_baseline(patch, profile, remote)
+        return NodeFacts(patch, layout, profile, scale, baseline_ohm, serial)
+
+    def _go_on(self) -> None:
+        if self.abandoned():
+            raise Abandoned
+
+    def _wait_for(self, patch: PatchConfig, remote: RemoteOd) -> None:
+        end_s = time.monotonic() + self.boot_deadline_s
+        while not remote.answers():
+            self._go_on()
+            if time.monotonic() > end_s:
+                raise NodeTimeout(
+                    patch.node_id,
+                    f"patch {patch.name!r} on {patch.bus}: got no answer, "
+                    f"allowed: one within {self.boot_deadline_s:g} s",
+                )
+
+    def _identify(self, patch: PatchConfig, remote: RemoteOd) -> int:
+        for subindex, what, wanted in (
+            (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
+            (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
+        ):
+            got = remote.read(od.IDENTITY, subindex, "u32")
+            if got != wanted:
+                raise _mismatch(patch, what, f"0x{got:08X}", f"0x{wanted:08X} (a skinnode patch)")
+        revision = remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32")
+        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision names the CANopen behaviour
+            allowed = f"{od.REVISION_NUMBER >> 16}.x"
+            raise _mismatch(patch, "revision", f"{revision >> 16}.{revision & 0xFFFF}", allowed)
+        serial = int(remote.read(od.IDENTITY, od.IDENTITY_SERIAL, "u32"))
+        if patch.serial is not None and serial != patch.serial:
+            raise _mismatch(patch, "serial number", str(serial), f"{patch.serial} as in the hand file")
+        return serial
+
+    def _check_layout(
+        self, patch: PatchConfig, layout: PatchLayout, profile: PatchProfile, remote: RemoteOd
+    ) -> None:
+        for subindex, what, wanted in (
+            (od.ROWS, "upper wires", profile.rows),
+            (od.COLUMNS, "lower wires", profile.columns),
+            (od.UPPER_ELECTRODES, "electrodes of an upper wire", profile.upper_electrodes),
+            (od.LOWER_ELECTRODES, "electrodes of a lower wire", profile.lower_electrodes),
+            (od.CODE_BITS, "code bits", profile.code_bits),
+        ):
+            got = remote.read(od.DESCRIPTOR, subindex, "u8")
+            if got != wanted:
+                raise _mismatch(patch, what, str(got), f"{wanted} as in the hand file")
+        got = remote.read(od.DESCRIPTOR, od.LAYOUT_HASH, "u32")
+        if got != layout.layout_hash:
+            wanted_hash = f"0x{layout.layout_hash:08X} ({layout.name} as in the hand file)"
+            raise _mismatch(patch, "layout hash", f"0x{got:08X}", wanted_hash)
+
+    def _configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
+        self._go_on()
+        period_us = self.sync.period_ms * 1000
+        remote.configure(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
+        # The overflow value may only change while the cycle period is 0 (CiA 301, 7.5.2.22).
+        remote.configure(od.CYCLE_PERIOD, 0, "u32", 0)
+        remote.configure(od.SYNC_COUNTER_OVERFLOW, 0, "u8", self.sync.counter_overflow)
+        remote.configure(od.CYCLE_PERIOD, 0, "u32", period_us)
+        remote.configure(od.HEARTBEAT_PRODUCER, 0, "u16", round(HEARTBEAT_S * 1000))
+        remote.configure(od.ACQUISITION, od.ACQUISITION_PERIOD, "u16", 0)
+        remote.configure(od.SEND_POLICY, od.SEND_MODE, "u8", 0)
+        self._check_mapping(patch, profile, remote)
+        inhibit_100us = inhibit_time_100us(self.sync.period_ms, profile.n_chunks + 1)
+        for index, cob_id, kind, inhibit in (
+            (od.TPDO1_PARAMETER, od.chunk_cob_id(patch.node_id), 254, inhibit_100us),
+            (od.TPDO2_PARAMETER, od.summary_cob_id(patch.node_id), 1, 0),
+        ):
+            self._go_on()
+            remote.configure(index, od.PDO_COB_ID, "u32", cob_id | _INVALID)
+            remote.configure(index, od.PDO_TYPE, "u8", kind)
+            remote.configure(index, od.PDO_INHIBIT_TIME, "u16", inhibit)
+            remote.configure(index, od.PDO_EVENT_TIMER, "u16", 0)
+            remote.configure(index, od.PDO_COB_ID, "u32", cob_id)
+
+    def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
+        """The profile's mapping is the only one that the decoder understands."""
+        wanted = {item.index: item for item in profile.objects()}
+        for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
+            count = int(wanted[index][0].default or 0)
+            got = remote.read(index, 0, "u8")
+            if got != count:
+                raise _mismatch(patch, f"entries mapped in 0x{index:04X}", str(got), str(count))
+            for subindex in range(1, count + 1):
+                entry, mapped = wanted[index][subindex].default, remote.read(index, subindex, "u32")
+                if mapped != entry:
+                    what = f"object mapped by 0x{index:04X}:{subindex}"
+                    raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
+
+    def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
+        """R0 of every wire pair. A node that still tares itself has zeros; it may take the boot deadline."""
+        end_s = time.monotonic() + self.boot_deadline_s
+        while remote.read(od.BASELINE, 1, "f32") == 0 and time.monotonic() < end_s:
+            self._go_on()
+            time.sleep(_POLL_S)
+        baseline = np.empty((profile.rows, profile.columns))
+        for row in range(profile.rows):
+            self._go_on()
+            for column in range(profile.columns):
+                baseline[row, column] = remote.read(od.BASELINE + row, column + 1, "f32")
+        bad = np.argwhere(~(np.isfinite(baseline) & (baseline > 0)))
+        if len(bad):
+            row, column = (int(i) for i in bad[0])
+            what = f"baseline of upper wire {row}, lower wire {column}"
+            raise _mismatch(
+                patch, what, f"{baseline[row, column]:g} ohm", "a positive resistance (tare the patch)"
+            )
+        return baseline
+
+
+def start(send: Callable[[int, bytes], None], node_id: int) -> None:
+    """NMT: go operational."""
+    send(od.NMT_COB_ID, bytes([_NMT_START, node_id]))
+
+
+def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
+    """NMT: go pre-operational; the node falls silent but for its heartbeat and SDO."""
+    send(od.NMT_COB_ID, bytes([_NMT_PRE_OPERATIONAL, node_id]))
+
+
+def inhibit_time_100us(period_ms: int, frames: int) -> int:
+    """Pace at which ``frames`` frames take SCAN_SHARE of the period, in units of 0x1800:3."""
+    return int(period_ms * 10 * SCAN_SHARE / frames)
+
+
+def check_eds(path: Path, profile: PatchProfile) -> None:
+    """Check that an EDS file describes the wire format that the hand file asks for.
+
+    Raises ProfileError for a file that is no EDS, and for the first object that differs or is missing.
+    """
+    import canopen
+
+    try:
+        described = canopen.import_od(str(path))
+    except Exception as error:  # the library lets its parser's errors through, whatever they are
+        raise ProfileError("EDS", str(path), f"a file as in CiA 306 ({error})") from None
+    for item in profile.objects():
+        for entry in item.entries:
+            where = f"0x{entry.index:04X}:{entry.subindex}"
+            found = described.get_variable(entry.index, entry.subindex)
+            if found is None:
+                raise ProfileError(
+                    where, "no such object", f"{entry.name} of {_format(profile)}", where=str(path)
+                )
+            if found.data_type != entry.data_type:
+                allowed = f"0x{int(entry.data_type):X} ({entry.data_type.name})"
+                raise ProfileError(f"{where} data type", found.data_type, allowed, where=str(path))
+            constant = entry.access == "const" and isinstance(entry.default, int)
+            if constant and found.default is not None and found.default != entry.default:
+                raise ProfileError(
+                    f"{where} {entry.name}",
+                    found.default,
+                    f"{entry.default} in {_format(profile)}",
+                    where=str(path),
+                )
+
+
+def _format(profile: PatchProfile) -> str:
+    return f"a patch of {profile.rows}x{profile.columns} wires at {profile.code_bits} bits"
+
+
+def _mismatch(patch: PatchConfig, what: str, got: str, allowed: str) -> NodeError:
+    return NodeError(
+        patch.node_id, f"patch {patch.name!r} on {patch.bus}: {what}: got {got}, allowed: {allowed}"
+    )

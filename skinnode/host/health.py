@@ -1,0 +1,163 @@
+"""How each patch is: what its node says of itself and what it does, side by side.
+
+The mainline writes down what it sees (:class:`NodeMonitor`), :func:`judge` draws the conclusion when asked.
+"""
+
+from __future__ import annotations
+
+import enum
+import logging
+from dataclasses import dataclass
+from typing import Final
+
+_log = logging.getLogger(__name__)
+
+PRE_OPERATIONAL: Final = 127
+OPERATIONAL: Final = 5
+STOPPED: Final = 4
+BOOT_UP: Final = 0
+"""NMT states as a heartbeat carries them (CiA 301, 7.2.8.3.2.2)."""
+
+HEARTBEATS_MISSED: Final = 3
+"""Heartbeat periods without one after which a node counts as lost. CiA 301 leaves it to the integrator; one
+may be late behind a burst of frames and one be hit by a bus error."""
+
+SCANS_MISSED: Final = 3
+"""SYNC periods without a scan after which a patch counts as stale."""
+
+RESTART_MEMORY_NS: Final = 5_000_000_000
+"""How long a boot-up that nobody asked for is remembered as a restart."""
+
+
+class Condition(enum.StrEnum):
+    """The one word for a patch."""
+
+    NEVER_SEEN = "never seen"
+    BOOTING = "booting"
+    """Heard, not operational yet."""
+    OPERATIONAL = "operational"
+    STALE = "stale"
+    """Operational by its heartbeat, but no scan comes."""
+    RESTARTING = "restarting"
+    """Booted a moment ago without being asked to."""
+    FAULTY = "faulty"
+    """Its error register is not zero."""
+    LOST = "lost"
+    """Was there, and its heartbeat stopped."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatchHealth:
+    """Health of a patch at one instant. Ages are None where the thing was never seen."""
+
+    patch: str
+    node_id: int
+    condition: Condition
+    nmt_state: int | None
+    """As in the heartbeat: 5 operational, 127 pre-operational, 4 stopped, 0 just booted."""
+    heartbeat_age_s: float | None
+    scan_age_s: float | None
+    boot_ups: int
+    emergencies: int
+    """EMCY messages with an error, since the host started."""
+    last_emergency: int | None
+    """Code of the newest of them."""
+    error_register: int
+
+
+class NodeMonitor:
+    """Facts about one node, written by the mainline only."""
+
+    def __init__(self, patch: str, node_id: int) -> None:
+        self.patch, self.node_id = patch, node_id
+        self.nmt_state: int | None = None
+        self._t_heartbeat_ns: int | None = None
+        self._t_scan_ns: int | None = None
+        self._t_restart_ns: int | None = None
+        self._boot_ups = self._emergencies = self._error_register = 0
+        self._last_emergency: int | None = None
+        self.running = False
+        """Set once the node was started: from then on a boot-up is a restart."""
+
+    def on_heartbeat(self, data: bytes, t_ns: int) -> None:
+        """Heartbeat or boot-up. One of another length than a byte is ignored."""
+        if len(data) != 1:
+            return
+        state = data[0] & 0x7F  # bit 7 is the toggle bit of node guarding
+        if state == BOOT_UP:
+            self._boot_ups += 1
+            if self.running:
+                self._t_restart_ns = t_ns
+                _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
+        self.nmt_state = state
+        self._t_heartbeat_ns = t_ns
+
+    def on_emergency(self, data: bytes, t_ns: int) -> None:
+        """EMCY: u16 code, u8 error register, five bytes of the maker. Code 0 says that the error is gone."""
+        if len(data) != 8:
+            return
+        code = int.from_bytes(data[:2], "little")
+        self._error_register = data[2]
+        if code:
+            self._emergencies += 1
+            self._last_emergency = code
+
+    def said_since(self, state: int, t_ns: int) -> bool:
+        """Whether the newest heartbeat came after ``t_ns`` and carried ``state``."""
+        heard_ns = self._t_heartbeat_ns
+        return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
+
+    def on_scan(self, t_ns: int) -> None:
+        self._t_scan_ns = t_ns
+
+    def health(self, now_ns: int, heartbeat_s: float, scan_s: float) -> PatchHealth:
+        """The conclusion at ``now_ns``, for a node that sends a heartbeat and a scan this often."""
+
+        def age_s(t_ns: int | None) -> float | None:
+            return None if t_ns is None else max(0, now_ns - t_ns) * 1e-9
+
+        heartbeat_age_s, scan_age_s = age_s(self._t_heartbeat_ns), age_s(self._t_scan_ns)
+        restart_age_s = age_s(self._t_restart_ns)
+        condition = judge(
+            nmt_state=self.nmt_state,
+            late_heartbeats=None if heartbeat_age_s is None else heartbeat_age_s / heartbeat_s,
+            late_scans=None if scan_age_s is None else scan_age_s / scan_s,
+            restarted=restart_age_s is not None and restart_age_s < RESTART_MEMORY_NS * 1e-9,
+            error_register=self._error_register,
+        )
+        return PatchHealth(
+            patch=self.patch,
+            node_id=self.node_id,
+            condition=condition,
+            nmt_state=self.nmt_state,
+            heartbeat_age_s=heartbeat_age_s,
+            scan_age_s=scan_age_s,
+            boot_ups=self._boot_ups,
+            emergencies=self._emergencies,
+            last_emergency=self._last_emergency,
+            error_register=self._error_register,
+        )
+
+
+def judge(
+    *,
+    nmt_state: int | None,
+    late_heartbeats: float | None,
+    late_scans: float | None,
+    restarted: bool,
+    error_register: int,
+) -> Condition:
+    """The worst that the facts say. Ages are in periods, None for never."""
+    if late_heartbeats is None:
+        return Condition.NEVER_SEEN
+    if late_heartbeats > HEARTBEATS_MISSED:
+        return Condition.LOST
+    if restarted:
+        return Condition.RESTARTING
+    if nmt_state != OPERATIONAL:
+        return Condition.BOOTING
+    if error_register:
+        return Condition.FAULTY
+    if late_scans is None or late_scans > SCANS_MISSED:
+        return Condition.STALE
+    return Condition.OPERATIONAL

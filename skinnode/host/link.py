@@ -1,0 +1,165 @@
+"""One bus of the hand: its port, its receive thread, and the mainline that deals frames out by COB-ID."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.errors import BusError, CodecError, SkinError
+from skinnode.host.network import RemoteOd, SkinNetwork
+from skinnode.model.config import BusConfig
+from skinnode.transport import CanPort, Receiver
+from skinnode.wire.profile import sdo_response_cob_id
+from skinnode.wire.timing import BusLoad
+
+_log = logging.getLogger(__name__)
+
+Handler = Callable[[bytes, int], None]
+"""What happens to a frame: its data and when it was received, monotonic ns."""
+
+_WAIT_S: Final = 0.02
+"""How long the mainline waits for a frame before it looks at the clock for scans that lack something."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusStats:
+    """What passed on a bus since the host opened it."""
+
+    received: int
+    """Data frames read, the host's own not among them."""
+    sent: int
+    foreign: int
+    """Data frames of a COB-ID that the hand file does not explain."""
+    ignored: int
+    """Remote, error, extended and CAN FD frames."""
+    dropped: int
+    """Frames that found the receive queue full."""
+    malformed: int
+    """Frames of a known COB-ID with a length that it does not have."""
+    bits: int
+    """Exact length of all data frames, received and sent."""
+    load: float
+    """Share of the bus that these took since the last SYNC period began to be counted; 1 is full."""
+
+
+class BusLink:
+    """An open bus. Its threads run from construction to :meth:`close`.
+
+    ``on_failure`` is called once, from the mainline, if the bus fails or a handler does.
+    Raises BusError where the interface does not open.
+    """
+
+    def __init__(self, config: BusConfig, on_failure: Callable[[SkinError], None]) -> None:
+        self.config = config
+        self.first_malformed: CodecError | None = None
+        self._on_failure = on_failure
+        self._handlers: dict[int, Handler] = {}
+        self._pollers: tuple[Callable[[int], None], ...] = ()
+        self._complained: set[int] = set()
+        self._foreign = self._ignored = self._malformed = self._received = 0
+        self._load = BusLoad(config.bitrate_bps)
+        self._stop = threading.Event()
+        self._port = CanPort(config)
+        self.network = SkinNetwork(self.send)
+        self._receiver = Receiver(self._port)
+        self._thread = threading.Thread(target=self._run, name=f"mainline {config.name}", daemon=True)
+        self._thread.start()
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send a data frame, from any thread. Raises BusError."""
+        self._port.send(can_id, data)
+
+    def handle(self, cob_id: int, handler: Handler) -> None:
+        """From now on ``handler`` gets the data frames of ``cob_id``, on the mainline."""
+        self._handlers[cob_id] = handler
+
+    def remote_od(self, node_id: int) -> RemoteOd:
+        """The object dictionary of a node on this bus."""
+
+        def on_response(data: bytes, t_ns: int) -> None:
+            if len(data) != 8:
+                self.reject(CodecError(sdo_response_cob_id(node_id), data, "8 bytes (SDO response)"))
+                return
+            self.network.notify(sdo_response_cob_id(node_id), bytearray(data), t_ns * 1e-9)
+
+        self.handle(sdo_response_cob_id(node_id), on_response)
+        return RemoteOd(self.network, node_id)
+
+    def poll_with(self, poller: Callable[[int], None]) -> None:
+        """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
+        self._pollers = (*self._pollers, poller)
+
+    def reject(self, error: CodecError) -> None:
+        """Count a frame that is not what its COB-ID promises; log the first of a COB-ID. Mainline only."""
+        self._malformed += 1
+        if self.first_malformed is None:
+            self.first_malformed = error
+        if error.cob_id not in self._complained:
+            self._complained.add(error.cob_id)
+            _log.warning("%s: %s; rejected, as are others like it", self.config.name, error)
+
+    def stats(self) -> BusStats:
+        return BusStats(
+            received=self._received,
+            sent=self._port.sent,
+            foreign=self._foreign,
+            ignored=self._ignored,
+            dropped=self._receiver.dropped,
+            malformed=self._malformed,
+            bits=self._load.bits,
+            load=0.0,
+        )
+
+    def stop(self) -> None:
+        """End and join the mainline; frames can still be sent."""
+        self._stop.set()
+        self._thread.join()
+
+    def close(self) -> None:
+        """End all threads and close the interface."""
+        self.stop()
+        self._receiver.close()
+        self._port.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._turn()
+        except BusError as error:
+            self._on_failure(error)
+        except Exception as error:  # a defect of ours: it must reach the user, not die with the thread
+            _log.debug("bus %s", self.config.name, exc_info=True)
+            failure = SkinError(f"bus {self.config.name!r}: {type(error).__name__}: {error}")
+            failure.__cause__ = error
+            self._on_failure(failure)
+
+    def _turn(self) -> None:
+        """One batch of frames to their handlers."""
+        batch = self._receiver.get_batch(_WAIT_S)
+        for frame in batch:
+            if frame.remote or frame.error or frame.extended or frame.fd:
+                self._ignored += 1
+                continue
+            self._received += 1
+            handler = self._handlers.get(frame.can_id)
+            if handler is None:
+                self._foreign += 1
+                continue
+            handler(frame.data, frame.t_ns)
+        # While frames wait, the time is that of the newest one dealt out: a scan is not late because we are.
+        now_ns = batch[-1].t_ns if batch else time.monotonic_ns()
+        for poll in self._pollers:
+            poll(now_ns)

@@ -1,0 +1,182 @@
+"""From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
+
+A patch has a lane. The mainline assembles into it and leaves scans in a box of one; a worker takes the newest
+and solves it. A scan that is overtaken while the worker is busy is skipped and counted. The lane's token
+makes sure that at most one worker is in it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from skinnode.errors import SkinError
+from skinnode.host.bringup import NodeFacts
+from skinnode.host.publish import Publisher
+from skinnode.host.sync import Tick
+from skinnode.model.config import SolverConfig
+from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
+from skinnode.solve.tracker import Tracker
+from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
+from skinnode.wire.codec import decode
+
+_log = logging.getLogger(__name__)
+
+
+class Solver:
+    """Scans of one patch to fields. Owned by one thread at a time."""
+
+    def __init__(self, facts: NodeFacts, config: SolverConfig) -> None:
+        self._facts = facts
+        self._tracker = Tracker(
+            facts.layout,
+            operator=config.operator,
+            relative_noise=facts.config.relative_noise,
+            baseline_ohm=facts.baseline_ohm,
+            stiffness_n_per_m=config.stiffness_n_per_m,
+        )
+        # The first call compiles the kernels or reads them from the cache: not while a scan waits.
+        self._tracker.update(facts.baseline_ohm)
+        self._tracker.reset()
+        self._quantisation_ohm = facts.scale.relative_std * facts.baseline_ohm
+
+    def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
+        """Resistances of a scan, NaN where there is none."""
+        resistance_ohm, valid = decode(scan.codes, self._facts.baseline_ohm, self._facts.scale)
+        valid &= scan.valid
+        resistance_ohm[~valid] = np.nan
+        return ResistanceFrame(resistance_ohm, valid, stamp)
+
+    def solve(self, frame: ResistanceFrame) -> FieldFrame:
+        """Field of a frame, stamped. The noise is that of the front end and of the codes together."""
+        analogue = self._facts.config.relative_noise
+        noise = np.hypot(analogue, self._quantisation_ohm / frame.resistance_ohm)
+        field: FieldFrame = self._tracker.update(
+            frame.resistance_ohm, frame.valid, np.where(frame.valid, noise, 1.0)
+        )
+        return replace(field, stamp=replace(frame.stamp, t_solved_ns=time.monotonic_ns()))
+
+
+@dataclass(frozen=True, slots=True)
+class LaneStats:
+    """What became of a patch's scans: ``offered`` = ``solved`` + ``skipped`` + at most two in work."""
+
+    offered: int
+    solved: int
+    skipped: int
+    """Overtaken by a newer scan before a worker was free."""
+    untrusted: int
+    """Fields in which a wire did not converge."""
+    invalid_codes: int
+    """Codes that were over range, short, open or missing, over all scans solved."""
+    assembler: AssemblerStats
+
+
+class Lane:
+    """One patch on its way through the host."""
+
+    def __init__(
+        self,
+        facts: NodeFacts,
+        solver: Solver,
+        assembler: ScanAssembler,
+        pool: ThreadPoolExecutor,
+        publisher: Publisher,
+        tick: Callable[[int], Tick | None],
+        on_scan: Callable[[int], None],
+    ) -> None:
+        self.facts = facts
+        self._solver, self._assembler, self._pool, self._publisher = solver, assembler, pool, publisher
+        self._tick, self._on_scan = tick, on_scan
+        self._box: deque[tuple[Scan, ScanStamp]] = deque(maxlen=1)
+        self._token: deque[None] = deque([None])
+        self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
+
+    # --- mainline
+
+    def on_chunk(self, data: bytes, t_ns: int) -> None:
+        """TPDO1."""
+        scan = self._assembler.on_chunk(data, t_ns)
+        if scan is not None:
+            self._offer(scan)
+
+    def on_summary(self, data: bytes, t_ns: int) -> None:
+        """TPDO2."""
+        scan = self._assembler.on_summary(data, t_ns)
+        if scan is not None:
+            self._offer(scan)
+
+    def poll(self, t_ns: int) -> None:
+        """Let a scan go that has waited long enough for what it lacks."""
+        scan = self._assembler.poll(t_ns)
+        if scan is not None:
+            self._offer(scan)
+
+    def close(self) -> None:
+        """Take no scan that is still in the box. Called when the mainline has ended."""
+        self._box.clear()
+
+    def _offer(self, scan: Scan) -> None:
+        self._on_scan(scan.t_last_ns)
+        tick = self._tick(scan.counter)
+        stamp = ScanStamp(
+            patch=self.facts.config.name,
+            scan=scan.scan if tick is None else tick.number,
+            counter=scan.counter,
+            device_time_us=scan.device_time_us or 0,  # None: the summary was lost
+            t_sync_ns=0 if tick is None else tick.t_ns,
+            t_receive_ns=scan.t_last_ns,
+        )
+        self._offered += 1
+        self._box.append((scan, stamp))  # a deque of one: pushes out a scan that nobody took
+        self._call_worker()
+
+    # --- worker
+
+    def _call_worker(self) -> None:
+        try:
+            self._token.pop()
+        except IndexError:
+            return  # a worker is in the lane and looks into the box when it is done
+        self._pool.submit(self._work)
+
+    def _work(self) -> None:
+        self._taken += 1  # before it leaves the box, so that no reader of the counters sees it nowhere
+        try:
+            scan, stamp = self._box.popleft()
+        except IndexError:  # the lane was closed
+            self._taken -= 1
+            return
+        try:
+            frame = self._solver.decode(scan, stamp)
+            field = self._solver.solve(frame)
+            self._solved += 1
+            self._untrusted += not field.trusted
+            self._invalid += int(frame.valid.size - np.count_nonzero(frame.valid))
+            self._publisher.publish(field, stamp.patch)
+        except Exception as error:  # a defect of ours: it must reach the user, not die with the job
+            _log.debug("patch %s", stamp.patch, exc_info=True)
+            failure = SkinError(f"patch {stamp.patch!r}, scan {stamp.scan}: {type(error).__name__}: {error}")
+            failure.__cause__ = error
+            self._publisher.fail(failure)
+        self._token.append(None)
+        if self._box:
+            self._call_worker()
+
+    def stats(self) -> LaneStats:
+        """Counters. Read in this order, no scan counts as skipped that may still be solved."""
+        offered, waiting = self._offered, len(self._box)
+        return LaneStats(
+            offered=offered,
+            solved=self._solved,
+            skipped=max(0, offered - waiting - self._taken),
+            untrusted=self._untrusted,
+            invalid_codes=self._invalid,
+            assembler=self._assembler.stats,
+        )

@@ -1,0 +1,170 @@
+"""From the workers to whoever listens: a bounded queue for each. A slow one loses its own data, counted."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import weakref
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.errors import SkinError
+from skinnode.model.frames import FieldFrame
+
+CAPACITY_FIELDS: Final = 64
+"""Fields a subscriber may lag behind: more than a second of four patches at 12.5 scans a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """Takes the place of a field when the host cannot go on."""
+
+    error: SkinError
+
+
+class _End:
+    """Takes the place of a field when the host has closed."""
+
+
+_Item = FieldFrame | _Failure | _End
+_END: Final = _End()
+
+
+class Subscription:
+    """The fields of a running host, newest last. Iterate over it, or ask with :meth:`get`.
+
+    A full queue loses its oldest field; ``dropped`` counts. The subscription ends with :meth:`close`, at the
+    end of a ``with`` block, or when the last reference to it goes.
+    """
+
+    def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
+        self._queue: queue.Queue[_Item] = queue.Queue(capacity)
+        self._timeout_s = timeout_s
+        self._wanted = patches
+        # One counter a patch: a patch has one worker at a time, so each has a single writer.
+        self._dropped = dict.fromkeys([*patches, ""], 0)
+
+    @property
+    def dropped(self) -> int:
+        """Fields lost because this subscriber was too slow."""
+        return sum(self._dropped.values())
+
+    def get(self, timeout_s: float | None = None) -> FieldFrame | None:
+        """The next field, or None after ``timeout_s``, or None at once when the host has closed.
+
+        Raises the SkinError that stopped the host, if one did.
+        """
+        try:
+            item = self._queue.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        return self._open(item)
+
+    def close(self) -> None:
+        """Want no more. Fields still queued are gone."""
+        self._wanted = frozenset()
+
+    def __iter__(self) -> Iterator[FieldFrame]:
+        """Fields until the host closes. Raises TimeoutError when none came for the subscription's timeout and
+        the SkinError that stopped the host, if one did."""
+        while True:
+            try:
+                item = self._queue.get(timeout=self._timeout_s)
+            except queue.Empty:
+                raise TimeoutError(f"no field within {self._timeout_s} s") from None
+            field = self._open(item)
+            if field is None:
+                return
+            yield field
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self, item: _Item) -> FieldFrame | None:
+        if isinstance(item, FieldFrame):
+            return item
+        self._offer(item, "")  # the next one to ask hears it too
+        if isinstance(item, _Failure):
+            raise item.error
+        return None
+
+    def _offer(self, item: _Item, patch: str) -> None:
+        """Never blocks."""
+        if patch and patch not in self._wanted:
+            return
+        while True:
+            try:
+                self._queue.put_nowait(item)
+                return
+            except queue.Full:
+                try:
+                    self._queue.get_nowait()
+                    self._dropped[patch] += 1
+                except queue.Empty:
+                    pass
+
+
+class Publisher:
+    """All subscriptions of a host, and the newest field of each patch."""
+
+    def __init__(self, patches: tuple[str, ...]) -> None:
+        self._patches = frozenset(patches)
+        self._latest: dict[str, FieldFrame] = {}
+        self._subscriptions: dict[int, weakref.ref[Subscription]] = {}
+        self._keys = itertools.count()
+        self._last: _Item | None = None
+
+    def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
+        """A subscription to one patch, or to all. Raises ValueError for a capacity below 1 or no patch."""
+        if capacity < 1:
+            raise ValueError(f"capacity: got {capacity}, must be at least 1")
+        if patch is not None and patch not in self._patches:
+            raise ValueError(f"patch: got {patch!r}, must be one of {', '.join(sorted(self._patches))}")
+        wanted = self._patches if patch is None else frozenset([patch])
+        subscription = Subscription(capacity, timeout_s, wanted)
+        key = next(self._keys)
+        # Item assignment and removal of a dict are atomic, and readers take a copy: no lock is needed.
+        forget = self._subscriptions
+        self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
+        if self._last is not None:
+            subscription._offer(self._last, "")
+        return subscription
+
+    def latest(self, patch: str) -> FieldFrame | None:
+        """The newest field of a patch, None before the first. Raises ValueError for no such patch."""
+        if patch not in self._patches:
+            raise ValueError(f"patch: got {patch!r}, must be one of {', '.join(sorted(self._patches))}")
+        return self._latest.get(patch)
+
+    def publish(self, field: FieldFrame, patch: str) -> None:
+        """Hand a field to everyone who wants it. Called by the worker that owns the patch; never blocks."""
+        self._latest[patch] = field
+        self._tell(field, patch)
+
+    @property
+    def failure(self) -> SkinError | None:
+        """What stopped the host, if something did."""
+        return self._last.error if isinstance(self._last, _Failure) else None
+
+    def fail(self, error: SkinError) -> None:
+        """The host cannot go on: every subscriber hears why, after the fields it has queued."""
+        self._last = self._last or _Failure(error)
+        self._tell(self._last, "")
+
+    def end(self) -> None:
+        """The host has closed: every subscriber's loop ends, after the fields it has queued."""
+        self._last = self._last or _END
+        self._tell(self._last, "")
+
+    def _tell(self, item: _Item, patch: str) -> None:
+        for reference in list(self._subscriptions.values()):
+            subscription = reference()
+            if subscription is not None:
+                subscription._offer(item, patch)

@@ -1,0 +1,105 @@
+"""The timer context: SYNC with a counter, at a fixed rate without drift."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from skinnode.errors import BusError
+from skinnode.wire.profile import SYNC_COB_ID
+
+
+class Tick(NamedTuple):
+    """One SYNC. ``number`` counts from 1 without wrapping; ``t_ns`` is when it was sent, monotonic."""
+
+    number: int
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class SyncStats:
+    """What the SYNC producer did."""
+
+    sent: int
+    missed: int
+    """Periods that passed before its thread got to run."""
+    failed: int
+    """SYNCs that a bus did not take."""
+    latest_ns: int
+    """The longest delay of a SYNC behind its due time."""
+
+
+class Ticks:
+    """The newest SYNC of each counter value. Written by the timer context, read by the mainline."""
+
+    def __init__(self, counter_overflow: int) -> None:
+        self.counter_overflow = counter_overflow
+        self._ticks: list[Tick | None] = [None] * (counter_overflow + 1)
+
+    def note(self, number: int, t_ns: int) -> int:
+        """Remember SYNC ``number`` and return its counter, 1 to ``counter_overflow``."""
+        counter = (number - 1) % self.counter_overflow + 1
+        self._ticks[counter] = Tick(number, t_ns)
+        return counter
+
+    def find(self, counter: int) -> Tick | None:
+        """The newest SYNC that carried ``counter``, None if none did."""
+        return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
+
+
+class SyncProducer:
+    """Sends SYNC on every bus at the same instant, from construction until :meth:`close`, on its own thread.
+
+    The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
+    first; a thread that wakes too late for a whole period skips it rather than send two in a row.
+    """
+
+    def __init__(
+        self, senders: Sequence[Callable[[int, bytes], None]], period_s: float, ticks: Ticks
+    ) -> None:
+        self._senders = tuple(senders)
+        self._period_ns = round(period_s * 1e9)
+        self._ticks = ticks
+        self._sent = self._missed = self._failed = self._latest_ns = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+        self._thread.start()
+
+    def stats(self) -> SyncStats:
+        return SyncStats(self._sent, self._missed, self._failed, self._latest_ns)
+
+    def close(self) -> None:
+        """Send no more, end and join the thread."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        due_ns = time.monotonic_ns()
+        number = 0
+        while not self._stop.wait(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)):
+            number += 1
+            now_ns = time.monotonic_ns()
+            self._latest_ns = max(self._latest_ns, now_ns - due_ns)
+            payload = bytes([self._ticks.note(number, now_ns)])  # before it is sent: the answers must find it
+            for send in self._senders:
+                try:
+                    send(SYNC_COB_ID, payload)
+                except BusError:  # a full or silent bus may recover; the scans it costs are counted there
+                    self._failed += 1
+            self._sent += 1
+            due_ns += self._period_ns
+            skipped = max(0, (time.monotonic_ns() - due_ns) // self._period_ns)
+            self._missed += skipped
+            due_ns += skipped * self._period_ns

@@ -1,0 +1,292 @@
+"""A hand file is read strictly; a mistake is one line: the thing, what it was, what is allowed."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skinnode.errors import BusLoadError, ConfigError
+from skinnode.model.config import BusConfig, load_hand, parse_hand
+from skinnode.model.layout import PatchLayout
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "hand.toml"
+MINIMAL: dict[str, Any] = {
+    "buses": [{"name": "can0"}],
+    "patches": [{"name": "thumb", "node_id": 1}, {"name": "index", "node_id": 2}],
+}
+
+
+def minimal() -> dict[str, Any]:
+    return copy.deepcopy(MINIMAL)
+
+
+def change(path: list[str | int], value: Any) -> Callable[[dict[str, Any]], None]:
+    """A function that puts ``value`` at ``path``."""
+
+    def apply(table: Any) -> None:
+        for part in path[:-1]:
+            table = table.setdefault(part, {}) if isinstance(part, str) else table[part]
+        table[path[-1]] = value
+
+    return apply
+
+
+def test_example_is_the_hand_of_the_readme() -> None:
+    hand = load_hand(EXAMPLE)
+    assert [(patch.name, patch.node_id) for patch in hand.patches] == [
+        ("thumb", 11),
+        ("index", 12),
+        ("middle", 13),
+        ("palm", 14),
+    ]
+    assert hand.bus("can0").interface == "udp_multicast"
+    layout = hand.patch("thumb").layout.build()
+    assert layout.layout_hash == PatchLayout.preset("staggered", height_m=2e-3).layout_hash
+    assert layout.shape == (10, 30)
+
+
+def test_example_says_the_defaults() -> None:
+    """Its comment promises that the values shown are those of a file that leaves them out."""
+    hand = load_hand(EXAMPLE)
+    buses = [{"name": "can0", "interface": "udp_multicast", "channel": "239.74.163.2"}]
+    patches = [{"name": patch.name, "node_id": patch.node_id} for patch in hand.patches]
+    spare = parse_hand({"name": hand.name, "buses": buses, "patches": patches})
+    spare_patches = [patch.model_copy(update={"eds": None}) for patch in hand.patches]
+    assert [patch.layout.build().layout_hash for patch in spare.patches] == [
+        patch.layout.build().layout_hash for patch in hand.patches
+    ]
+    assert [patch.model_dump(exclude={"layout"}) for patch in spare.patches] == [
+        patch.model_dump(exclude={"layout"}) for patch in spare_patches
+    ]
+    for part in ("buses", "sync", "solver", "simulation"):
+        assert getattr(spare, part) == getattr(hand, part)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "line"),
+    [
+        (
+            ["patches", 1, "nodeid"],
+            3,
+            "patches[1].nodeid: got 3, allowed: no such key (did you mean node_id?); the keys here are "
+            "name, node_id, bus, eds, layout, code_bits, serial, relative_noise",
+        ),
+        (
+            ["colour"],
+            "red",
+            "colour: got 'red', allowed: no such key; the keys here are "
+            "name, buses, patches, sync, solver, simulation",
+        ),
+        (
+            ["sync", "overflow"],
+            240,
+            "sync.overflow: got 240, allowed: no such key (did you mean counter_overflow?); "
+            "the keys here are period_ms, counter_overflow",
+        ),
+        (
+            ["patches", 1, "node_id"],
+            1,
+            "patches[1].node_id: got 1, allowed: one that patches[0] does not use",
+        ),
+        (
+            ["patches", 1, "name"],
+            "thumb",
+            "patches[1].name: got 'thumb', allowed: one that patches[0] does not use",
+        ),
+        (["patches", 0, "node_id"], 0, "patches[0].node_id: got 0, allowed: an integer from 1 to 127"),
+        (["patches", 0, "node_id"], 128, "patches[0].node_id: got 128, allowed: an integer from 1 to 127"),
+        (["patches", 0, "node_id"], "1", "patches[0].node_id: got '1', allowed: an integer from 1 to 127"),
+        (["patches", 0, "node_id"], True, "patches[0].node_id: got True, allowed: an integer from 1 to 127"),
+        (["patches", 0, "node_id"], 1.0, "patches[0].node_id: got 1.0, allowed: an integer from 1 to 127"),
+        (["patches", 0, "bus"], "can7", "patches[0].bus: got 'can7', allowed: a bus of this file: can0"),
+        (["patches", 0, "code_bits"], 12, "patches[0].code_bits: got 12, allowed: 16 or 24"),
+        (["patches", 0, "serial"], -1, "patches[0].serial: got -1, allowed: an integer from 0 to 2^32 - 1"),
+        (
+            ["patches", 0, "layout", "preset"],
+            "zigzag",
+            "patches[0].layout.preset: got 'zigzag', allowed: aligned or symmetric or staggered",
+        ),
+        (
+            ["patches", 0, "layout", "height_m"],
+            0,
+            "patches[0].layout.height_m: got 0, allowed: a positive number",
+        ),
+        (
+            ["patches", 0, "layout", "height_m"],
+            float("nan"),
+            "patches[0].layout.height_m: got nan, allowed: a positive number",
+        ),
+        (
+            ["patches", 0, "layout", "lower_wires"],
+            255,
+            "patches[0].layout.lower_wires: got 255, allowed: an integer from 1 to 254",
+        ),
+        (["patches", 0, "layout"], "flat", "patches[0].layout: got 'flat', allowed: a table"),
+        (
+            ["patches", 0, "layout", "upper_wires"],
+            26,
+            "patches[0].layout: got 780, allowed: at most 768 wire pairs at 16 bits",
+        ),
+        (["patches", 0], 7, "patches[0]: got 7, allowed: a table"),
+        (["patches"], [], "patches: got [], allowed: at least one [[patches]]"),
+        (["buses"], [], "buses: got [], allowed: at least one [[buses]]"),
+        (
+            ["buses", 0, "bitrate_bps"],
+            5_000_000,
+            "buses[0].bitrate_bps: got 5000000, "
+            "allowed: an integer from 10000 to 1000000, as classic CAN has it",
+        ),
+        (["sync", "period_ms"], 8.5, "sync.period_ms: got 8.5, allowed: an integer from 1 to 60000"),
+        (
+            ["sync", "counter_overflow"],
+            241,
+            "sync.counter_overflow: got 241, allowed: an integer from 2 to 240",
+        ),
+        (
+            ["solver", "operator"],
+            "newton",
+            "solver.operator: got 'newton', allowed: gauss_newton or levenberg_marquardt or dogleg",
+        ),
+        (["simulation", "depth"], 1.0, "simulation.depth: got 1.0, allowed: a number between 0 and 1"),
+    ],
+)
+def test_one_line_a_mistake(path: list[str | int], value: Any, line: str) -> None:
+    table = minimal()
+    change(path, value)(table)
+    with pytest.raises(ConfigError) as caught:
+        parse_hand(table, where="hand.toml")
+    assert str(caught.value) == f"hand.toml: {line}"
+
+
+def test_missing_key() -> None:
+    table = minimal()
+    del table["patches"][0]["node_id"]
+    with pytest.raises(
+        ConfigError, match=r"^patches\[0\]\.node_id: got nothing, allowed: an integer from 1 to 127$"
+    ):
+        parse_hand(table)
+
+
+def test_same_node_id_on_two_buses_is_fine() -> None:
+    table = minimal()
+    table["buses"].append({"name": "can1", "channel": "skin1"})
+    table["patches"][1].update(node_id=1, bus="can1")
+    hand = parse_hand(table)
+    assert [patch.name for patch in hand.patches_on("can1")] == ["index"]
+
+
+def test_two_buses_on_one_channel() -> None:
+    table = minimal()
+    table["buses"].append({"name": "can1"})
+    with pytest.raises(ConfigError) as caught:
+        parse_hand(table)
+    assert str(caught.value) == "buses[1].channel: got 'skin', allowed: one that buses[0] does not use"
+
+
+def test_bus_load_is_the_worst_case_of_the_plan() -> None:
+    # 8 data bytes with all stuff bits and inter-frame space are 135 bits, the SYNC with its counter 65
+    # (Davis et al. 2007, table of worst cases); 300 codes are 100 chunks and a summary.
+    hand = parse_hand(minimal())
+    assert hand.bus_load("can0") == pytest.approx((2 * 101 * 135 + 65) / 80e3, rel=1e-12)
+
+
+def test_plan_that_does_not_fit_its_bus() -> None:
+    table = minimal()
+    table["buses"][0]["bitrate_bps"] = 250_000
+    with pytest.raises(BusLoadError) as caught:
+        parse_hand(table, where="hand.toml")
+    assert str(caught.value) == (
+        "hand.toml: buses[0] (can0): got a plan that needs 137% of 250000 bit/s, "
+        "allowed: at most 70%; sync.period_ms = 157 or fewer patches would do"
+    )
+    table["sync"] = {"period_ms": 157}
+    parse_hand(table)
+    table["sync"] = {"period_ms": 155}
+    with pytest.raises(BusLoadError):
+        parse_hand(table)
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "hand.toml"
+    path.write_text(text)
+    return path
+
+
+HEAD = '[[buses]]\nname = "can0"\n[[patches]]\nname = "thumb"\nnode_id = 1\n'
+
+
+def test_eds_is_relative_to_the_file(tmp_path: Path) -> None:
+    (tmp_path / "eds").mkdir()
+    (tmp_path / "eds" / "patch.eds").write_text("")
+    hand = load_hand(write(tmp_path, HEAD + 'eds = "eds/patch.eds"\n'))
+    assert hand.patches[0].eds == tmp_path / "eds" / "patch.eds"
+
+
+def test_missing_eds(tmp_path: Path) -> None:
+    path = write(tmp_path, HEAD + 'eds = "eds/patch.eds"\n')
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value) == (
+        f"{path}: patches[0].eds: got 'eds/patch.eds', "
+        f"allowed: the path of an EDS file; there is no file {tmp_path}/eds/patch.eds"
+    )
+
+
+def test_toml_syntax(tmp_path: Path) -> None:
+    path = write(tmp_path, HEAD + "bus = can0\n")
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value).startswith(f"{path}: line 6, column 7: got 'bus = can0', allowed: TOML (")
+    assert "\n" not in str(caught.value)
+
+
+def test_toml_that_ends_too_soon(tmp_path: Path) -> None:
+    path = write(tmp_path, HEAD + 'bus = "can0')
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "allowed: TOML (" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_not_text(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_bytes(b'name = "\xff"\n')
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value) == f"{path}: byte 8: got b'\\xff', allowed: UTF-8"
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    path = tmp_path / "none.toml"
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value) == (
+        f"hand file: got '{path}', allowed: a file that can be read (No such file or directory)"
+    )
+
+
+def test_another_interface_and_channel() -> None:
+    hand = parse_hand(minimal()).on("socketcan", "vcan0")
+    assert hand.buses == (BusConfig(name="can0", interface="socketcan", channel="vcan0"),)
+    assert parse_hand(minimal()).on() == parse_hand(minimal())
+
+
+def test_one_channel_for_several_buses() -> None:
+    table = minimal()
+    table["buses"].append({"name": "can1", "channel": "skin1"})
+    hand = parse_hand(table)
+    with pytest.raises(
+        ConfigError, match=r"^--channel: got 'vcan0', allowed: no channel for a hand of 2 buses$"
+    ):
+        hand.on(channel="vcan0")
+
+
+def test_options_do_not_change() -> None:
+    hand = parse_hand(minimal())
+    with pytest.raises(ValueError, match="frozen"):
+        hand.name = "other"

@@ -188,10 +188,7 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
 
 class SummaryFlag(enum.IntFlag):
-    """The lower four flags of a scan summary; the upper four are :attr:`Summary.baseline_generation`.
-
-    Flags not named here are sent as 0 and ignored.
-    """
+    """Flags of a scan summary. Bits not named here are sent as 0 and ignored."""
 
     CHANGED_ONLY = 0x01
     """Only chunks that changed were sent: any other is as in the scan before."""
@@ -199,6 +196,8 @@ class SummaryFlag(enum.IntFlag):
     """The next SYNC came first: chunks were left out, and nothing is known about them."""
     WIRE_FAULT = 0x04
     """A wire is open or shorted: see 0x2030 and 0x2031."""
+    BASELINE_CHANGED = 0x08
+    """The codes of this scan are the first of a new baseline: read 0x2200 … again."""
 
 
 class Summary(NamedTuple):
@@ -210,24 +209,16 @@ class Summary(NamedTuple):
     """Chunks sent in this scan."""
     device_time_us: int
 
-    @property
-    def baseline_generation(self) -> int:
-        """Which baseline the codes refer to, modulo 16: where it changed, 0x2200 … must be read again. A
-        number and not an event, so that a lost summary delays the news and does not swallow it."""
-        return self.flags >> 4
-
 
 _SUMMARY: Final = struct.Struct("<BBHI")
 
 
-def pack_summary(
-    scan: int, flags: int, chunks: int, device_time_us: int, *, baseline_generation: int = 0
-) -> bytes:
-    """Payload of TPDO2. ``flags``: of :class:`SummaryFlag`. ``device_time_us`` wraps at 2³² and
-    ``baseline_generation`` at 16. Raises ValueError for another number that does not fit.
+def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
+    """Payload of TPDO2. ``flags``: of :class:`SummaryFlag`. ``device_time_us`` wraps at 2³².
+
+    Raises ValueError for another number that does not fit.
     """
     try:
-        flags |= (baseline_generation & 0xF) << 4
         return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
     except struct.error as error:
         raise ValueError(f"summary: got scan {scan}, flags {flags}, chunks {chunks}: {error}") from None

@@ -128,8 +128,7 @@ class _Second:
                 "dropped": new.dropped,
                 "malformed": new.malformed,
                 "foreign": new.foreign,
-                "load": (new.bits - before.buses[name].bits)
-                / (max(1e-9, now.t_ns - before.t_ns) * 1e-9 * running.hand.bus(name).bitrate_bps),
+                "load": new.load,
             }
             for name, new in now.buses.items()
         }

@@ -1,7 +1,7 @@
 """The host: discover, configure, start, supervise; receive, assemble, solve, publish."""
 
-from skinnode.host.facade import Host, HostStats
+from skinnode.host.facade import BringUpCancelled, Host, HostStats
 from skinnode.host.health import Condition, PatchHealth
 from skinnode.host.publish import Subscription
 
-__all__ = ["Condition", "Host", "HostStats", "PatchHealth", "Subscription"]
+__all__ = ["BringUpCancelled", "Condition", "Host", "HostStats", "PatchHealth", "Subscription"]

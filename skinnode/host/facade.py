@@ -40,9 +40,8 @@ _POLL_S: Final = 0.005
 
 @dataclass(frozen=True, slots=True)
 class HostStats:
-    """Counters of a running host at the instant ``t_ns``, monotonic."""
+    """Counters of a running host, at one instant."""
 
-    t_ns: int
     buses: Mapping[str, BusStats]
     patches: Mapping[str, LaneStats]
     sync: SyncStats
@@ -185,7 +184,6 @@ class Host:
     def stats(self) -> HostStats:
         """All counters."""
         return HostStats(
-            t_ns=time.monotonic_ns(),
             buses={name: link.stats() for name, link in self._links.items()},
             patches={name: lane.stats() for name, lane in self._lanes.items()},
             sync=self._sync.stats(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
@@ -21,6 +22,10 @@ _log = logging.getLogger(__name__)
 
 Handler = Callable[[bytes, int], None]
 """What happens to a frame: its data and when it was received, monotonic ns."""
+
+_MARK_NS: Final = 100_000_000
+_MARKS: Final = 10
+"""The load is the mean over the last ten tenths of a second."""
 
 _WAIT_S: Final = 0.02
 """How long the mainline waits for a frame before it looks at the clock for scans that lack something."""
@@ -42,9 +47,9 @@ class BusStats:
     malformed: int
     """Frames of a known COB-ID with a length that it does not have."""
     bits: int
-    """Exact length of all data frames, received and sent."""
+    """Exact length of all data frames, received and sent, up to a tenth of a second ago."""
     load: float
-    """Share of the bus that these took since the last SYNC period began to be counted; 1 is full."""
+    """Share of the bus that these took over the last second; 1 is full."""
 
 
 class BusLink:
@@ -62,7 +67,10 @@ class BusLink:
         self._pollers: tuple[Callable[[int], None], ...] = ()
         self._complained: set[int] = set()
         self._foreign = self._ignored = self._malformed = self._received = 0
-        self._load = BusLoad(config.bitrate_bps)
+        self._meter = BusLoad(config.bitrate_bps)
+        self._outgoing: deque[tuple[int, bytes]] = deque()
+        self._marks: deque[tuple[int, int]] = deque([(time.monotonic_ns(), 0)], maxlen=_MARKS)
+        self._load = 0.0
         self._stop = threading.Event()
         self._port = CanPort(config)
         self.network = SkinNetwork(self.send)
@@ -73,6 +81,7 @@ class BusLink:
     def send(self, can_id: int, data: bytes) -> None:
         """Send a data frame, from any thread. Raises BusError."""
         self._port.send(can_id, data)
+        self._outgoing.append((can_id, data))
 
     def handle(self, cob_id: int, handler: Handler) -> None:
         """From now on ``handler`` gets the data frames of ``cob_id``, on the mainline."""
@@ -111,8 +120,8 @@ class BusLink:
             ignored=self._ignored,
             dropped=self._receiver.dropped,
             malformed=self._malformed,
-            bits=self._load.bits,
-            load=0.0,
+            bits=self._marks[-1][1],
+            load=self._load,
         )
 
     def stop(self) -> None:
@@ -154,6 +163,7 @@ class BusLink:
                 self._ignored += 1
                 continue
             self._received += 1
+            self._meter.add(frame.can_id, frame.data)
             handler = self._handlers.get(frame.can_id)
             if handler is None:
                 self._foreign += 1
@@ -163,3 +173,14 @@ class BusLink:
         now_ns = batch[-1].t_ns if batch else time.monotonic_ns()
         for poll in self._pollers:
             poll(now_ns)
+        if now_ns >= self._marks[-1][0] + _MARK_NS:
+            self._mark(now_ns)
+
+    def _mark(self, now_ns: int) -> None:
+        """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
+        while self._outgoing:
+            self._meter.add(*self._outgoing.popleft())
+        bits = self._meter.bits
+        then_ns, then_bits = self._marks[0]
+        self._load = (bits - then_bits) * 1e9 / ((now_ns - then_ns) * self.config.bitrate_bps)
+        self._marks.append((now_ns, bits))

@@ -1,0 +1,8 @@
+"""A patch as a CANopen device (CiA 301), and the thread that drives patches on a bus."""
+
+from skinnode.node.nmt import NmtState
+from skinnode.node.node import PatchNode
+from skinnode.node.runner import NodeRunner
+from skinnode.node.source import ResistanceSource
+
+__all__ = ["NmtState", "NodeRunner", "PatchNode", "ResistanceSource"]

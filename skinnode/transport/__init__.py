@@ -1,0 +1,6 @@
+"""The only users of python-can at run time: a port on a bus and the thread that empties it."""
+
+from skinnode.transport.port import CanPort, Frame
+from skinnode.transport.receiver import Receiver
+
+__all__ = ["CanPort", "Frame", "Receiver"]

@@ -1,0 +1,231 @@
+"""What a node is for: scans of the patch, at SYNC, by its own timer or on command; tare; wire faults.
+
+Connects the manufacturer's objects (0x2000 to 0x2300) with the acquisition behind them and the TPDO engine
+before them. The communication around it is in :mod:`skinnode.node.node`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import PRESET_IDS, PatchLayout
+from skinnode.node.abort import AbortCode, Refused
+from skinnode.node.acquisition import Acquisition, Mask, WireFaults
+from skinnode.node.clock import NO_DEADLINE_NS, Clock
+from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.od import ObjectStore
+from skinnode.node.tpdo import OutgoingScan, TpdoEngine
+from skinnode.wire import profile as od
+from skinnode.wire.codec import SendMode, SummaryFlag, pack_scan
+from skinnode.wire.coordinates import pack_coordinates
+from skinnode.wire.profile import PatchProfile
+
+_SUMMARY_FIELDS: Final = {
+    od.SUMMARY_SCAN: slice(0, 1),
+    od.SUMMARY_FLAGS: slice(1, 2),
+    od.SUMMARY_CHUNKS: slice(2, 4),
+    od.SUMMARY_TIME: slice(4, 8),
+}
+
+
+class PatchApplication:
+    """Scans of one patch. ``now`` is the time of the event being handled."""
+
+    def __init__(
+        self,
+        layout: PatchLayout,
+        profile: PatchProfile,
+        serial: int,
+        store: ObjectStore,
+        acquisition: Acquisition,
+        tpdos: TpdoEngine,
+        emcy: EmcyProducer,
+        now: Clock,
+    ) -> None:
+        self._profile, self._store, self._acquisition = profile, store, acquisition
+        self._tpdos, self._emcy, self._now = tpdos, emcy, now
+        self._operational = False
+        self._counter = -1
+        self._period_ns = 0
+        self._faults_told: WireFaults = acquisition.faults
+        self._late = False
+        self._baseline_changed = False
+        self.overruns = 0
+        """Scans skipped because two others were still to be sent."""
+        self.deadline_ns = NO_DEADLINE_NS
+        """When :meth:`on_timer` has a scan of the node's own timer to take."""
+        self._describe(layout, serial)
+        self._connect()
+
+    # --- events
+
+    def power_on(self, t_ns: int) -> None:
+        """Tare, unless there is a baseline from before."""
+        if not self._acquisition.tared:
+            self._acquisition.tare(t_ns)
+
+    def reset(self) -> None:
+        """The node was reset: scans are numbered anew and nothing has been told."""
+        self._counter, self._late = -1, False
+        self._faults_told = WireFaults.none(self._profile)
+
+    def enter(self, *, operational: bool) -> None:
+        """The node entered another state."""
+        self._operational = operational
+        if operational:
+            self._acquisition.forget_sent()
+        self._plan()
+
+    def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
+        """A SYNC came, in OPERATIONAL; ``turns`` are the synchronous TPDOs whose turn it is."""
+        if not self._period_ns:
+            self._scan(self._following() if counter is None else counter, turns, t_ns)
+
+    def on_timer(self, t_ns: int) -> None:
+        """Take the scan that is due, if one is."""
+        if t_ns >= self.deadline_ns:
+            self.deadline_ns = max(self.deadline_ns + self._period_ns, t_ns)
+            self._scan(self._following(), frozenset(), t_ns)
+
+    # --- scans
+
+    def _following(self) -> int:
+        return self._counter + 1 & 0xFF
+
+    def _scan(self, counter: int, turns: frozenset[int], t_ns: int) -> None:
+        """Sample now; the engine sends. Skipped, and counted, when a sampled scan waits to be sent
+        already."""
+        self._counter = counter
+        if self._tpdos.full:
+            self.overruns += 1
+            if not self._late:
+                self._late = True
+                self._emcy.present(EmcyCode.CAN_OVERRUN, struct.pack("<H", self.overruns & 0xFFFF), t_ns)
+            return
+        store, acquisition = self._store, self._acquisition
+        acquisition.sample(t_ns, store.integer(od.ACQUISITION, od.ACQUISITION_AVERAGING))
+        self._tell_faults(acquisition.faults, t_ns)
+        flags = SummaryFlag.WIRE_FAULT if acquisition.faults.any else SummaryFlag(0)
+        if self._baseline_changed:
+            flags |= SummaryFlag.BASELINE_CHANGED
+            self._baseline_changed = False
+        chunks = pack_scan(acquisition.codes, counter, self._profile)
+        if store.integer(od.SEND_POLICY, od.SEND_MODE) == SendMode.CHANGED:
+            changed = acquisition.changed_chunks(
+                store.integer(od.SEND_POLICY, od.SEND_THRESHOLD),
+                store.integer(od.SEND_POLICY, od.SEND_REFRESH),
+            )
+            if changed is not None:
+                flags |= SummaryFlag.CHANGED_ONLY
+                chunks = [chunks[index] for index in changed]
+        self._tpdos.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
+        if self._late and not self._tpdos.full:
+            self._late = False
+            self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
+
+    def _tell_faults(self, faults: WireFaults, t_ns: int) -> None:
+        """One message when wires fail, with the kind and number of the first and how many there are: a pulled
+        connector is one event."""
+        told, self._faults_told = self._faults_told, faults
+        if not faults.any:
+            self._emcy.over(EmcyCode.HARDWARE, t_ns)
+            return
+        count = sum(int(mask.sum()) for mask in faults.masks)
+        for kind, (now, before) in enumerate(zip(faults.masks, told.masks, strict=True)):
+            new = now & ~before
+            if new.any():
+                detail = struct.pack("<BBH", kind, int(new.argmax()), count)
+                self._emcy.present(EmcyCode.HARDWARE, detail, t_ns)
+                return
+
+    # --- object dictionary
+
+    def _describe(self, layout: PatchLayout, serial: int) -> None:
+        put, scale = self._store.put, self._acquisition.scale
+        put(od.DESCRIPTOR, od.CODE_LO, scale.lo)
+        put(od.DESCRIPTOR, od.CODE_HI, scale.hi)
+        put(od.DESCRIPTOR, od.RESISTIVITY, layout.resistivity_ohm_per_m)
+        put(od.DESCRIPTOR, od.LAYOUT_ID, PRESET_IDS.get(layout.name, PRESET_IDS["custom"]))
+        put(od.DESCRIPTOR, od.LAYOUT_HASH, layout.layout_hash)
+        put(od.DESCRIPTOR, od.SERIAL, serial)
+        put(od.COORDINATES, 0, pack_coordinates(layout))
+
+    def _connect(self) -> None:
+        store, acquisition, tpdos = self._store, self._acquisition, self._tpdos
+        store.bind(od.CHUNK, self._read_chunk)
+        store.bind(od.SUMMARY, lambda sub: tpdos.summary[_SUMMARY_FIELDS[sub]])
+        store.watch(od.SEND_POLICY, lambda _: acquisition.forget_sent())
+        store.guard(od.ACQUISITION, self._guard_acquisition)
+        store.watch(od.ACQUISITION, self._on_acquisition)
+        store.bind(od.UPPER_WIRE_FAULTS, lambda sub: _fault_word(acquisition.faults.masks[:2], sub))
+        store.bind(od.LOWER_WIRE_FAULTS, lambda sub: _fault_word(acquisition.faults.masks[2:], sub))
+        for row in range(self._profile.rows):
+            self._connect_row(row)
+
+    def _connect_row(self, row: int) -> None:
+        store, acquisition, width = self._store, self._acquisition, self._profile.code_bits // 8
+        codes, baseline = od.CODES + row, od.BASELINE + row
+
+        def set_baseline(subindex: int) -> None:
+            if subindex:
+                (value,) = struct.unpack("<f", store.written(baseline, subindex))
+                acquisition.set_baseline(row, subindex - 1, value)
+                self._baseline_changed = True
+
+        store.bind(codes, lambda sub: int(acquisition.codes[row, sub - 1]).to_bytes(width, "little"))
+        store.bind(baseline, lambda sub: struct.pack("<f", acquisition.baseline_ohm[row, sub - 1]))
+        store.guard(baseline, _only_resistance)
+        store.watch(baseline, set_baseline)
+
+    def _guard_acquisition(self, subindex: int, value: int) -> None:
+        match subindex:
+            case od.TARE if value not in (0, od.TARE_SIGNATURE):
+                raise Refused(AbortCode.CANNOT_STORE)
+            case od.SELF_TEST if value:  # there is nothing to test in a node without a board
+                raise Refused(AbortCode.CANNOT_STORE)
+            case od.SINGLE_SCAN if value:
+                # Where SYNC numbers the scans, this one would be taken for the next.
+                numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
+                if numbered_by_sync or not self._operational:
+                    raise Refused(AbortCode.DEVICE_STATE)
+
+    def _on_acquisition(self, subindex: int) -> None:
+        store = self._store
+        if subindex == od.ACQUISITION_PERIOD:
+            self._plan()
+        elif subindex == od.TARE and store.integer(od.ACQUISITION, od.TARE):
+            store.put(od.ACQUISITION, od.TARE, 0)
+            self._acquisition.tare(self._now())
+            self._baseline_changed = True
+        elif subindex == od.SINGLE_SCAN and store.integer(od.ACQUISITION, od.SINGLE_SCAN):
+            store.put(od.ACQUISITION, od.SINGLE_SCAN, 0)
+            self._scan(self._following(), frozenset(), self._now())
+
+    def _plan(self) -> None:
+        self._period_ns = self._store.integer(od.ACQUISITION, od.ACQUISITION_PERIOD) * 1_000_000
+        runs = self._operational and self._period_ns
+        self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
+
+    def _read_chunk(self, subindex: int) -> bytes:
+        chunk, width = self._tpdos.chunk, self._profile.code_bits // 8
+        if subindex < od.CHUNK_FIRST_CODE:
+            return chunk[subindex - 1 : subindex]
+        at = 2 + (subindex - od.CHUNK_FIRST_CODE) * width
+        return chunk[at : at + width]
+
+
+def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
+    """A word of 32 wires: open ones at odd sub-indices, shorted ones at even ones."""
+    first = (subindex - 1) // 2 * 32
+    bits = masks[(subindex - 1) % 2][first : first + 32]
+    return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")
+
+
+def _only_resistance(_: int, pattern: int) -> None:
+    (value,) = struct.unpack("<f", pattern.to_bytes(4, "little"))
+    if not 0 < value < math.inf:
+        raise Refused(AbortCode.INVALID_VALUE)

@@ -1,0 +1,140 @@
+"""The object dictionary of a running node: the declarations of the profile, and the values.
+
+Declarations come from :mod:`skinnode.wire.profile`, the same that the EDS files are generated from. Values
+are the bytes that travel (little-endian), so that an SDO answer and a PDO are slices and a joined list. An
+object may be computed when it is read (:meth:`ObjectStore.bind`), may refuse a value
+(:meth:`ObjectStore.guard`) and may act on one that was accepted (:meth:`ObjectStore.watch`); a refused write
+changes nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from skinnode.node.abort import AbortCode, Refused
+from skinnode.wire.dictionary import DataType, Entry, Object, Value
+
+MAX_BYTES: Final = 1 << 16
+"""Longest value of an object without a fixed size that a client may write."""
+
+Reader = Callable[[int], bytes]
+"""Sub-index to value; may refuse."""
+Guard = Callable[[int, int], None]
+"""Sub-index and proposed value (the bit pattern of a REAL32); raises Refused."""
+Watcher = Callable[[int], None]
+"""Called with the sub-index that has just been written."""
+
+
+def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
+    """A value as it travels. Raises OverflowError or struct.error for one that the type cannot hold."""
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, str):
+        return value.encode("ascii")
+    if entry.data_type is DataType.REAL32:
+        return struct.pack("<f", value)
+    return int(value).to_bytes(entry.data_type.bits // 8, "little")
+
+
+class ObjectStore:
+    """Values of all objects of one node.
+
+    ``read`` and ``write`` are a client's accesses and refuse with :class:`~skinnode.node.abort.Refused`;
+    ``raw``,
+    ``integer`` and ``put`` are the node's own, on objects it knows to exist.
+    """
+
+    def __init__(self, objects: Iterable[Object], node_id: int) -> None:
+        self._entries = {(e.index, e.subindex): e for item in objects for e in item.entries}
+        self._indices = {index for index, _ in self._entries}
+        self._node_id = node_id
+        self._values = {key: self._at_start(entry) for key, entry in self._entries.items()}
+        self._readers: dict[tuple[int, int], Reader] = {}
+        self._guards: dict[int, Guard] = {}
+        self._watchers: dict[int, Watcher] = {}
+
+    def _at_start(self, entry: Entry) -> bytes:
+        value = entry.value_at_start(self._node_id)
+        return bytes(entry.data_type.bits // 8) if value is None else to_bytes(entry, value)
+
+    def bind(self, index: int, reader: Reader, *, count: bool = False) -> None:
+        """Compute the sub-objects of ``index`` when they are read; sub-index 0 of an array or record, its
+        count, only if ``count`` is set."""
+        whole = count or (index, 1) not in self._entries
+        for key in self._entries:
+            if key[0] == index and (key[1] or whole):
+                self._readers[key] = reader
+
+    def guard(self, index: int, guard: Guard) -> None:
+        """Let ``guard`` refuse values written to ``index``."""
+        self._guards[index] = guard
+
+    def watch(self, index: int, watcher: Watcher) -> None:
+        """Call ``watcher`` after ``index`` was written."""
+        self._watchers[index] = watcher
+
+    def find(self, index: int, subindex: int) -> Entry:
+        """The declaration. Refuses an object or a sub-object that does not exist."""
+        entry = self._entries.get((index, subindex))
+        if entry is None:
+            raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
+        return entry
+
+    def writable(self, index: int, subindex: int) -> Entry:
+        """The declaration of an object that may be written; refuses any other."""
+        entry = self.find(index, subindex)
+        if entry.access in ("ro", "const"):
+            raise Refused(AbortCode.READ_ONLY)
+        return entry
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """A client's upload."""
+        if self.find(index, subindex).access == "wo":
+            raise Refused(AbortCode.WRITE_ONLY)
+        return self.raw(index, subindex)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """A client's download: checked against declaration and guard, stored, then announced."""
+        entry = self.writable(index, subindex)
+        size = entry.data_type.bits // 8
+        if len(data) > (size or MAX_BYTES):
+            raise Refused(AbortCode.TOO_LONG)
+        if len(data) < size:
+            raise Refused(AbortCode.TOO_SHORT)
+        value = int.from_bytes(data, "little") if size else 0
+        if entry.high is not None and value > entry.high:
+            raise Refused(AbortCode.VALUE_TOO_HIGH)
+        if entry.low is not None and value < entry.low:
+            raise Refused(AbortCode.VALUE_TOO_LOW)
+        guard = self._guards.get(index)
+        if guard is not None:
+            guard(subindex, value)
+        self._values[index, subindex] = data
+        watcher = self._watchers.get(index)
+        if watcher is not None:
+            watcher(subindex)
+
+    def raw(self, index: int, subindex: int) -> bytes:
+        """The bytes of an object, computed if it is bound."""
+        reader = self._readers.get((index, subindex))
+        return self._values[index, subindex] if reader is None else reader(subindex)
+
+    def written(self, index: int, subindex: int) -> bytes:
+        """The bytes a client has written, also where reading computes something else."""
+        return self._values[index, subindex]
+
+    def integer(self, index: int, subindex: int = 0) -> int:
+        """The value of an unsigned object that is not bound."""
+        return int.from_bytes(self._values[index, subindex], "little")
+
+    def put(self, index: int, subindex: int, value: Value | bytes) -> None:
+        """Set an object from within the node; nobody is asked or told."""
+        self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
+
+    def restore(self, first: int, last: int) -> None:
+        """Writable objects from ``first`` to ``last`` as they were at start."""
+        for key, entry in self._entries.items():
+            if first <= key[0] <= last and entry.access not in ("ro", "const"):
+                self._values[key] = self._at_start(entry)

@@ -1,0 +1,134 @@
+"""Drives nodes on a bus: one thread for all boards that share an endpoint."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.errors import BusError
+from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.node import PatchNode
+from skinnode.transport.port import CanPort
+
+_IDLE_S: Final = 0.1
+"""Longest wait for a frame: how soon the thread sees that it should end."""
+
+_RETRY_S: Final = 0.02
+"""Pause after an error of the bus: a queue that was full has drained by then."""
+
+PATIENCE_S: Final = 5.0
+"""An interface that does nothing but fail for this long has gone."""
+
+
+class NodeRunner:
+    """Powers ``nodes`` on and keeps them going until :meth:`stop`.
+
+    Raises ValueError for no nodes, or for two with the same node-ID. A runner runs once. The nodes belong to
+    the thread from :meth:`start` to :meth:`stop`; only counters may be looked at meanwhile. The port stays
+    open.
+    """
+
+    def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
+        self._port = port
+        self.nodes = tuple(nodes)
+        if not self.nodes:
+            raise ValueError("nodes: got none, must be at least one")
+        ids = [node.node_id for node in self.nodes]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
+        self.bus_errors = 0
+        """Errors of the bus that the nodes got over."""
+        self._stopping = threading.Event()
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the thread has ended by an error; :meth:`stop` raises it."""
+        return self._error is not None
+
+    def start(self) -> None:
+        """Power on. The boot-up messages follow from the thread, in the order of the nodes."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End and join the thread; the nodes are off. Raises what ended the thread before: an error of a
+        source, or BusError. Stopping again does nothing."""
+        if self._stopping.is_set():
+            return
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.stop()
+        except Exception:
+            if error is None:  # otherwise what went wrong first is on its way already
+                raise
+
+    def _run(self) -> None:
+        try:
+            now_ns = time.monotonic_ns()
+            for node in self.nodes:
+                node.power_on(now_ns)
+            self._drive()
+        except Exception as error:  # whatever it is, it belongs to whoever calls stop()
+            self._error = error
+        finally:
+            for node in self.nodes:
+                node.power_off()
+
+    def _drive(self) -> None:
+        failing_since_s: float | None = None
+        while not self._stopping.is_set():
+            try:
+                self._turn()
+                failing_since_s = None
+            except BusError:
+                # What could not be sent is lost, as on any bus; the nodes go on. A bus that stays away ends
+                # them.
+                self.bus_errors += 1
+                now_s = time.monotonic()
+                failing_since_s = now_s if failing_since_s is None else failing_since_s
+                if now_s - failing_since_s > PATIENCE_S:
+                    raise
+                self._stopping.wait(_RETRY_S)
+
+    def _turn(self) -> None:
+        """Serve all nodes and at most one frame; returns when there is something to do, or now and then."""
+        nodes, clock = self.nodes, time.monotonic_ns
+        failure: BusError | None = None  # of one node; the others are served all the same
+        # One time for all: nodes that started together stay together, and the thread wakes once for all.
+        now_ns, first_ns = clock(), NO_DEADLINE_NS
+        for node in nodes:
+            deadline_ns = node.next_deadline_ns()
+            if deadline_ns is not None and deadline_ns <= now_ns:
+                try:
+                    node.on_timer(now_ns)
+                except BusError as error:
+                    failure = error
+                deadline_ns = node.next_deadline_ns()
+            if deadline_ns is not None and deadline_ns < first_ns:
+                first_ns = deadline_ns
+        wait_s = min((first_ns - clock()) * 1e-9, _IDLE_S)
+        frame = self._port.recv(wait_s if wait_s > 0.0 else 0.0)
+        if frame is not None and not (frame.error or frame.extended or frame.fd):
+            for node in nodes:
+                try:
+                    node.on_frame(frame.can_id, frame.data, frame.t_ns, frame.remote)
+                except BusError as error:
+                    failure = error
+        if failure is not None:
+            raise failure

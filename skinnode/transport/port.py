@@ -1,0 +1,269 @@
+"""One endpoint on a CAN bus, whatever the interface. With :mod:`skinnode.transport.receiver` the only user of
+python-can at run time: everything it raises leaves here as one line of :class:`~skinnode.errors.BusError`.
+
+Times are of the host's monotonic clock. Where the interface stamps frames with the wall clock (virtual,
+udp_multicast, socketcan) the age of the stamp is kept, so that a frame that waited in a queue is not dated
+late.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+import uuid
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+
+import can
+
+from skinnode.errors import BusError
+
+if TYPE_CHECKING:
+    from skinnode.model.config import BusConfig
+
+VIRTUAL_QUEUE_FRAMES: Final = 32768
+"""Frames that wait in an endpoint of python-can's virtual bus, about 4 s of a full bus at 1 Mbit/s. Without a
+bound an endpoint that nobody reads would eat the memory of the process."""
+
+RECEIVE_BUFFER_BYTES: Final = 1 << 22
+"""Asked of the kernel where the interface is a socket: a waiting frame takes about 800 bytes of it."""
+
+_SO_RCVBUFFORCE: Final = 33  # <asm-generic/socket.h>; Python has no name for it
+
+_OLDEST_STAMP_S: Final = 10.0
+"""A stamp older than this, or of the future, is not of this machine's wall clock: the time of reading
+counts."""
+
+_MULTICAST: Final = "udp_multicast"
+_VIRTUAL: Final = "virtual"
+
+
+# python-can's loggers warn on stderr where a program has set up no logging, also of what BusError says
+# already.
+logging.getLogger("can").addHandler(logging.NullHandler())
+
+
+class Frame(NamedTuple):
+    """A frame off the bus. ``t_ns`` is monotonic; ``data`` is empty for a remote frame."""
+
+    can_id: int
+    data: bytes
+    t_ns: int
+    remote: bool = False
+    error: bool = False
+    extended: bool = False
+    fd: bool = False
+
+
+class _Message(can.Message):
+    """A message that python-can's virtual bus, which deep-copies one for each receiver, copies in a sixth of
+    the time: it is never changed after it was sent, so copies may share its bytes."""
+
+    __slots__ = ()
+
+    def __deepcopy__(self, memo: dict[int, Any] | None) -> can.Message:
+        copy = _Message.__new__(_Message)
+        copy.timestamp = self.timestamp
+        copy.arbitration_id = self.arbitration_id
+        copy.is_extended_id = self.is_extended_id
+        copy.is_remote_frame = self.is_remote_frame
+        copy.is_error_frame = self.is_error_frame
+        copy.channel = self.channel
+        copy.dlc = self.dlc
+        copy.data = self.data[:]
+        copy.is_fd = self.is_fd
+        copy.is_rx = self.is_rx
+        copy.bitrate_switch = self.bitrate_switch
+        copy.error_state_indicator = self.error_state_indicator
+        return copy
+
+
+class CanPort:
+    """An open endpoint. Sends from any thread; receives on one.
+
+    The interface is opened by the constructor and closed by :meth:`close` or at the end of a ``with`` block.
+    An endpoint does not hear what it sent itself. Raises BusError where the interface does not open.
+
+    python-can's own configuration files and environment variables are not consulted: the argument is all.
+    """
+
+    def __init__(self, config: BusConfig) -> None:
+        self.config = config
+        self._where = f"{config.name}: interface {config.interface!r}, channel {config.channel!r}"
+        self._closed = False
+        self._counting = threading.Lock()  # sent is counted by several threads; see send()
+        self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
+        self._bus = self._open()
+        # Frames sent to a multicast group come back, and every member has the same address and port. The one
+        # field that tells them apart is the channel, which python-can sends along and nobody reads.
+        self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
+        self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
+
+    def _open(self) -> can.BusABC:
+        config = self.config
+        options: dict[str, Any] = {"bitrate": config.bitrate_bps}
+        if config.interface == _VIRTUAL:
+            options["rx_queue_size"] = VIRTUAL_QUEUE_FRAMES
+        elif config.interface == _MULTICAST:
+            options["fd"] = True
+        if config.interface not in can.VALID_INTERFACES:
+            raise BusError(
+                f"{self._where}: no such interface, allowed: {', '.join(sorted(can.VALID_INTERFACES))}"
+            )
+        try:
+            bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
+        except (
+            Exception
+        ) as error:  # backends raise what their drivers raise: OSError, ImportError, TypeError …
+            raise BusError(
+                f"{self._where}: does not open ({_why(error)}), allowed: {_channel_hint(config)}"
+            ) from error
+        if config.interface in (_MULTICAST, "socketcan"):
+            _enlarge_receive_buffer(bus.fileno())
+        return bus
+
+    @property
+    def sent(self) -> int:
+        """Frames handed to the interface."""
+        return self._sent
+
+    @property
+    def received(self) -> int:
+        """Frames read, without the endpoint's own."""
+        return self._received
+
+    @property
+    def errors(self) -> int:
+        """Sends and receives that raised BusError."""
+        return self._errors
+
+    @property
+    def undelivered(self) -> int:
+        """Frames on a virtual bus that some other endpoint had no room for: its loss, not the sender's."""
+        return self._undelivered
+
+    @property
+    def malformed(self) -> int:
+        """Packets of the multicast group that were no CAN frame."""
+        return self._malformed
+
+    def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+        """Send a classic frame with an 11-bit identifier. ``data`` is up to 8 bytes.
+
+        Raises BusError if the interface refuses it; ValueError for an identifier or a length that no such
+        frame has. A full queue of another endpoint of a virtual bus is that endpoint's loss, as on a real
+        one.
+        """
+        if not 0 <= can_id <= 0x7FF:
+            raise ValueError(f"can_id: got {can_id}, must be 0 to 0x7FF")
+        if len(data) > 8:
+            raise ValueError(f"data: got {len(data)} bytes, must be at most 8")
+        message = _Message(
+            arbitration_id=can_id, is_extended_id=False, is_remote_frame=remote, channel=self._tag, data=data
+        )
+        undelivered = 0
+        try:
+            self._bus.send(message, self._send_timeout_s)
+        except (can.CanError, OSError, ValueError) as error:
+            if self._closed or self.config.interface != _VIRTUAL:
+                with self._counting:
+                    self._errors += 1
+                raise BusError(f"{self._where}: 0x{can_id:03X} not sent ({_why(error)})") from error
+            undelivered = 1
+        with self._counting:
+            self._sent += 1
+            self._undelivered += undelivered
+
+    def recv(self, timeout_s: float) -> Frame | None:
+        """The next frame, or None after ``timeout_s``. Raises BusError if the interface fails or is
+        closed."""
+        end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        while True:
+            try:
+                message = self._bus.recv(timeout_s)
+                if message is None:
+                    return None
+                if self._tag is None or message.channel != self._tag:
+                    self._received += 1
+                    return _frame(message)
+            except (can.CanError, OSError, ValueError) as error:
+                if self._closed or not _is_garbage(error):
+                    self._errors += 1
+                    raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
+                self._malformed += 1
+            # The endpoint's own frame, or none at all: wait for what is left of the time.
+            timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
+
+    def close(self) -> None:
+        """Close the interface. Closing twice is fine; a thread that receives must have ended before."""
+        if not self._closed:
+            self._closed = True
+            self._bus.shutdown()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<CanPort {self._where}>"
+
+
+def _enlarge_receive_buffer(fileno: int) -> None:
+    """Ask the kernel for room for bursts. It grants what the machine's net.core.rmem_max and our rights
+    allow."""
+    duplicate = socket.socket(fileno=os.dup(fileno))
+    try:
+        duplicate.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+    except OSError:  # only root may exceed rmem_max
+        duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    finally:
+        duplicate.close()
+
+
+def _frame(message: can.Message) -> Frame:
+    now_ns = time.monotonic_ns()
+    age_s = time.time() - message.timestamp
+    if 0.0 < age_s < _OLDEST_STAMP_S:
+        now_ns -= int(age_s * 1e9)
+    return Frame(
+        message.arbitration_id,
+        bytes(message.data),
+        now_ns,
+        message.is_remote_frame,
+        message.is_error_frame,
+        message.is_extended_id,
+        message.is_fd,
+    )
+
+
+def _is_garbage(error: Exception) -> bool:
+    """Whether the multicast bus failed on what a packet said rather than on the network: its error then comes
+    from msgpack or from a check of the message, and not from the socket."""
+    cause = error.__cause__
+    return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
+
+
+def _why(error: BaseException) -> str:
+    """The most telling of a chain of errors, in one line."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    if error.__context__ is not None and isinstance(error.__context__, OSError):
+        error = error.__context__
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _channel_hint(config: BusConfig) -> str:
+    match config.interface:
+        case "socketcan":
+            return "a CAN network interface that exists and is up (see `ip -details link show type can`)"
+        case "udp_multicast":
+            return "a multicast address of a network that is up, such as 239.74.163.2"
+        case _:
+            return f"a channel that python-can's {config.interface} interface can open"

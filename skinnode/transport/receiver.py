@@ -1,0 +1,110 @@
+"""The receive context: a thread that copies frames into a bounded queue, counts what does not fit, and
+nothing else. Whoever owns the receiver reads whole batches from the other end."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.errors import BusError
+from skinnode.transport.port import CanPort, Frame
+
+CAPACITY_FRAMES: Final = 16384
+"""Two seconds of a full bus at 1 Mbit/s (8,000 frames/s): longer than any pause a host survives otherwise."""
+
+_POLL_S: Final = 0.1
+"""How long the thread waits before it looks whether it should end."""
+
+
+class Receiver:
+    """Frames of ``port``, received on a thread of its own from construction until :meth:`close`.
+
+    When the queue is full the newest frame is dropped, as a kernel socket does: what has been queued stays
+    complete and in order, and only the thread that fills the queue ever touches its end. ``dropped`` counts.
+
+    An error of the bus ends the thread and is raised to the reader, after the frames that came before it.
+    """
+
+    def __init__(self, port: CanPort, capacity: int = CAPACITY_FRAMES) -> None:
+        if capacity < 1:
+            raise ValueError(f"capacity: got {capacity}, must be at least 1")
+        self._port = port
+        self._capacity = capacity
+        self._queue: queue.SimpleQueue[Frame | None] = queue.SimpleQueue()  # None: the bus failed
+        self._dropped = 0
+        self._error: BusError | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"receive {port.config.name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Frames that found the queue full."""
+        return self._dropped
+
+    @property
+    def queued(self) -> int:
+        """Frames waiting to be read."""
+        return self._queue.qsize()
+
+    def get_batch(self, timeout_s: float, max_frames: int = 1024) -> list[Frame]:
+        """All frames waiting, at most ``max_frames``, in order of arrival; waits up to ``timeout_s`` for the
+        first and returns an empty list if there is none. Raises BusError once the bus has failed."""
+        batch: list[Frame] = []
+        try:
+            frame = self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
+            while frame is not None:
+                batch.append(frame)
+                if len(batch) == max_frames:
+                    return batch
+                frame = self._queue.get_nowait()
+        except queue.Empty:
+            return batch
+        self._queue.put(None)  # whoever asks next hears of the failure too
+        if batch:
+            return batch
+        assert self._error is not None  # set before the mark was queued
+        raise self._error
+
+    def close(self) -> None:
+        """End and join the thread. The port stays open: it belongs to whoever opened it."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        receive, put, size = self._port.recv, self._queue.put, self._queue.qsize
+        stopped, capacity = self._stop.is_set, self._capacity
+        try:
+            while not stopped():
+                frame = receive(_POLL_S)
+                if frame is None:
+                    continue
+                if size() < capacity:
+                    put(frame)
+                else:
+                    self._dropped += 1
+        except BusError as error:
+            self._error = error
+            put(None)
+
+
+def drain(port: CanPort, within_s: float) -> list[Frame]:
+    """Every frame that arrives within ``within_s``. For tools and tests that need no thread."""
+    frames: list[Frame] = []
+    end_ns = time.monotonic_ns() + int(within_s * 1e9)
+    while (left_ns := end_ns - time.monotonic_ns()) > 0:
+        frame = port.recv(left_ns * 1e-9)
+        if frame is not None:
+            frames.append(frame)
+    return frames

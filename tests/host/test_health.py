@@ -1,0 +1,80 @@
+"""One word for a patch, drawn from what its node says and does."""
+
+from __future__ import annotations
+
+import pytest
+
+from skinnode.host.health import Condition, NodeMonitor
+
+MS = 1_000_000
+
+
+def condition(monitor: NodeMonitor, now_ms: int) -> Condition:
+    return monitor.health(now_ms * MS, heartbeat_s=0.25, scan_s=0.08).condition
+
+
+@pytest.fixture
+def monitor() -> NodeMonitor:
+    return NodeMonitor("thumb", 11)
+
+
+def test_life_of_a_node(monitor: NodeMonitor) -> None:
+    assert condition(monitor, 0) is Condition.NEVER_SEEN
+    monitor.on_heartbeat(b"\x00", 10 * MS)
+    assert condition(monitor, 11) is Condition.BOOTING
+    monitor.on_heartbeat(b"\x7f", 260 * MS)
+    assert condition(monitor, 261) is Condition.BOOTING
+    monitor.running = True
+    monitor.on_heartbeat(b"\x05", 510 * MS)
+    assert condition(monitor, 511) is Condition.STALE
+    monitor.on_scan(590 * MS)
+    assert condition(monitor, 600) is Condition.OPERATIONAL
+    monitor.on_heartbeat(b"\x05", 760 * MS)
+    assert condition(monitor, 590 + 240) is Condition.OPERATIONAL  # three periods of 80 ms
+    assert condition(monitor, 590 + 241) is Condition.STALE
+    assert condition(monitor, 760 + 751) is Condition.LOST  # three of 250 ms
+
+
+def test_restart_is_remembered_for_five_seconds(monitor: NodeMonitor) -> None:
+    monitor.running = True
+    monitor.on_heartbeat(b"\x05", 0)
+    monitor.on_heartbeat(b"\x00", 100 * MS)
+    assert condition(monitor, 101) is Condition.RESTARTING
+    for t_ms in range(300, 5301, 250):
+        monitor.on_heartbeat(b"\x05", t_ms * MS)
+        monitor.on_scan(t_ms * MS)
+    assert condition(monitor, 5099) is Condition.RESTARTING
+    assert condition(monitor, 5301) is Condition.OPERATIONAL
+    assert monitor.health(5301 * MS, 0.25, 0.08).boot_ups == 1
+
+
+def test_a_boot_up_that_was_waited_for_is_no_restart(monitor: NodeMonitor) -> None:
+    monitor.on_heartbeat(b"\x00", 100 * MS)
+    monitor.running = True
+    monitor.on_heartbeat(b"\x05", 200 * MS)
+    monitor.on_scan(200 * MS)
+    assert condition(monitor, 201) is Condition.OPERATIONAL
+
+
+def test_emergency_makes_faulty_until_it_is_over(monitor: NodeMonitor) -> None:
+    monitor.on_heartbeat(b"\x05", 0)
+    monitor.on_scan(0)
+    monitor.on_emergency(bytes.fromhex("00 50 81 00 03 01 00 00"), 1 * MS)
+    health = monitor.health(2 * MS, 0.25, 0.08)
+    assert health.condition is Condition.FAULTY
+    assert (health.emergencies, health.last_emergency, health.error_register) == (1, 0x5000, 0x81)
+    monitor.on_emergency(bytes(8), 3 * MS)
+    health = monitor.health(4 * MS, 0.25, 0.08)
+    assert health.condition is Condition.OPERATIONAL
+    assert (health.emergencies, health.last_emergency, health.error_register) == (1, 0x5000, 0)
+
+
+def test_toggle_bit_of_node_guarding_is_not_state(monitor: NodeMonitor) -> None:
+    monitor.on_heartbeat(b"\x85", 0)
+    assert monitor.health(0, 0.25, 0.08).nmt_state == 5
+
+
+@pytest.mark.parametrize("data", [b"", b"\x05\x00"])
+def test_malformed_heartbeat_says_nothing(monitor: NodeMonitor, data: bytes) -> None:
+    monitor.on_heartbeat(data, 0)
+    assert condition(monitor, 1) is Condition.NEVER_SEEN

@@ -1,0 +1,80 @@
+"""SYNC: counter, order, buses side by side, and what happens when the timer thread is held up."""
+
+from __future__ import annotations
+
+import queue
+import threading
+
+from skinnode.errors import BusError
+from skinnode.host.sync import SyncProducer, Ticks
+
+
+def test_counter_runs_from_one_and_wraps() -> None:
+    sent: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+    ticks = Ticks(3)
+    with SyncProducer([lambda cob_id, data: sent.put((cob_id, data))], 0.002, ticks):
+        frames = [sent.get(timeout=10) for _ in range(8)]
+    assert frames == [(0x80, bytes([counter])) for counter in (1, 2, 3, 1, 2, 3, 1, 2)]
+
+
+def test_ticks_name_the_newest_sync_of_a_counter() -> None:
+    ticks = Ticks(240)
+    assert ticks.find(1) is None
+    assert [ticks.note(number, 1000 * number) for number in (1, 240, 241, 242)] == [1, 240, 1, 2]
+    assert ticks.find(1) == (241, 241_000)
+    assert ticks.find(2) == (242, 242_000)
+    assert ticks.find(240) == (240, 240_000)
+    assert ticks.find(0) is None
+    assert ticks.find(241) is None
+
+
+def test_the_tick_is_known_before_the_frame_is_out() -> None:
+    """A node may answer before send() returns."""
+    ticks = Ticks(240)
+    known: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    with SyncProducer([lambda _, data: known.put(ticks.find(data[0]) is not None)], 0.002, ticks):
+        assert [known.get(timeout=10) for _ in range(5)] == [True] * 5
+
+
+def test_a_bus_that_refuses_does_not_silence_the_others() -> None:
+    sent: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def broken(cob_id: int, data: bytes) -> None:
+        raise BusError("can0: 0x080 not sent (no buffer space)")
+
+    with SyncProducer([broken, lambda _, data: sent.put(data[0])], 0.002, Ticks(240)) as sync:
+        assert [sent.get(timeout=10) for _ in range(3)] == [1, 2, 3]
+    stats = sync.stats()
+    assert stats.failed == stats.sent >= 3
+
+
+def test_missed_periods_are_skipped_and_counted_not_sent_in_a_burst() -> None:
+    period_s = 0.02
+    sent: queue.SimpleQueue[int] = queue.SimpleQueue()
+    hold = threading.Event()
+
+    def send(cob_id: int, data: bytes) -> None:
+        sent.put(data[0])
+        if data[0] == 1:
+            hold.wait(5.5 * period_s)
+
+    ticks = Ticks(240)
+    with SyncProducer([send], period_s, ticks) as sync:
+        assert [sent.get(timeout=10) for _ in range(4)] == [1, 2, 3, 4]
+    assert sync.stats().missed >= 4
+    second, third, fourth = (ticks.find(counter) for counter in (2, 3, 4))
+    assert second is not None
+    assert third is not None
+    assert fourth is not None
+    # No burst: what follows keeps to the raster of the periods. Lateness only makes the first gap shorter.
+    assert fourth.t_ns - second.t_ns > period_s * 1e9
+
+
+def test_nothing_is_sent_after_close() -> None:
+    sent: queue.SimpleQueue[int] = queue.SimpleQueue()
+    with SyncProducer([lambda _, data: sent.put(data[0])], 0.001, Ticks(240)):
+        sent.get(timeout=10)
+    while not sent.empty():
+        sent.get()
+    threading.Event().wait(0.02)
+    assert sent.empty()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
 from vcan_sim.scene import Scene
+
+REMEMBERED_READINGS: Final = 4096
+"""Readings whose time is kept: more than five minutes of scans at 12.5 a second."""
 
 Fault = Callable[[Float, int], Float]
 """What is wrong with a patch: resistances (U, K) in ohm and the time in ns to what the converter sees
@@ -19,7 +24,7 @@ class SimulatedPatch:
 
     A :class:`skinnode.node.source.ResistanceSource`. The scene lies at rest until :meth:`start` sets its
     origin of time, so that readings at power-on (a tare) see a patch that nobody touches. The truth is a pure
-    function of time and kept nowhere: :meth:`truth_m` gives it for any reading, however long ago.
+    function of time and kept nowhere: :meth:`truth_m` gives it for any time, :meth:`read_ns` that of a scan.
 
     Args:
         scene: what happens on the skin.
@@ -34,11 +39,14 @@ class SimulatedPatch:
         self.fault = fault
         self.reads = 0
         """Readings so far, those of a tare included."""
+        self.last_read_ns = 0
+        """Time of the newest reading."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
         self._random = np.random.default_rng([scene.simulation.seed, scene.number])
         self._forward = _Forward(scene.layout)
         self._rest_ohm = self._forward(scene.layout.upper_m)
         self._origin_ns: int | None = None
+        self._read_ns: OrderedDict[int, int] = OrderedDict()
 
     @property
     def started(self) -> bool:
@@ -52,17 +60,36 @@ class SimulatedPatch:
         """(U, K) resistances in ohm at ``t_ns`` with the converter's noise. The k-th reading of a seed has
         the same noise whenever it is taken."""
         self.reads += 1
+        self.last_read_ns = t_ns
+        self._remember(t_ns)
         upper = self.truth_m(t_ns)
         resting = upper is self.scene.layout.upper_m
         resistance = self._rest_ohm if resting else self._forward(upper)
         read = resistance * (1.0 + self._noise * self._random.standard_normal(resistance.shape))
         return read if self.fault is None else self.fault(read, t_ns)
 
+    def read_ns(self, device_time_us: int) -> int:
+        """When the reading was taken that a node calls ``device_time_us``, the u32 of its scan summary.
+
+        Raises LookupError if there was none, or if it is too long ago.
+        """
+        try:
+            return self._read_ns[device_time_us]
+        except KeyError:
+            raise LookupError(
+                f"no reading at device time {device_time_us} µs among the last {len(self._read_ns)}"
+            ) from None
+
     def truth_m(self, t_ns: int) -> Float:
         """(U, N, 3) true electrodes at ``t_ns``, metres."""
         if self._origin_ns is None:
             return self.scene.layout.upper_m
         return self.scene.upper_m((t_ns - self._origin_ns) * 1e-9)
+
+    def _remember(self, t_ns: int) -> None:
+        self._read_ns[t_ns // 1000 & 0xFFFF_FFFF] = t_ns
+        if len(self._read_ns) > REMEMBERED_READINGS:
+            self._read_ns.popitem(last=False)
 
 
 class _Forward:

@@ -1,0 +1,120 @@
+"""``vcan-sim hand.toml``: the patches of a hand as CANopen nodes, pressed by a simulated indenter.
+
+Exit status: 0 ended as asked (Ctrl-C, SIGTERM or ``--seconds``), 2 could not run or could not go on.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.errors import SkinError
+
+if TYPE_CHECKING:
+    from skinnode.node import NmtState
+    from vcan_sim.fleet import Fleet, NodeReport
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.command()
+def simulate(
+    hand: Annotated[Path, typer.Argument(help="The hand to simulate.", metavar="HAND.toml")],
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
+    ] = None,
+) -> None:
+    """Simulate the patches of a hand: CANopen nodes on a bus, a sphere pressing and sliding over each.
+
+    Bring them up with `skinnode host` and the same file in another terminal.
+    """
+    from skinnode.model.config import load_hand
+    from vcan_sim.fleet import Fleet
+
+    plan = load_hand(hand).on(interface, channel)
+    with _until_told() as ended, Fleet(plan) as fleet:
+        where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
+        _say(f"{len(plan.patches)} patches of {plan.name!r} on {where}; Ctrl-C ends")
+        _watch(fleet, ended.wait, seconds)
+    _say(_summary(fleet.report()))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of the console script."""
+    try:
+        app(args=argv)
+    except (SkinError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
+
+
+@contextmanager
+def _until_told() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, so that both end the program the ordinary way."""
+    told = threading.Event()
+
+    def tell(_signal: int, _frame: FrameType | None) -> None:
+        told.set()
+
+    kept = {number: signal.signal(number, tell) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield told
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:
+    """A line a second until ``wait`` says that it is over, time is up, or a node thread has failed."""
+    start = time.monotonic()
+    before = fleet.report()
+    for second in range(1, sys.maxsize):
+        due = float(second) if seconds is None else min(second, seconds)
+        if wait(max(0.0, start + due - time.monotonic())) or fleet.failed:
+            return
+        now = fleet.report()
+        _say(_progress(due, before, now))
+        before = now
+        if seconds is not None and due >= seconds:
+            return
+
+
+def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
+    steps = list(zip(before, now, strict=True))
+    frames = sum(new.frames_sent - old.frames_sent for old, new in steps)
+    each = "  ".join(
+        f"{new.patch} {_words(new.nmt_state)} {new.scans_sent - old.scans_sent} scans" for old, new in steps
+    )
+    return f"{elapsed_s:6.1f} s  {each}  {frames} frames"
+
+
+def _words(state: NmtState) -> str:
+    return state.name.lower().replace("_", "-")
+
+
+def _summary(reports: Sequence[NodeReport]) -> str:
+    scans, frames = sum(r.scans_sent for r in reports), sum(r.frames_sent for r in reports)
+    return f"sent {scans} scans in {frames} frames from {len(reports)} nodes"
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

@@ -1,0 +1,455 @@
+"""Gauss-Newton, Levenberg-Marquardt and trust-region dogleg, written once as reverse communication.
+
+    begin      r and J at x are in the workspace
+    propose    factor J, return a status or put the next trial point into ``trial``
+    judge      r at ``trial`` is in ``r_trial``: take it or not, update the radius, return what is next
+
+The caller evaluates the functions, so the same compiled steps serve the compiled driver of a skin wire and any
+pair of Python callables. Symbols are the paper's: r residual (m,), J its Jacobian (m, n), stored transposed,
+lam the Levenberg-Marquardt parameter, radius that of the trust region ‖D s‖ ≤ radius, D the running maximum of
+the column norms of J (Moré 1978), so that the unit of an unknown does not matter.
+
+Gauss-Newton takes every step in full, as the paper's does; the other two take a step only when r gets smaller.
+
+What CONVERGED means. Square systems: a root, that is max|r| ≤ tol_f *and* a simplified Newton correction
+‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞), by the factors at hand. Where rounding keeps r above tol_f, r within the
+rounding of J·x counts as zero. Tall systems: a minimum, ‖P r‖ ≤ tol_f ‖r‖ with P the projection on the range of J,
+and the same correction. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED: J is singular there.
+
+Sources: Moré, The Levenberg-Marquardt algorithm, 1978 (parameter iteration, radius factors 1/4, 3/4, 0.0001);
+Powell, A hybrid method for nonlinear equations, 1970 (dogleg); Deuflhard, Newton methods for nonlinear problems,
+2004 (simplified correction as the error estimate); Xu et al. 2018, eqs. 8-10.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from skinnode.jit import njit
+from skinnode.model.layout import Float
+from skinnode.model.status import Status
+from skinnode.solve.linear import (
+    Index,
+    damped_solve,
+    dot,
+    largest,
+    lu_factor,
+    lu_inverse_transposed,
+    lu_solve_transposed,
+    qr_factor,
+    qr_inverse,
+    qr_project,
+    r_solve,
+    r_solve_transposed,
+)
+
+OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
+GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
+LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
+
+# What propose and judge return besides a terminal Status, which is ≥ 0.
+TRY: Final = -1
+ACCEPTED: Final = -2
+REJECTED: Final = -3
+
+# The compiled code sees plain integers.
+CONVERGED: Final = int(Status.CONVERGED)
+MAX_STEPS: Final = int(Status.MAX_STEPS)
+RADIUS_TOO_SMALL: Final = int(Status.RADIUS_TOO_SMALL)
+STEP_TOO_SMALL: Final = int(Status.STEP_TOO_SMALL)
+ILL_CONDITIONED: Final = int(Status.ILL_CONDITIONED)
+NON_FINITE: Final = int(Status.NON_FINITE)
+INVALID_START: Final = int(Status.INVALID_START)
+
+EPS: Final = float(np.finfo(np.float64).eps)
+STATIONARY: Final = 1e-7
+"""A gradient below this share of ‖J_j‖ ‖r‖ is zero: r² is then flat to rounding, about √eps."""
+STALL_LIMIT: Final = 8
+"""Steps below the rounding of ‖r‖² that a tall system may take to settle its x."""
+
+# Scalars of a solve, in Work.s
+LIMIT, RADIUS, LAM, NORM, LENGTH, NEWTON_LENGTH, ERROR, ANGLE, SCALARS = range(9)
+# Flags of a solve, in Work.flag
+FACTORED, SINGULAR, SIGN, HAS_QR, STALLED, FLAGS = range(6)
+
+
+class Work(NamedTuple):
+    """Everything a solve of m equations in n unknowns writes to."""
+
+    x: Float
+    trial: Float
+    step: Float
+    newton: Float
+    gradient: Float
+    scale: Float
+    """(n,) D."""
+    diagonal: Float
+    """(n,) of R."""
+    beta: Float
+    """(n,) of the reflectors."""
+    qtr: Float
+    """(n,) −Qᵀ r."""
+    v: Float
+    d: Float
+    damping: Float
+    sd: Float
+    r: Float
+    r_trial: Float
+    js: Float
+    """(m,) J·step."""
+    e: Float
+    """(m,) scratch."""
+    jt: Float
+    """(n, m) Jᵀ at x."""
+    lu: Float
+    """(n, n) of Jᵀ where the system is square."""
+    qr: Float
+    """(m, n) of J."""
+    triangle: Float
+    pivot: Index
+    s: Float
+    flag: Index
+
+
+def workspace(n: int, m: int) -> Work:
+    """A zeroed workspace for m equations in n unknowns."""
+    vectors = [np.zeros(n) for _ in range(13)]
+    equations = [np.zeros(m) for _ in range(4)]
+    matrices = [np.zeros((n, m)), np.zeros((n, n)), np.zeros((m, n)), np.zeros((n, n))]
+    return Work(
+        *vectors, *equations, *matrices, np.zeros(n, np.int64), np.zeros(SCALARS), np.zeros(FLAGS, np.int64)
+    )
+
+
+@njit
+def begin(w: Work) -> int:
+    """Start from x, r and J in the workspace. TRY, or INVALID_START where r is not finite or m < n."""
+    s, flag = w.s, w.flag
+    for k in range(flag.size):
+        flag[k] = 0
+    s[RADIUS] = -1.0  # set by the first propose, which knows D
+    s[LAM] = 0.0
+    s[ERROR] = math.inf
+    s[ANGLE] = 1.0
+    s[NORM] = math.sqrt(dot(w.r, w.r))
+    for j in range(w.scale.size):
+        w.scale[j] = 0.0
+    if w.r.size < w.x.size or not s[NORM] < math.inf:
+        return INVALID_START
+    return TRY
+
+
+@njit
+def _weighted(scale: Float, v: Float) -> float:
+    """‖D v‖₂"""
+    total = 0.0
+    for j in range(v.size):
+        total += (scale[j] * v[j]) ** 2
+    return math.sqrt(total)
+
+
+@njit
+def _times_jacobian(jt: Float, v: Float, out: Float) -> None:
+    """J v into ``out`` (m,)."""
+    for k in range(out.size):
+        out[k] = 0.0
+    for j in range(v.size):
+        row, factor = jt[j], v[j]
+        for k in range(out.size):
+            out[k] += factor * row[k]
+
+
+@njit
+def _correction(w: Work, r: Float, out: Float) -> float:
+    """−J⁺ r into ``out`` (n,) with the factors at hand; its largest element."""
+    n = out.size
+    if w.r.size == n:
+        for j in range(n):
+            out[j] = -r[j]
+        lu_solve_transposed(w.lu, w.pivot, out)
+    else:
+        for k in range(r.size):
+            w.e[k] = -r[k]
+        qr_project(w.qr, w.beta, w.e)
+        r_solve(w.qr, w.diagonal, w.e)
+        for j in range(n):
+            out[j] = w.e[j]
+    return largest(out)
+
+
+@njit
+def _factor(w: Work) -> None:
+    """Factor J at x and compute the Newton step."""
+    n = w.x.size
+    flag = w.flag
+    flag[FACTORED] = 1
+    flag[HAS_QR] = 0
+    if w.r.size == n:
+        for j in range(n):
+            target, source = w.lu[j], w.jt[j]
+            for k in range(n):
+                target[k] = source[k]
+        flag[SIGN] = lu_factor(w.lu, w.pivot)
+        flag[SINGULAR] = int(flag[SIGN] == 0)
+    else:
+        flag[HAS_QR] = 1
+        flag[SINGULAR] = 1 - qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v)
+    if flag[SINGULAR] == 0:
+        w.s[ERROR] = _correction(w, w.r, w.newton)
+        flag[SINGULAR] = int(not w.s[ERROR] < math.inf)
+
+
+@njit
+def _within_rounding(w: Work, r: Float) -> bool:
+    """True where every r is what rounding x alone can cause: |r_k| ≤ 4 eps Σ_j |J_kj x_j|."""
+    for k in range(r.size):
+        w.e[k] = 0.0
+    for j in range(w.x.size):
+        row, size = w.jt[j], abs(w.x[j])
+        for k in range(r.size):
+            w.e[k] += abs(row[k]) * size
+    for k in range(r.size):
+        if not abs(r[k]) <= 4.0 * EPS * w.e[k]:
+            return False
+    return True
+
+
+@njit
+def _slope(w: Work) -> float:
+    """Gradient Jᵀr into the workspace; its largest cosine |J_j·r| / (D_j ‖r‖)."""
+    top = 0.0
+    for j in range(w.x.size):
+        w.gradient[j] = dot(w.jt[j], w.r)
+        top = max(top, abs(w.gradient[j]) / (w.scale[j] * w.s[NORM]))
+    return top
+
+
+@njit
+def _dogleg_step(w: Work) -> None:
+    """Powell's step: along −D⁻²g to the Cauchy point, from there towards Newton, to the radius."""
+    n, radius = w.x.size, w.s[RADIUS]
+    square = 0.0
+    for j in range(n):
+        w.v[j] = -w.gradient[j] / w.scale[j] ** 2
+        square += w.gradient[j] * -w.v[j]
+    _times_jacobian(w.jt, w.v, w.js)
+    curvature = dot(w.js, w.js)
+    length = math.sqrt(square)
+    cauchy = square / curvature if curvature > 0.0 else math.inf
+    if cauchy * length >= radius:
+        for j in range(n):
+            w.step[j] = w.v[j] * (radius / length)
+        return
+    for j in range(n):
+        w.step[j] = w.v[j] * cauchy
+    if w.flag[SINGULAR] == 1:
+        return
+    a, b, c = 0.0, 0.0, (cauchy * length) ** 2 - radius * radius
+    for j in range(n):
+        leg = w.newton[j] - w.step[j]
+        weight = w.scale[j] ** 2
+        a += weight * leg * leg
+        b += weight * leg * w.step[j]
+    root = math.sqrt(b * b - a * c)
+    share = -c / (b + root) if b > 0.0 else (root - b) / a
+    for j in range(n):
+        w.step[j] += share * (w.newton[j] - w.step[j])
+
+
+@njit
+def _marquardt_step(w: Work) -> None:
+    """The step with ‖D s‖ within a tenth of the radius, by Newton's method on lam (Moré 1978, section 5)."""
+    n, s = w.x.size, w.s
+    radius = s[RADIUS]
+    if w.flag[HAS_QR] == 0:
+        w.flag[HAS_QR] = 1
+        qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v)
+    for k in range(w.r.size):
+        w.e[k] = -w.r[k]
+    qr_project(w.qr, w.beta, w.e)
+    total = 0.0
+    for j in range(n):
+        w.qtr[j] = w.e[j]
+        total += (w.gradient[j] / w.scale[j]) ** 2
+    gradient = math.sqrt(total)
+    low, high = 0.0, gradient / radius
+    if w.flag[SINGULAR] == 0:
+        for j in range(n):
+            w.v[j] = w.scale[j] ** 2 * (w.newton[j] / s[NEWTON_LENGTH])
+        r_solve_transposed(w.qr, w.diagonal, w.v)
+        bound = (s[NEWTON_LENGTH] - radius) / (radius * dot(w.v, w.v))
+        if bound < math.inf:
+            low = bound
+    lam = min(max(s[LAM], low), high)
+    if lam == 0.0:
+        lam = gradient / s[NEWTON_LENGTH] if w.flag[SINGULAR] == 0 else 1e-3 * high
+    before = 0.0
+    for _ in range(10):
+        lam = max(lam, 1e-3 * high if lam == 0.0 else lam)
+        root = math.sqrt(lam)
+        for j in range(n):
+            w.damping[j] = root * w.scale[j]
+        damped_solve(w.qr, w.diagonal, w.qtr, w.damping, w.triangle, w.sd, w.d, w.step)
+        length = _weighted(w.scale, w.step)
+        excess = length - radius
+        if abs(excess) <= 0.1 * radius or (low == 0.0 and excess <= before < 0.0):
+            break
+        before = excess
+        for j in range(n):
+            w.v[j] = w.scale[j] ** 2 * (w.step[j] / length)
+        r_solve_transposed(w.triangle, w.sd, w.v)
+        if excess > 0.0:
+            low = max(low, lam)
+        else:
+            high = min(high, lam)
+        lam = max(low, lam + excess / (radius * dot(w.v, w.v)))
+    s[LAM] = lam
+
+
+@njit
+def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
+    """Next trial point: TRY with ``trial``, ``step`` and ``js`` set, or a Status."""
+    n, s, flag = w.x.size, w.s, w.flag
+    if flag[FACTORED] == 0:
+        _factor(w)
+        if flag[SINGULAR] == 1:
+            for j in range(n):
+                if not largest(w.jt[j]) < math.inf:
+                    return NON_FINITE
+        else:
+            settled = largest(w.r) <= tol_f
+            if w.r.size > n:
+                _times_jacobian(w.jt, w.newton, w.js)
+                s[ANGLE] = math.sqrt(dot(w.js, w.js)) / s[NORM] if s[NORM] > 0.0 else 0.0
+                settled = settled or s[ANGLE] <= tol_f
+            if settled and s[ERROR] <= tol_x * max(1.0, largest(w.x)):
+                return CONVERGED
+        if operator != GAUSS_NEWTON:
+            for j in range(n):
+                w.scale[j] = max(w.scale[j], math.sqrt(dot(w.jt[j], w.jt[j])))
+                if w.scale[j] == 0.0:
+                    w.scale[j] = 1.0
+            if s[RADIUS] < 0.0:
+                size = _weighted(w.scale, w.x)
+                s[RADIUS] = 100.0 * size if size > 0.0 else 100.0
+                if s[LIMIT] > 0.0:
+                    s[RADIUS] = s[LIMIT] * math.sqrt(dot(w.scale, w.scale))
+            s[NEWTON_LENGTH] = _weighted(w.scale, w.newton) if flag[SINGULAR] == 0 else math.inf
+    full = flag[SINGULAR] == 0
+    if operator == GAUSS_NEWTON:
+        if not full:
+            return ILL_CONDITIONED
+    elif full:
+        full = s[NEWTON_LENGTH] <= (1.1 if operator == LEVENBERG_MARQUARDT else 1.0) * s[RADIUS]
+    if full:
+        s[LAM] = 0.0
+        for j in range(n):
+            w.step[j] = w.newton[j]
+    elif _slope(w) <= EPS:
+        return CONVERGED if w.r.size > n and flag[SINGULAR] == 0 else ILL_CONDITIONED
+    elif operator == LEVENBERG_MARQUARDT:
+        _marquardt_step(w)
+    else:
+        _dogleg_step(w)
+    for j in range(n):
+        w.trial[j] = w.x[j] + w.step[j]
+    if operator != GAUSS_NEWTON:
+        s[LENGTH] = _weighted(w.scale, w.step)
+        _times_jacobian(w.jt, w.step, w.js)
+    return TRY
+
+
+@njit
+def _take(w: Work, norm: float) -> None:
+    for j in range(w.x.size):
+        w.x[j] = w.trial[j]
+    for k in range(w.r.size):
+        w.r[k] = w.r_trial[k]
+    w.s[NORM] = norm
+    w.flag[FACTORED] = 0
+
+
+@njit
+def _ended(w: Work) -> int:
+    """The status of a search that cannot get r any smaller."""
+    slope = _slope(w)
+    if w.r.size > w.x.size:
+        return CONVERGED if w.flag[SINGULAR] == 0 and w.s[ANGLE] <= STATIONARY else STEP_TOO_SMALL
+    return ILL_CONDITIONED if slope <= STATIONARY else STEP_TOO_SMALL
+
+
+@njit
+def judge(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
+    """Judge ``r_trial``: ACCEPTED (the caller evaluates J at x), REJECTED or a Status."""
+    s, flag = w.s, w.flag
+    norm = math.sqrt(dot(w.r_trial, w.r_trial))
+    finite = norm < math.inf
+    if finite and norm > 0.25 * s[NORM] and flag[SINGULAR] == 0 and _within_rounding(w, w.r_trial):
+        _take(w, norm)  # no closer to the root in this arithmetic
+        s[ERROR] = _correction(w, w.r, w.newton)
+        return CONVERGED
+    if operator == GAUSS_NEWTON:
+        if not finite:
+            return NON_FINITE
+    else:
+        gain, predicted = -1.0, 1.0
+        if finite:
+            gain = 1.0 - (norm / s[NORM]) ** 2
+            predicted = -(2.0 * dot(w.r, w.js) + dot(w.js, w.js)) / s[NORM] ** 2
+        if predicted <= 4.0 * EPS and abs(gain) <= 64.0 * EPS:  # ‖r‖ cannot tell any more
+            flag[STALLED] += 1
+            if w.r.size == w.x.size or flag[STALLED] > STALL_LIMIT:
+                return _ended(w)
+        else:
+            ratio = gain / predicted if predicted > 0.0 else -1.0
+            if ratio < 0.25:
+                shrink = 0.1
+                if finite and norm < 10.0 * s[NORM]:  # minimiser of the parabola through both residuals
+                    slope = dot(w.r, w.js) / s[NORM] ** 2
+                    shrink = 0.5 if gain >= 0.0 else max(0.1, min(0.5, 0.5 * slope / (slope + 0.5 * gain)))
+                s[RADIUS] = shrink * min(s[RADIUS], 10.0 * s[LENGTH])
+                s[LAM] /= shrink
+            elif s[LAM] == 0.0 or ratio >= 0.75:
+                s[RADIUS] = max(s[RADIUS], 2.0 * s[LENGTH]) if s[LAM] == 0.0 else 2.0 * s[LENGTH]
+                s[LAM] *= 0.5
+            if not ratio >= 1e-4:
+                if s[RADIUS] <= EPS * _weighted(w.scale, w.x) or s[RADIUS] < 1e-300:
+                    return RADIUS_TOO_SMALL
+                return REJECTED
+    _take(w, norm)
+    if flag[SINGULAR] == 0:
+        s[ERROR] = _correction(w, w.r, w.newton)
+        if largest(w.r) <= tol_f and s[ERROR] <= tol_x * max(1.0, largest(w.x)):
+            return CONVERGED
+    return ACCEPTED
+
+
+@njit
+def certify(w: Work, inverse: Float) -> float:
+    """J⁺ of the last factors into ``inverse`` (n, m); what rounding of r leaves open in x, max over x.
+
+    Inf where J is singular. Added to the error estimate of a converged solve.
+    """
+    if w.flag[SINGULAR] == 1:
+        return math.inf
+    if w.r.size == w.x.size:
+        lu_inverse_transposed(w.lu, w.pivot, inverse)
+    else:
+        qr_inverse(w.qr, w.diagonal, w.jt, inverse)
+    for k in range(w.r.size):
+        w.e[k] = 0.0
+    for j in range(w.x.size):
+        row, size = w.jt[j], abs(w.x[j])
+        for k in range(w.r.size):
+            w.e[k] += abs(row[k]) * size
+    top = 0.0
+    for j in range(w.x.size):
+        row, total = inverse[j], 0.0
+        for k in range(w.r.size):
+            total += abs(row[k]) * w.e[k]
+        if not total <= top:
+            top = total
+    return EPS * top

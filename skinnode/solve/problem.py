@@ -1,0 +1,75 @@
+"""One patch as a set of dimensionless systems, one an upper wire.
+
+Lengths are in pitches and the residual is relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k, so that
+one residual is one share of a resistance, whatever the rubber and the size of the patch. With measured rest
+resistances R₀ the resistivity and the gain of the front end cancel; without, R₀ F₀ is the layout's resistivity.
+w_k = σ_min / σ_k weighs equations of unequal noise (a tall system minimises χ²); 0 drops an equation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skinnode.model.forward import potential_per_m
+from skinnode.model.kernels import lower_rows
+from skinnode.model.layout import Float, PatchLayout, require_array
+
+TRUST_SHARE: Final = 0.25
+"""First trust radius as a share of the rest clearance of the electrodes: F is smooth on the scale of the
+distance to the nearest charge, and no live scan moves the skin by more between two frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class PatchProblem:
+    """The constants of a patch in the units of the solver."""
+
+    layout: PatchLayout
+    rest: Float
+    """(U, 3N) electrodes at rest, pitches."""
+    lower: Float
+    """(3, M, K) lower electrodes, pitches."""
+    gain: Float
+    """(U, K) 1 / (R₀ F₀): a = R · gain."""
+    a_rest: Float
+    """(U, K) a at rest, 1 / F."""
+    clearance: Float
+    """(U, N) distance of each electrode at rest from the nearest lower one, pitches."""
+
+    @classmethod
+    def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
+        """``baseline_ohm`` (U, K) are measured rest resistances. ValueError unless they are positive."""
+        pitch = layout.pitch_m
+        rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
+        potential = potential_per_m(layout, layout.upper_m) * pitch
+        gain = np.full(layout.shape, 1.0 / (layout.resistivity_ohm_per_m * pitch))
+        if baseline_ohm is not None:
+            baseline = require_array("baseline_ohm", baseline_ohm, layout.shape)
+            if not (baseline > 0).all():
+                where = tuple(int(i) for i in np.argwhere(~(baseline > 0))[0])
+                raise ValueError(f"baseline_ohm: got {baseline[where]} at {list(where)}, must be positive")
+            gain = 1.0 / (baseline * potential)
+        gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)
+        clearance = np.sqrt((gaps**2).sum(axis=-1)).min(axis=-1) / pitch
+        return cls(layout, rest, lower_rows(layout.lower_m / pitch), gain, 1.0 / potential, clearance)
+
+    @property
+    def step_limit(self) -> float:
+        """First trust radius, pitches a coordinate."""
+        return TRUST_SHARE * float(self.clearance.min())
+
+    def displacement_m(self, x: Float) -> Float:
+        """(U, N, 3) metres from ``x`` (U, 3N) pitches."""
+        return np.asarray((x - self.rest) * self.layout.pitch_m).reshape(self.layout.upper_m.shape)
+
+    def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
+        """(U,) wires with an electrode farther from rest than it was from the nearest lower electrode.
+
+        F is the same for electrodes mirrored at the lower layer and for two that changed places; both roots lie
+        that far away, and no rubber pressed on from outside moves by more than its own thickness.
+        """
+        moved = (x - self.rest).reshape(self.layout.upper_m.shape)
+        return np.asarray((np.sqrt((moved**2).sum(axis=-1)) > self.clearance).any(axis=1))

@@ -1,0 +1,232 @@
+"""The path of the paper run for ever: a live stream of frames, each solved from the one before.
+
+predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway
+correct    the operator, to a tolerance far below any noise
+bridge     a wire that fails: R interpolated from the last solved frame to the new one, steps halved and doubled
+restart    the same from the rest position
+hold       a wire that still fails keeps its last trusted position, with an infinite deviation and a status
+
+A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and no
+electrode moves farther than its clearance from the lower layer.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skinnode.model.forward import potential_per_m
+from skinnode.model.frames import FieldFrame, SolveStats
+from skinnode.model.layout import Float, PatchLayout, require_array
+from skinnode.model.status import Status
+from skinnode.solve import operators as op
+from skinnode.solve import wires
+from skinnode.solve.problem import PatchProblem
+from skinnode.solve.system import operator_code
+
+TOLERANCE: Final = 1e-9
+"""Of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from 1e-5."""
+BRIDGE_TOLERANCE: Final = 1e-6
+"""Of the substeps of a bridge, the paper's intermediate tolerance."""
+FRAME_STEPS: Final = 12
+"""Most steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
+BRIDGE_SOLVES: Final = 16
+"""Most solves of a bridge."""
+RECOVERY_STEPS: Final = 600
+"""Most steps all bridges of a frame may take together, about 20 ms: a broken frame must not stop the stream."""
+
+
+class Tracker:
+    """Follows one patch, frame by frame. One owner; the compiled part holds no GIL.
+
+    Args:
+        layout: the patch, K ≥ 3N.
+        operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
+        relative_noise: standard deviation of R relative to R, a number or (U, K).
+        baseline_ohm: (U, K) resistances measured at rest; the resistivity and the gain then cancel.
+        stiffness_n_per_m: k of the paper's law F = k Δs; forces are given where it is.
+
+    Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
+    """
+
+    def __init__(
+        self,
+        layout: PatchLayout,
+        *,
+        operator: str = "levenberg_marquardt",
+        relative_noise: ArrayLike = 1e-5,
+        baseline_ohm: ArrayLike | None = None,
+        stiffness_n_per_m: float | None = None,
+    ) -> None:
+        if stiffness_n_per_m is not None and not (math.isfinite(stiffness_n_per_m) and stiffness_n_per_m > 0):
+            raise ValueError(f"stiffness_n_per_m: got {stiffness_n_per_m}, must be positive and finite")
+        if layout.shape[1] < layout.unknowns:
+            raise ValueError(
+                f"layout: got {layout.shape[1]} lower wires for {layout.unknowns} unknowns an upper wire, "
+                "must be at least as many"
+            )
+        self.layout = layout
+        self._problem = PatchProblem.of(layout, baseline_ohm)
+        self._stiffness = stiffness_n_per_m
+        self._noise, self._sigma = self._checked_noise(relative_noise)
+        self._solver = wires.Solver(self._problem, operator_code(operator))
+        self._every = np.full(layout.shape[0], wires.SOLVE, np.uint8)
+        self._solver.solve(
+            self._every,
+            self._problem.a_rest.copy(),
+            np.ones(layout.shape),
+            wires.COVARIANCE,
+            TOLERANCE,
+            TOLERANCE,
+            1,
+        )
+        self._rest_branch = self._solver.report[:, wires.BRANCH].copy()
+        self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
+        self._rest_inverse = self._solver.inverse.copy()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream: the next frame is solved from the rest position."""
+        self._x = self._problem.rest.copy()  # last trusted position of each wire, and its a
+        self._a = self._problem.a_rest.copy()
+        self._solver.inverse[:] = self._rest_inverse
+        self._solver.a_solved[:] = self._a
+        self._predictable = self._rest_known.copy()  # wires whose inverse in the solver belongs to their x
+
+    def update(
+        self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
+    ) -> FieldFrame:
+        """The displacement field of one frame.
+
+        Args:
+            frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
+            valid: (U, K) bool, False where a chunk or wire is missing; default all.
+            relative_noise: as in the constructor, of this frame only.
+
+        Never raises for numbers. A wire with fewer usable resistances than unknowns is ILL_CONDITIONED, or
+        NON_FINITE where resistances not marked as missing were unusable. Such a wire, and one that no solve
+        brings to a root, holds its last trusted position with an infinite deviation. Raises ValueError for
+        wrong shapes.
+        """
+        start = time.perf_counter()
+        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        noise, sigma = (
+            (self._noise, self._sigma) if relative_noise is None else self._checked_noise(relative_noise)
+        )
+        weight = sigma / noise
+        if valid is not None:
+            weight *= self._checked_mask(valid)
+        with np.errstate(over="ignore", invalid="ignore"):
+            a = frame * self._problem.gain
+        solver = self._solver
+        solver.x[:] = self._x
+        todo = np.where(self._predictable, wires.PREDICT, wires.SOLVE).astype(np.uint8)
+        solver.solve(todo, a, weight, wires.COVARIANCE, TOLERANCE, TOLERANCE, FRAME_STEPS, sigma)
+        evaluations, steps = solver.cost
+        status = solver.report[:, wires.STATUS].copy()
+        good = self._reached()
+        if good.all():
+            residual = solver.measure[:, wires.RESIDUAL].copy()
+        else:
+            status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
+            solvable = np.count_nonzero(weight, axis=1) >= self.layout.unknowns
+            for u in np.flatnonzero(~good & solvable).tolist():
+                for x_from, a_from in (
+                    (self._x[u], self._a[u]),
+                    (self._problem.rest[u], self._problem.a_rest[u]),
+                ):
+                    if steps >= RECOVERY_STEPS:
+                        break
+                    cost = self._bridge(u, x_from, a_from, a, weight, sigma, RECOVERY_STEPS - steps)
+                    evaluations, steps = evaluations + cost[0], steps + cost[1]
+                    if self._reached()[u]:
+                        good[u], status[u] = True, op.CONVERGED
+                        break
+            residual = np.where(good, solver.measure[:, wires.RESIDUAL], self._held_residual(a, weight))
+            solver.std[~good] = np.inf
+        self._x[good] = solver.x[good]
+        self._a[good] = solver.a_solved[good]
+        self._predictable = good
+        displacement = self._problem.displacement_m(self._x)
+        return FieldFrame(
+            displacement_m=displacement,
+            displacement_std_m=(solver.std * self.layout.pitch_m).reshape(displacement.shape),
+            status=tuple(map(Status, status.tolist())),
+            residual=residual,
+            stats=SolveStats(evaluations, evaluations, steps, time.perf_counter() - start),
+            force_n=None if self._stiffness is None else self._stiffness * displacement,
+        )
+
+    def _reached(self) -> NDArray[np.bool_]:
+        """(U,) wires the solver brought to a root on the branch of the rest position."""
+        report = self._solver.report
+        on_branch = report[:, wires.BRANCH] * self._rest_branch >= 0
+        reached = (report[:, wires.STATUS] == op.CONVERGED) & on_branch
+        return np.asarray(reached & ~self._problem.out_of_reach(self._solver.x))
+
+    def _bridge(
+        self, u: int, x_from: Float, a_from: Float, a: Float, weight: Float, sigma: float, budget: int
+    ) -> tuple[int, int]:
+        """Solve wire u along the straight line of its resistances from ``a_from`` to ``a``, step lengths adapted.
+
+        Returns the evaluations and steps it took; the outcome is the solver's report of the wire.
+        """
+        solver = self._solver
+        todo = np.zeros_like(self._every)
+        todo[u] = wires.SOLVE
+        between = a.copy()
+        x, at, stride = x_from.copy(), 0.0, 1.0
+        evaluations = steps = 0
+        for _ in range(BRIDGE_SOLVES):
+            to = min(1.0, at + stride)
+            last = to == 1.0
+            between[u] = a[u] if last else a_from + to * (a[u] - a_from)
+            solver.x[u] = x
+            tolerance = TOLERANCE if last else BRIDGE_TOLERANCE
+            tasks = wires.COVARIANCE if last else 0
+            solver.solve(todo, between, weight, tasks, tolerance, tolerance, FRAME_STEPS, sigma)
+            evaluations += int(solver.report[u, wires.EVALUATIONS])
+            steps += int(solver.report[u, wires.STEPS])
+            if not self._reached()[u]:
+                stride *= 0.5
+            elif last:
+                break
+            else:
+                x[:], at, stride = solver.x[u], to, 2.0 * stride
+            if steps >= budget:
+                break
+        if at + stride < 1.0 or not last:  # ended between the frames: nothing is known of this one
+            solver.report[u, wires.STATUS] = op.MAX_STEPS
+        return evaluations, steps
+
+    def _held_residual(self, a: Float, weight: Float) -> Float:
+        """(U,) RMS of F/b − 1 at the held positions over the usable resistances; inf where there is none."""
+        potential = potential_per_m(self.layout, self.layout.upper_m + self._problem.displacement_m(self._x))
+        relative = np.where(weight > 0, a * potential * self.layout.pitch_m - 1.0, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rms = np.sqrt((relative**2).sum(axis=1) / np.count_nonzero(weight, axis=1))
+        return np.asarray(np.where(np.isfinite(rms), rms, np.inf))
+
+    def _checked_noise(self, relative_noise: ArrayLike) -> tuple[Float, float]:
+        """(U, K) deviations and the smallest of them."""
+        try:
+            noise = np.broadcast_to(np.asarray(relative_noise, np.float64), self.layout.shape)
+        except (TypeError, ValueError):
+            shape = np.shape(relative_noise)
+            raise ValueError(
+                f"relative_noise: got shape {shape}, must be a number or {self.layout.shape}"
+            ) from None
+        if not ((noise > 0) & (noise < np.inf)).all():
+            raise ValueError("relative_noise: must be positive and finite everywhere")
+        return noise, float(noise.min())
+
+    def _checked_mask(self, valid: ArrayLike) -> NDArray[np.bool_]:
+        mask = np.asarray(valid)
+        if mask.dtype != np.bool_ or mask.shape != self.layout.shape:
+            got = f"{mask.dtype} of shape {mask.shape}"
+            raise ValueError(f"valid: got {got}, must be bool of shape {self.layout.shape}")
+        return mask

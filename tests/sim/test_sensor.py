@@ -44,6 +44,14 @@ def test_nothing_happens_before_the_start() -> None:
     assert patch.reads == 3
 
 
+def test_scene_time_runs_in_seconds_from_the_start() -> None:
+    patch = SimulatedPatch(SCENE)
+    patch.start(10**15)
+    for t_s in (SCENE.lead_s + 0.5, SCENE.lead_s + 2.5):
+        expected = SCENE.upper_m(t_s)
+        np.testing.assert_allclose(patch.truth_m(10**15 + round(t_s * S)), expected, atol=1e-11)
+
+
 def test_truth_can_be_asked_for_later_and_in_any_order() -> None:
     patch = SimulatedPatch(SCENE)
     patch.start(0)

@@ -28,7 +28,7 @@ def kernel(rubber: Rubber, x: float, y: float) -> NDArray[np.float64]:
     tangential_y += [1 / r + y**2 / r**3 + (1 - 2 * nu) * (1 / r - y**2 / r**3), (1 - 2 * nu) * y / r**2]
     normal = [-(1 - 2 * nu) * x / r**2, -(1 - 2 * nu) * y / r**2, 2 * (1 - nu) / r]
     flip = np.diag([1.0, 1.0, -1.0])
-    return flip @ np.array([tangential_x, tangential_y, normal]).T @ flip / (4 * math.pi * g)
+    return np.asarray(flip @ np.array([tangential_x, tangential_y, normal]).T @ flip / (4 * math.pi * g))
 
 
 def by_cells(contact: HertzContact, points: NDArray[np.float64], cells: int) -> NDArray[np.float64]:

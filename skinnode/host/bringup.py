@@ -224,7 +224,9 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     try:
         described = canopen.import_od(str(path))
     except Exception as error:  # the library lets its parser's errors through, whatever they are
-        raise ProfileError("EDS", str(path), f"a file as in CiA 306 ({error})") from None
+        raise ProfileError(
+            "EDS", path.name, f"a file as in CiA 306 ({_line(error)})", where=str(path)
+        ) from None
     for item in profile.objects():
         for entry in item.entries:
             where = f"0x{entry.index:04X}:{entry.subindex}"
@@ -254,3 +256,7 @@ def _mismatch(patch: PatchConfig, what: str, got: str, allowed: str) -> NodeErro
     return NodeError(
         patch.node_id, f"patch {patch.name!r} on {patch.bus}: {what}: got {got}, allowed: {allowed}"
     )
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -17,11 +17,11 @@ from skinnode.errors import BusError, CodecError, NodeTimeout, SkinError
 from skinnode.host import bringup
 from skinnode.host.bringup import Abandoned, Bringer, NodeFacts, check_eds
 from skinnode.host.health import OPERATIONAL, NodeMonitor, PatchHealth
-from skinnode.host.link import BusLink, BusStats
+from skinnode.host.link import BusLink, BusStats, Handler
 from skinnode.host.pipeline import Lane, LaneStats, Solver
 from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
 from skinnode.host.sync import SyncProducer, SyncStats, Ticks
-from skinnode.model.config import HandConfig, PatchConfig, load_hand
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.wire import profile as od
 from skinnode.wire.assembler import ScanAssembler
@@ -132,12 +132,12 @@ class Host:
         publisher = Publisher(names)
         with contextlib.ExitStack() as stack:
             stack.callback(publisher.end)
+            monitors = {patch.name: NodeMonitor(patch.name, patch.node_id) for patch in hand.patches}
             links = {
-                bus.name: stack.enter_context(BusLink(bus, publisher.fail))
+                bus.name: stack.enter_context(BusLink(bus, _handlers(hand, bus, monitors), publisher.fail))
                 for bus in hand.buses
                 if hand.patches_on(bus.name)
             }
-            monitors = {patch.name: _watch(patch, links[patch.bus]) for patch in hand.patches}
             ticks = Ticks(hand.sync.counter_overflow)
             period_ns = hand.sync.period_ms * 1_000_000
             try:
@@ -193,11 +193,20 @@ class Host:
         )
 
 
-def _watch(patch: PatchConfig, link: BusLink) -> NodeMonitor:
-    monitor = NodeMonitor(patch.name, patch.node_id)
-    link.handle(od.heartbeat_cob_id(patch.node_id), monitor.on_heartbeat)
-    link.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency)
-    return monitor
+def _handlers(hand: HandConfig, bus: BusConfig, monitors: Mapping[str, NodeMonitor]) -> dict[int, Handler]:
+    """Who gets what from the moment the bus is open."""
+    handlers: dict[int, Handler] = {}
+    for patch in hand.patches_on(bus.name):
+        monitor, node_id = monitors[patch.name], patch.node_id
+        handlers[od.heartbeat_cob_id(node_id)] = monitor.on_heartbeat
+        handlers[od.emcy_cob_id(node_id)] = monitor.on_emergency
+        # A node that an earlier host left operational may be sending already.
+        handlers[od.chunk_cob_id(node_id)] = handlers[od.summary_cob_id(node_id)] = _ignore
+    return handlers
+
+
+def _ignore(data: bytes, t_ns: int) -> None:
+    pass
 
 
 def _pool(hand: HandConfig) -> ThreadPoolExecutor:

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
@@ -55,15 +55,17 @@ class BusStats:
 class BusLink:
     """An open bus. Its threads run from construction to :meth:`close`.
 
-    ``on_failure`` is called once, from the mainline, if the bus fails or a handler does.
-    Raises BusError where the interface does not open.
+    ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once, from
+    the mainline, if the bus fails or a handler does. Raises BusError where the interface does not open.
     """
 
-    def __init__(self, config: BusConfig, on_failure: Callable[[SkinError], None]) -> None:
+    def __init__(
+        self, config: BusConfig, handlers: Mapping[int, Handler], on_failure: Callable[[SkinError], None]
+    ) -> None:
         self.config = config
         self.first_malformed: CodecError | None = None
         self._on_failure = on_failure
-        self._handlers: dict[int, Handler] = {}
+        self._handlers = dict(handlers)
         self._pollers: tuple[Callable[[int], None], ...] = ()
         self._complained: set[int] = set()
         self._foreign = self._ignored = self._malformed = self._received = 0

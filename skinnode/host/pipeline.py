@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skinnode.errors import SkinError
+from skinnode.errors import ConfigError, SkinError
 from skinnode.host.bringup import NodeFacts
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
@@ -34,13 +34,16 @@ class Solver:
 
     def __init__(self, facts: NodeFacts, config: SolverConfig) -> None:
         self._facts = facts
-        self._tracker = Tracker(
-            facts.layout,
-            operator=config.operator,
-            relative_noise=facts.config.relative_noise,
-            baseline_ohm=facts.baseline_ohm,
-            stiffness_n_per_m=config.stiffness_n_per_m,
-        )
+        try:
+            self._tracker = Tracker(
+                facts.layout,
+                operator=config.operator,
+                relative_noise=facts.config.relative_noise,
+                baseline_ohm=facts.baseline_ohm,
+                stiffness_n_per_m=config.stiffness_n_per_m,
+            )
+        except ValueError as error:  # a layout that can be sensed but not solved
+            raise ConfigError(f"patch {facts.config.name!r}", facts.layout.name, str(error)) from None
         # The first call compiles the kernels or reads them from the cache: not while a scan waits.
         self._tracker.update(facts.baseline_ohm)
         self._tracker.reset()

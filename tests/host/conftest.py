@@ -7,6 +7,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -51,10 +52,15 @@ def fleet(hand: HandConfig) -> Iterator[Fleet]:
 
 
 @pytest.fixture
-def listener(hand: HandConfig) -> Iterator[CanPort]:
-    """Somebody else on the bus, who hears everything."""
-    with CanPort(hand.buses[0]) as port:
-        yield port
+def listener_of() -> Iterator[Callable[[HandConfig], CanPort]]:
+    """Somebody else on the bus of a hand, who hears everything."""
+    with ExitStack() as ports:
+        yield lambda hand: ports.enter_context(CanPort(hand.buses[0]))
+
+
+@pytest.fixture
+def listener(hand: HandConfig, listener_of: Callable[[HandConfig], CanPort]) -> CanPort:
+    return listener_of(hand)
 
 
 def heard(port: CanPort) -> list[Frame]:

@@ -1,0 +1,342 @@
+"""Bring-up: a node that is not what the hand file says is named in one line, and nothing is left running."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import SMALL, eventually, heard
+
+from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
+from skinnode.host import BringUpCancelled, Host
+from skinnode.host.bringup import inhibit_time_100us
+from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.node.nmt import NmtState
+from skinnode.node.node import PatchNode
+from skinnode.node.runner import NodeRunner
+from skinnode.transport import CanPort
+from skinnode.wire.profile import PatchProfile, eds_text
+from vcan_sim.fleet import Fleet
+
+LAYOUT = PatchLayout.preset("staggered", **SMALL)
+
+
+class Rest:
+    """A patch that nobody touches."""
+
+    def __init__(self, layout: PatchLayout) -> None:
+        self._resistance_ohm = resistance_ohm(layout, layout.upper_m)
+
+    def read(self, t_ns: int) -> Float:
+        return self._resistance_ohm
+
+
+Tamper = Callable[[int, bytes], bytes]
+
+
+def node(
+    port: CanPort, node_id: int, layout: PatchLayout = LAYOUT, tamper: Tamper | None = None, **options: int
+) -> PatchNode:
+    """The real node; ``tamper`` may change what it sends."""
+
+    def send(can_id: int, data: bytes) -> None:
+        port.send(can_id, data if tamper is None else tamper(can_id, data))
+
+    return PatchNode(node_id, layout, Rest(layout), send=send, **options)
+
+
+def answer_instead(index: int, subindex: int, value: bytes) -> Tamper:
+    """Another value in the answer to an expedited SDO upload."""
+    key = struct.pack("<HB", index, subindex)
+
+    def tamper(can_id: int, data: bytes) -> bytes:
+        is_answer = can_id & 0x780 == 0x580 and data[0] & 0xE0 == 0x40 and data[1:4] == key
+        return data[:4] + value.ljust(4, b"\0") if is_answer else data
+
+    return tamper
+
+
+def abort_instead(index: int, subindex: int, code: int) -> Tamper:
+    """An abort in place of the answer to an SDO download."""
+    key = struct.pack("<HB", index, subindex)
+
+    def tamper(can_id: int, data: bytes) -> bytes:
+        is_answer = can_id & 0x780 == 0x580 and data[0] == 0x60 and data[1:4] == key
+        return b"\x80" + key + code.to_bytes(4, "little") if is_answer else data
+
+    return tamper
+
+
+def failure_of(
+    hand: HandConfig, *make: Callable[[CanPort], PatchNode], deadline_s: float = 3.0
+) -> BaseException:
+    """What bring-up raises with these nodes on the bus."""
+    with (
+        CanPort(hand.buses[0]) as port,
+        NodeRunner(port, [one(port) for one in make]),
+        pytest.raises((BusError, ConfigError)) as caught,
+        Host.from_config(hand, boot_deadline_s=deadline_s),
+    ):
+        pass
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_brings_a_hand_up_and_down(hand: HandConfig, fleet: Fleet, listener: CanPort) -> None:
+    with Host.from_config(hand) as host:
+        assert {report.nmt_state for report in fleet.report()} == {NmtState.OPERATIONAL}
+        assert host.fields(timeout_s=10).get(10) is not None
+    assert eventually(lambda: {report.nmt_state for report in fleet.report()} == {NmtState.PRE_OPERATIONAL})
+    heard(listener)
+    time.sleep(0.3)
+    # Heartbeats of two pre-operational nodes, and nothing else: no SYNC, no PDO.
+    assert {(frame.can_id, frame.data) for frame in heard(listener)} == {(0x705, b"\x7f"), (0x706, b"\x7f")}
+
+
+def test_configuration_is_in_the_node(hand: HandConfig, fleet: Fleet) -> None:
+    from skinnode.host.link import BusLink
+
+    with Host.from_config(hand):
+        pass
+    with BusLink(hand.buses[0], {}, lambda error: None) as link:
+        od = link.remote_od(5)
+        assert od.read(0x1005, 0, "u32") == 0x80
+        assert od.read(0x1006, 0, "u32") == 25_000
+        assert od.read(0x1019, 0, "u8") == 240
+        assert od.read(0x1017, 0, "u16") == 250
+        assert (od.read(0x1800, 1, "u32"), od.read(0x1800, 2, "u8")) == (0x185, 254)
+        assert od.read(0x1800, 3, "u16") == 11  # 0.8 · 25 ms over 16 chunks and a summary, in 100 µs
+        assert (od.read(0x1801, 1, "u32"), od.read(0x1801, 2, "u8")) == (0x285, 1)
+
+
+def test_a_host_that_was_killed_is_followed_by_another(
+    hand: HandConfig, fleet: Fleet, listener: CanPort
+) -> None:
+    """Its nodes are still operational, and somebody's SYNC still comes."""
+    listener.send(0x000, b"\x01\x00")
+    assert eventually(lambda: {report.nmt_state for report in fleet.report()} == {NmtState.OPERATIONAL})
+    listener.send(0x080, b"\x11")
+    with Host.from_config(hand) as host:
+        field = host.fields(timeout_s=10).get(10)
+        assert field is not None
+        assert field.stamp is not None
+        assert field.stamp.scan == 1
+        assert eventually(lambda: all(p.solved > 3 for p in host.stats().patches.values()))
+        assert all(patch.assembler.scans_torn == 0 for patch in host.stats().patches.values())
+
+
+def test_no_node_at_all(hand: HandConfig) -> None:
+    start_s = time.monotonic()
+    with pytest.raises(BusError) as caught, Host.from_config(hand, boot_deadline_s=0.5):
+        pass
+    assert str(caught.value) == (
+        f"can0: interface 'virtual', channel '{hand.buses[0].channel}': got no answer from any node, "
+        "allowed: an answer within 0.5 s from 5 (p0), 6 (p1)"
+    )
+    assert time.monotonic() - start_s < 10  # no hang
+
+
+def test_one_node_missing(hand: HandConfig) -> None:
+    failure = failure_of(hand, lambda port: node(port, 5), deadline_s=0.5)
+    assert isinstance(failure, NodeTimeout)
+    assert failure.node_id == 6
+    assert str(failure) == (
+        "node 6: patch 'p1' on can0: got no answer, allowed: an answer within 0.5 s from 6 (p1)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("subindex", "value", "line"),
+    [
+        (1, 0x1234, "vendor-ID: got 0x00001234, allowed: 0x00000000 (a skinnode patch)"),
+        (2, 0x0192_0402, "product code: got 0x01920402, allowed: 0x534B494E (a skinnode patch)"),
+        (3, 0x0002_0003, "revision: got 2.3, allowed: 1.x"),
+    ],
+)
+def test_identity_differs(
+    make_hand: Callable[..., HandConfig],
+    listener_of: Callable[[HandConfig], CanPort],
+    subindex: int,
+    value: int,
+    line: str,
+) -> None:
+    hand = make_hand(patches=1)
+    listener = listener_of(hand)
+    tamper = answer_instead(0x1018, subindex, value.to_bytes(4, "little"))
+    failure = failure_of(hand, lambda port: node(port, 5, tamper=tamper))
+    assert isinstance(failure, NodeError)
+    assert str(failure) == f"node 5: patch 'p0' on can0: {line}"
+    # It could be a drive: nothing was written to it, and no NMT command was sent to it.
+    frames = heard(listener)
+    assert {frame.data[0] & 0xE0 for frame in frames if frame.can_id == 0x605} == {0x40}
+    assert not [frame for frame in frames if frame.can_id == 0x000]
+
+
+def test_serial_number_differs(make_hand: Callable[..., HandConfig]) -> None:
+    patches = [{"name": "p0", "node_id": 5, "layout": SMALL, "serial": 7}]
+    hand = parse_hand({**make_hand(patches=1).model_dump(mode="json"), "patches": patches})
+    assert str(failure_of(hand, lambda port: node(port, 5, serial=8))) == (
+        "node 5: patch 'p0' on can0: serial number: got 8, allowed: 7 as in the hand file"
+    )
+
+
+def test_layout_hash_differs(make_hand: Callable[..., HandConfig]) -> None:
+    other = PatchLayout.preset("staggered", height_m=3e-3, **SMALL)
+    failure = failure_of(make_hand(patches=1), lambda port: node(port, 5, other))
+    assert isinstance(failure, NodeError)
+    assert str(failure) == (
+        f"node 5: patch 'p0' on can0: layout hash: got 0x{other.layout_hash:08X}, "
+        f"allowed: 0x{LAYOUT.layout_hash:08X} (staggered as in the hand file)"
+    )
+
+
+def test_size_differs(make_hand: Callable[..., HandConfig]) -> None:
+    other = PatchLayout.preset("staggered", **{**SMALL, "lower_wires": 9})
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, other))) == (
+        "node 5: patch 'p0' on can0: lower wires: got 9, allowed: 12 as in the hand file"
+    )
+
+
+def test_code_width_differs(make_hand: Callable[..., HandConfig]) -> None:
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, code_bits=24))) == (
+        "node 5: patch 'p0' on can0: code bits: got 24, allowed: 16 as in the hand file"
+    )
+
+
+def test_configuration_that_is_not_kept(make_hand: Callable[..., HandConfig]) -> None:
+    tamper = answer_instead(0x1017, 0, b"\x00\x00")
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))) == (
+        "node 5: object 0x1017:0: got 0x0 back, allowed: 0xFA as set"
+    )
+
+
+def test_configuration_that_is_refused(make_hand: Callable[..., HandConfig]) -> None:
+    tamper = abort_instead(0x1019, 0, 0x0800_0022)
+    failure = failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))
+    assert isinstance(failure, SdoAbort)
+    assert failure.code == 0x0800_0022
+    assert str(failure).startswith("node 5: SDO abort 0x08000022: write of object 0x1019:0: ")
+    assert "present device state" in str(failure)
+
+
+def test_baseline_that_is_no_resistance(make_hand: Callable[..., HandConfig]) -> None:
+    tamper = answer_instead(0x2202, 4, struct.pack("<f", float("nan")))
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))) == (
+        "node 5: patch 'p0' on can0: baseline of upper wire 2, lower wire 3: got nan ohm, "
+        "allowed: a positive resistance (tare the patch)"
+    )
+
+
+def test_other_mapping(make_hand: Callable[..., HandConfig]) -> None:
+    tamper = answer_instead(0x1A00, 2, bytes.fromhex("08 02 11 20"))
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))) == (
+        "node 5: patch 'p0' on can0: object mapped by 0x1A00:2: got 0x20110208, allowed: 0x20100208"
+    )
+
+
+def test_the_other_nodes_are_pre_operational_when_one_fails(hand: HandConfig) -> None:
+    other = PatchLayout.preset("staggered", height_m=3e-3, **SMALL)
+    with CanPort(hand.buses[0]) as port, CanPort(hand.buses[0]) as listener:
+        good, bad = node(port, 5), node(port, 6, other)
+        with NodeRunner(port, [good, bad]):
+            complaint = pytest.raises(NodeError, match=r"^node 6: patch 'p1' on can0: layout hash: ")
+            with complaint, Host.from_config(hand):
+                pass
+            assert good.nmt_state is bad.nmt_state is NmtState.PRE_OPERATIONAL
+            heard(listener)
+            time.sleep(0.1)
+            assert [frame for frame in heard(listener) if frame.can_id < 0x700] == []
+
+
+def test_node_that_never_goes_operational(make_hand: Callable[..., HandConfig]) -> None:
+    def tamper(can_id: int, data: bytes) -> bytes:
+        return b"\x7f" if can_id == 0x705 and data == b"\x05" else data
+
+    failure = failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))
+    assert isinstance(failure, NodeTimeout)
+    assert str(failure) == (
+        "node 5: patch 'p0' on can0: got NMT state 127 after the start command, "
+        "allowed: 5 (operational) within 1 s"
+    )
+
+
+def test_interface_that_does_not_open(hand: HandConfig) -> None:
+    with pytest.raises(BusError) as caught, Host.from_config(hand, interface="socketcan", channel="nocan0"):
+        pass
+    line = str(caught.value)
+    assert line.startswith("can0: interface 'socketcan', channel 'nocan0': does not open (")
+    assert ", allowed: " in line
+    assert "\n" not in line
+
+
+def test_interface_that_is_not_known(hand: HandConfig) -> None:
+    with pytest.raises(BusError) as caught, Host.from_config(hand, interface="carrier-pigeon"):
+        pass
+    assert str(caught.value).startswith("can0: interface 'carrier-pigeon', channel ")
+    assert "no such interface, allowed: " in str(caught.value)
+
+
+def test_cancelled(hand: HandConfig) -> None:
+    with pytest.raises(BringUpCancelled), Host.from_config(hand, cancelled=lambda: True):
+        pass
+
+
+def with_eds(hand: HandConfig, path: Path) -> HandConfig:
+    patches = tuple(patch.model_copy(update={"eds": path}) for patch in hand.patches)
+    return hand.model_copy(update={"patches": patches})
+
+
+def test_eds_of_the_profile_is_accepted(hand: HandConfig, fleet: Fleet, tmp_path: Path) -> None:
+    path = tmp_path / "patch.eds"
+    path.write_text(eds_text(PatchProfile.from_layout(LAYOUT)))
+    with Host.from_config(with_eds(hand, path)):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("profile", "line"),
+    [
+        (PatchProfile(4, 9, 4, 4), "0x2000:2 Lower wires: got 9, allowed: 12"),
+        (PatchProfile(4, 12, 4, 4, code_bits=24), "0x2000:5 Code bits: got 24, allowed: 16"),
+    ],
+)
+def test_eds_of_another_patch(hand: HandConfig, tmp_path: Path, profile: PatchProfile, line: str) -> None:
+    path = tmp_path / "patch.eds"
+    path.write_text(eds_text(profile))
+    with pytest.raises(ProfileError) as caught, Host.from_config(with_eds(hand, path)):
+        pass
+    assert str(caught.value) == f"{path}: {line} in a patch of 4x12 wires at 16 bits"
+
+
+def test_eds_with_an_object_missing(hand: HandConfig, tmp_path: Path) -> None:
+    path = tmp_path / "patch.eds"
+    text = eds_text(PatchProfile.from_layout(LAYOUT))
+    head, tail = text.split("[1019]\n")
+    path.write_text(head + tail[tail.index("[") :])
+    with pytest.raises(ProfileError) as caught, Host.from_config(with_eds(hand, path)):
+        pass
+    assert str(caught.value) == (
+        f"{path}: 0x1019:0: got 'no such object', "
+        "allowed: Synchronous counter overflow value of a patch of 4x12 wires at 16 bits"
+    )
+
+
+def test_eds_that_is_none(hand: HandConfig, tmp_path: Path) -> None:
+    path = tmp_path / "patch.eds"
+    path.write_text("once upon a time\n")
+    with pytest.raises(ProfileError) as caught, Host.from_config(with_eds(hand, path)):
+        pass
+    assert str(caught.value).startswith(f"{path}: EDS: got ")
+    assert "allowed: a file as in CiA 306" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_inhibit_time_leaves_a_fifth_of_the_period() -> None:
+    # 100 chunks and a summary in 64 of 80 ms
+    assert inhibit_time_100us(80, 101) == 6
+    assert 101 * 6 * 0.1 <= 64 < 101 * 7 * 0.1

@@ -1,0 +1,111 @@
+"""One bus: frames to handlers by COB-ID, the rest counted, the load to the bit."""
+
+from __future__ import annotations
+
+import queue
+
+import pytest
+from conftest import eventually
+
+from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
+from skinnode.host.link import BusLink
+from skinnode.model.config import HandConfig
+from skinnode.transport import CanPort
+from skinnode.wire.timing import exact_bits
+
+
+def fail(error: SkinError) -> None:
+    raise AssertionError(error)
+
+
+def test_frames_go_to_their_handlers_in_order(hand: HandConfig, listener: CanPort) -> None:
+    got: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+    handlers = {
+        0x185: lambda data, t_ns: got.put(("a", data)),
+        0x186: lambda data, t_ns: got.put(("b", data)),
+    }
+    with BusLink(hand.buses[0], handlers, fail) as link:
+        for can_id, data in ((0x186, b"1"), (0x185, b"2"), (0x3F0, b"x"), (0x186, b"3")):
+            listener.send(can_id, data)
+        assert [got.get(timeout=10) for _ in range(3)] == [("b", b"1"), ("a", b"2"), ("b", b"3")]
+        stats = link.stats()
+    assert (stats.received, stats.foreign, stats.dropped, stats.malformed) == (4, 1, 0, 0)
+
+
+def test_bits_are_those_of_every_frame_sent_and_received(hand: HandConfig, listener: CanPort) -> None:
+    received = [(0x185, bytes([i, 255 - i, 0, 0, 0, 0, 255, 255])) for i in range(200)] + [(0x705, b"\x05")]
+    sent = [(0x080, bytes([i])) for i in range(1, 20)]
+    with BusLink(hand.buses[0], {}, fail) as link:
+        for can_id, data in received:
+            listener.send(can_id, data)
+        for can_id, data in sent:
+            link.send(can_id, data)
+        expected = sum(exact_bits(can_id, data) for can_id, data in received + sent)
+        assert eventually(lambda: link.stats().bits == expected)
+        assert (link.stats().received, link.stats().sent) == (201, 19)
+        assert link.stats().load > 0
+
+
+def test_defect_of_a_handler_is_reported(hand: HandConfig, listener: CanPort) -> None:
+    failures: queue.SimpleQueue[SkinError] = queue.SimpleQueue()
+
+    def broken(data: bytes, t_ns: int) -> None:
+        raise ZeroDivisionError("by zero")
+
+    with BusLink(hand.buses[0], {0x185: broken}, failures.put):
+        listener.send(0x185, b"")
+        error = failures.get(timeout=10)
+    assert str(error) == "bus 'can0': ZeroDivisionError: by zero"
+    assert isinstance(error.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize(
+    ("response", "error", "line"),
+    [
+        (None, NodeTimeout, "node 5: read of object 0x1017:0: got no answer, allowed: one within 0.9 s"),
+        (
+            "4f 17 10 00 05 00 00 00",
+            NodeError,
+            "node 5: object 0x1017:0: got 05, allowed: 2 bytes (u16)",
+        ),
+        (
+            "60 17 10 00 00 00 00 00",
+            NodeError,
+            "node 5: read of object 0x1017:0: got Unexpected response 0x60, allowed: an answer of CiA 301",
+        ),
+        (
+            "80 17 10 00 00 00 02 06",
+            SdoAbort,
+            "node 5: SDO abort 0x06020000: read of object 0x1017:0: Object does not exist",
+        ),
+    ],
+)
+def test_sdo_that_goes_wrong(
+    hand: HandConfig, listener: CanPort, response: str | None, error: type[NodeError], line: str
+) -> None:
+    def on_request(data: bytes, t_ns: int) -> None:
+        if response is not None:
+            listener.send(0x585, bytes.fromhex(response))
+
+    bus = hand.buses[0]
+    with (  # the node is a link as well: it answers on its own mainline
+        BusLink(bus, {}, fail) as link,
+        BusLink(bus, {0x605: on_request}, fail),
+        pytest.raises(error) as caught,
+    ):
+        link.remote_od(5).read(0x1017, 0, "u16")
+    assert str(caught.value) == line
+
+
+def test_short_sdo_answer_is_rejected_and_the_next_one_counts(hand: HandConfig, listener: CanPort) -> None:
+    def on_request(data: bytes, t_ns: int) -> None:
+        listener.send(0x585, b"\x4b\x17\x10")
+        listener.send(0x585, bytes.fromhex("4b 17 10 00 fa 00 00 00"))
+
+    bus = hand.buses[0]
+    with BusLink(bus, {}, fail) as link, BusLink(bus, {0x605: on_request}, fail):
+        assert link.remote_od(5).read(0x1017, 0, "u16") == 250
+        assert link.stats().malformed == 1
+        assert str(link.first_malformed) == (
+            "COB-ID 0x585: got 3 bytes (4b 17 10), allowed: 8 bytes (SDO response)"
+        )

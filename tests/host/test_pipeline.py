@@ -1,0 +1,164 @@
+"""A lane under overload and under a defect: newest scan first, everything counted, nothing swallowed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SMALL, eventually
+
+from skinnode.errors import SkinError
+from skinnode.host.bringup import NodeFacts
+from skinnode.host.pipeline import Lane
+from skinnode.host.publish import Publisher
+from skinnode.host.sync import Ticks
+from skinnode.model.config import PatchConfig
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, SolveStats
+from skinnode.model.layout import PatchLayout
+from skinnode.model.status import Status
+from skinnode.wire.assembler import Scan, ScanAssembler
+from skinnode.wire.codec import CodeScale, SummaryFlag, encode, pack_scan, pack_summary
+from skinnode.wire.profile import PatchProfile
+
+LAYOUT = PatchLayout.preset("staggered", **SMALL)
+PROFILE = PatchProfile.from_layout(LAYOUT)
+REST_OHM = resistance_ohm(LAYOUT, LAYOUT.upper_m)
+MS = 1_000_000
+
+
+class Stub:
+    """Stands for the solver: waits until it is let go, or fails."""
+
+    def __init__(self) -> None:
+        self.entered, self.go = threading.Event(), threading.Event()
+        self.error: Exception | None = None
+
+    def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
+        return ResistanceFrame(REST_OHM, scan.valid, stamp)
+
+    def solve(self, frame: ResistanceFrame) -> FieldFrame:
+        self.entered.set()
+        self.go.wait(10)
+        if self.error is not None:
+            raise self.error
+        zero = np.zeros_like(LAYOUT.upper_m)
+        status = (Status.CONVERGED,) * len(zero)
+        field = FieldFrame(zero, zero, status, np.zeros(len(zero)), SolveStats(0, 0, 0, 0.0))
+        return replace(field, stamp=frame.stamp)
+
+
+@pytest.fixture
+def stub() -> Stub:
+    return Stub()
+
+
+@pytest.fixture
+def publisher() -> Publisher:
+    return Publisher(("thumb",))
+
+
+@pytest.fixture
+def ticks() -> Ticks:
+    return Ticks(240)
+
+
+@pytest.fixture
+def lane(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[Lane]:
+    facts = NodeFacts(PatchConfig(name="thumb", node_id=11), LAYOUT, PROFILE, CodeScale(), REST_OHM, 0)
+    assembler = ScanAssembler(PROFILE, counter_overflow=240)
+    with ThreadPoolExecutor(2) as pool:
+        lane = Lane(facts, stub, assembler, pool, publisher, ticks.find, lambda t_ns: None)
+        yield lane
+        stub.go.set()
+        lane.close()
+
+
+def feed(lane: Lane, counter: int, t_ns: int) -> None:
+    """A whole scan at rest."""
+    chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), counter, PROFILE)
+    for chunk in chunks:
+        lane.on_chunk(chunk, t_ns)
+    lane.on_summary(pack_summary(counter, SummaryFlag(0), len(chunks), 1000 * counter), t_ns)
+
+
+def test_overload_skips_to_the_newest_scan(
+    lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
+) -> None:
+    fields = publisher.subscribe(10, 10.0, None)
+    feed(lane, 1, 0)
+    assert stub.entered.wait(10)
+    for counter in range(2, 8):
+        feed(lane, counter, counter * MS)
+    stats = lane.stats()
+    assert stats.offered == 7
+    stub.go.set()
+    numbers = [field.stamp.scan for field in (fields.get(10), fields.get(10)) if field and field.stamp]
+    assert numbers == [1, 7]
+    assert eventually(lambda: lane.stats().solved == 2)
+    stats = lane.stats()
+    assert (stats.offered, stats.solved, stats.skipped) == (7, 2, 5)
+    assert fields.get(0.05) is None
+
+
+def test_scan_number_and_time_are_those_of_the_sync(
+    lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
+) -> None:
+    stub.go.set()
+    fields = publisher.subscribe(10, 10.0, None)
+    for number in range(239, 243):
+        counter = ticks.note(number, 1000 * number)
+        feed(lane, counter, number * MS)
+        field = fields.get(10)
+        assert field is not None
+        assert field.stamp is not None
+        assert (field.stamp.scan, field.stamp.t_sync_ns) == (number, 1000 * number)
+        assert field.stamp.counter == (239, 240, 1, 2)[number - 239]
+        assert field.stamp.t_receive_ns == number * MS
+        assert field.stamp.device_time_us == 1000 * field.stamp.counter
+
+
+def test_scan_with_a_chunk_missing_goes_on_with_a_mask(lane: Lane, stub: Stub, publisher: Publisher) -> None:
+    stub.go.set()
+    chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
+    for chunk in chunks[:3] + chunks[4:]:
+        lane.on_chunk(chunk, 0)
+    lane.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
+    assert lane.stats().offered == 0
+    lane.poll(100 * MS)
+    assert eventually(lambda: lane.stats().solved == 1)
+    stats = lane.stats()
+    assert (stats.assembler.scans_torn, stats.assembler.chunks_lost, stats.invalid_codes) == (1, 1, 3)
+
+
+@pytest.mark.parametrize("failing", [ZeroDivisionError("by zero"), MemoryError("no more")])
+def test_a_defect_reaches_the_subscriber(
+    lane: Lane, stub: Stub, publisher: Publisher, failing: Exception
+) -> None:
+    fields = publisher.subscribe(10, 10.0, None)
+    stub.error = failing
+    stub.go.set()
+    feed(lane, 1, 0)
+    with pytest.raises(SkinError) as caught:
+        fields.get(10)
+    assert str(caught.value) == f"patch 'thumb', scan 1: {type(failing).__name__}: {failing}"
+    assert caught.value.__cause__ is failing
+
+
+def test_scans_from_many_turns_are_all_accounted_for(lane: Lane, stub: Stub, publisher: Publisher) -> None:
+    """However mainline and workers interleave: solved, skipped or waiting, and the token is never lost."""
+    stub.go.set()
+    for number in range(500):
+        feed(lane, number % 240 + 1, number * MS)
+        if number % 50 == 0:
+            assert eventually(lambda: lane.stats().offered == lane.stats().solved + lane.stats().skipped)
+    assert eventually(lambda: lane.stats().offered == lane.stats().solved + lane.stats().skipped)
+    assert lane.stats().offered == 500
+    newest = publisher.latest("thumb")
+    assert newest is not None
+    assert newest.stamp is not None
+    assert newest.stamp.counter == 499 % 240 + 1

@@ -1,0 +1,235 @@
+"""A running hand on the real road: simulated front ends, the real node code, a virtual bus, the host."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import threading
+import time
+import weakref
+from collections import defaultdict
+from collections.abc import Callable
+
+import can
+import numpy as np
+import pytest
+from conftest import SMALL, eventually, heard
+
+from skinnode.errors import BusError, ConfigError
+from skinnode.host import Condition, Host, Subscription
+from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.frames import FieldFrame, ScanStamp
+from skinnode.node.nmt import NmtState
+from skinnode.transport import CanPort
+from vcan_sim.fleet import Fleet
+
+
+def take(fields: Subscription, count: int) -> list[FieldFrame]:
+    taken = []
+    for field in fields:
+        taken.append(field)
+        if len(taken) == count:
+            break
+    return taken
+
+
+def stamp(field: FieldFrame) -> ScanStamp:
+    assert field.stamp is not None
+    return field.stamp
+
+
+def test_every_scan_from_the_first_on_every_patch(hand: HandConfig, fleet: Fleet) -> None:
+    with Host.from_config(hand) as host:
+        fields = take(host.fields(timeout_s=10, capacity=1000), 60)
+        numbers = defaultdict(list)
+        for field in fields:
+            numbers[stamp(field).patch].append(stamp(field).scan)
+        # The subscription began after the SYNC: what came before it is in the counters.
+        for patch in ("p0", "p1"):
+            assert numbers[patch] == list(range(numbers[patch][0], numbers[patch][-1] + 1))
+        stats = host.stats()
+    for lane in stats.patches.values():
+        assembler = lane.assembler
+        assert lane.skipped == 0
+        assert assembler.scans_torn == assembler.scans_missed == assembler.chunks_lost == 0
+        assert assembler.late == assembler.duplicates == assembler.resyncs == 0
+        assert assembler.scans_complete == lane.offered
+    assert (stats.buses["can0"].dropped, stats.buses["can0"].foreign) == (0, 0)
+
+
+def test_one_number_names_one_instant_on_all_patches(hand: HandConfig, fleet: Fleet) -> None:
+    with Host.from_config(hand) as host:
+        fields = take(host.fields(timeout_s=10), 20)
+    sync_of: dict[int, set[int]] = defaultdict(set)
+    for field in fields:
+        when = stamp(field)
+        assert when.counter == (when.scan - 1) % 240 + 1
+        assert 0 < when.t_sync_ns < when.t_receive_ns < when.t_solved_ns
+        sync_of[when.scan].add(when.t_sync_ns)
+    assert all(len(times) == 1 for times in sync_of.values())
+
+
+def test_field_agrees_with_the_truth_within_what_it_claims(hand: HandConfig, fleet: Fleet) -> None:
+    """The simulator knows where the electrodes really are; the host knows nothing but the frames."""
+    scores = []
+    with Host.from_config(hand) as host:
+        for field in take(host.fields(timeout_s=10, capacity=1000), 80):
+            assert field.trusted
+            patch = hand.patch(stamp(field).patch).layout.build()
+            truth_m = fleet.truth_m(stamp(field).patch, stamp(field).device_time_us) - patch.upper_m
+            scores.append((field.displacement_m - truth_m) / field.displacement_std_m)
+    # Normalised errors of a Gaussian have RMS 1. Those of one wire hang together and the baseline has a noise
+    # of its own: the claim is refuted above 2, and an idle claim (deviations too large) below 0.3.
+    assert 0.3 < float(np.sqrt(np.mean(np.square(scores)))) < 2.0
+
+
+def test_latest_is_there_for_a_control_loop(hand: HandConfig, fleet: Fleet) -> None:
+    with Host.from_config(hand) as host:
+        assert eventually(lambda: host.latest("p0") is not None and host.latest("p1") is not None)
+        first = host.latest("p1")
+        assert first is not None
+        assert stamp(first).patch == "p1"
+        with pytest.raises(ValueError, match="patch: got 'p9', must be one of p0, p1"):
+            host.latest("p9")
+
+
+def test_loop_ends_with_the_host(hand: HandConfig, fleet: Fleet) -> None:
+    seen: list[FieldFrame] = []
+    with Host.from_config(hand) as host:
+        fields = host.fields()
+        reader = threading.Thread(target=lambda: seen.extend(fields))
+        reader.start()
+        assert eventually(lambda: len(seen) > 3)
+    reader.join(10)
+    assert not reader.is_alive()
+
+
+def test_host_is_freed_with_its_last_reference(hand: HandConfig, fleet: Fleet) -> None:
+    with Host.from_config(hand) as host:
+        fields = host.fields(timeout_s=10)
+        take(fields, 4)
+    gone = weakref.ref(host)
+    del host
+    gc.collect()
+    assert gone() is None
+    assert fields.dropped == 0  # a subscription outlives its host
+
+
+def test_pdo_of_wrong_length_is_rejected_counted_and_said_once(
+    hand: HandConfig, fleet: Fleet, listener: CanPort, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING), Host.from_config(hand) as host:
+        take(host.fields(timeout_s=10), 4)
+        for _ in range(3):
+            listener.send(0x185, bytes.fromhex("00 01 02 03 04 05 06"))
+        listener.send(0x286, b"")
+        assert eventually(lambda: host.stats().buses["can0"].malformed == 4)
+        take(host.fields(timeout_s=10), 4)  # it goes on
+        stats = host.stats()
+    line = "COB-ID 0x185: got 7 bytes (00 01 02 03 04 05 06), allowed: 8 bytes (chunk)"
+    assert [str(error) for error in stats.malformed] == [line]
+    assert stats.patches["p0"].assembler.bad_length == 3
+    assert stats.patches["p1"].assembler.bad_length == 1
+    assert [record.getMessage() for record in caplog.records] == [
+        f"can0: {line}; rejected, as are others like it",
+        "can0: COB-ID 0x286: got 0 bytes (nothing), allowed: 8 bytes (scan summary); "
+        "rejected, as are others like it",
+    ]
+
+
+def test_foreign_and_remote_frames_do_no_harm(hand: HandConfig, fleet: Fleet, listener: CanPort) -> None:
+    with Host.from_config(hand) as host:
+        for _ in range(5):
+            listener.send(0x3F0, b"abc")
+        listener.send(0x185, b"", remote=True)
+        assert eventually(lambda: host.stats().buses["can0"].foreign == 5)
+        assert host.stats().buses["can0"].ignored == 1
+        take(host.fields(timeout_s=10), 4)
+        assert host.stats().buses["can0"].malformed == 0
+
+
+def test_subscriber_that_does_not_read_costs_nobody_else(hand: HandConfig, fleet: Fleet) -> None:
+    with Host.from_config(hand) as host:
+        asleep, awake = host.fields(capacity=1), host.fields(timeout_s=10, capacity=1000)
+        take(awake, 20)
+        assert awake.dropped == 0
+        assert asleep.dropped >= 19
+        assert sum(patch.skipped for patch in host.stats().patches.values()) == 0
+
+
+def test_silence_is_a_timeout_and_a_lost_patch(hand: HandConfig) -> None:
+    with Fleet(hand) as fleet, Host.from_config(hand) as host:
+        fields = host.fields(timeout_s=0.5)
+        take(fields, 4)
+        assert host.health("p0").condition is Condition.OPERATIONAL
+        fleet.stop()
+        with pytest.raises(TimeoutError, match=r"^no field within 0\.5 s$"):
+            take(fields, 1000)
+        assert eventually(lambda: host.health("p0").condition is Condition.LOST)
+
+
+def test_node_that_restarts_by_itself(
+    hand: HandConfig, fleet: Fleet, listener: CanPort, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING), Host.from_config(hand) as host:
+        take(host.fields(timeout_s=10), 4)
+        boot_ups = host.health("p1").boot_ups
+        listener.send(0x000, bytes([0x81, 6]))  # as a watchdog would
+        assert eventually(lambda: host.health("p1").condition is Condition.RESTARTING)
+        assert host.health("p1").boot_ups == boot_ups + 1
+        assert host.health("p0").condition is Condition.OPERATIONAL
+    assert [record.getMessage() for record in caplog.records] == ["node 6 (p1) restarted by itself"]
+
+
+def test_bus_that_fails_ends_the_loop_with_its_error(
+    hand: HandConfig, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(timeout: float | None) -> None:
+        raise can.CanOperationError("Network is down")
+
+    with Host.from_config(hand) as host:
+        fields = host.fields(timeout_s=10)
+        take(fields, 4)
+        bus = host._links["can0"]._port._bus  # where a driver would fail
+        monkeypatch.setattr(bus, "_recv_internal", broken)
+        with pytest.raises(BusError, match=r"^can0: .*does not receive .*Network is down"):
+            take(fields, 1000)
+        with pytest.raises(BusError, match="Network is down"):
+            take(host.fields(timeout_s=10), 1)
+
+
+def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:
+    table = make_hand().model_dump(mode="json")
+    table["buses"] = [{"name": f"can{i}", "channel": f"{table['buses'][0]['channel']}-{i}"} for i in range(2)]
+    table["patches"] = [{"name": f"p{i}", "node_id": 5, "bus": f"can{i}", "layout": SMALL} for i in range(2)]
+    hand = parse_hand(table)
+    with Fleet(hand), Host.from_config(hand) as host:
+        fields = take(host.fields(timeout_s=10), 10)
+        assert set(host.stats().buses) == {"can0", "can1"}
+    assert {stamp(field).patch for field in fields} == {"p0", "p1"}
+    by_scan: dict[int, set[int]] = defaultdict(set)
+    for field in fields:
+        by_scan[stamp(field).scan].add(stamp(field).t_sync_ns)
+    assert all(len(times) == 1 for times in by_scan.values())
+
+
+def test_patch_that_cannot_be_solved(make_hand: Callable[..., HandConfig]) -> None:
+    table = make_hand(patches=1).model_dump(mode="json")
+    table["patches"][0]["layout"]["lower_wires"] = 11
+    hand = parse_hand(table)
+    with Fleet(hand), pytest.raises(ConfigError) as caught, Host.from_config(hand):
+        pass
+    assert str(caught.value).startswith(
+        "patch 'p0': got 'staggered', allowed: layout: got 11 lower wires for 12 "
+    )
+
+
+def test_exception_in_the_block_shuts_everything_down(
+    hand: HandConfig, fleet: Fleet, listener: CanPort
+) -> None:
+    with pytest.raises(ZeroDivisionError), Host.from_config(hand):
+        raise ZeroDivisionError
+    assert eventually(lambda: {report.nmt_state for report in fleet.report()} == {NmtState.PRE_OPERATIONAL})
+    heard(listener)
+    time.sleep(0.1)
+    assert [frame for frame in heard(listener) if frame.can_id < 0x700] == []

@@ -3,8 +3,9 @@
 **A scan is never mixed from two.** A scan holds only frames with its own counter that arrived within the
 *timeout* of its first frame, and it is closed for good when a frame of a newer scan arrives. So two scans can
 only meet in one if they bear the same counter and their frames arrive within the timeout of each other: not
-while counter range × period exceeds the timeout plus the longest delay of a frame. The timeout is three
-periods (less for counters that come round sooner), the range normally 240 periods.
+while counter range × period is longer than the timeout and the age of the oldest frame together, the age
+counted from the SYNC of its scan to its arrival. The timeout is three periods (less where counters come round
+sooner), so with the usual range of 240 scans a frame may be 237 periods old.
 
 **Order of counters.** Up to half the counter range ahead is newer, the rest is late and dropped. After a
 timeout without an accepted frame whatever comes is believed to be a new stream: a node or the SYNC producer
@@ -149,7 +150,7 @@ class ScanAssembler:
         self._summary: Summary | None = None
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
 
-        # what is known about every chunk after the last scan
+        # what is known about every chunk after the last scan, and whether the open scan follows it
         self._held: list[bytes | None] = [None] * self._n
         self._follows = False
         self._changed_only = False
@@ -226,7 +227,6 @@ class ScanAssembler:
             self._discarded += 1
             self._book()
         self._counter, self._last_counter = _NONE_OPEN, _NEVER
-        self._held = [None] * self._n
         self._changed_only = False
 
     @property

@@ -21,6 +21,7 @@ from skinnode.host.link import BusLink, BusStats, Handler
 from skinnode.host.pipeline import Lane, LaneStats, Solver
 from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
 from skinnode.host.sync import SyncProducer, SyncStats, Ticks
+from skinnode.host.workers import Workers
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.wire import profile as od
@@ -143,9 +144,9 @@ class Host:
             try:
                 facts = _bring_up(hand, links, boot_deadline_s, cancelled)
                 solvers = {name: Solver(known, hand.solver) for name, known in facts.items()}
-                pool = stack.enter_context(_pool(hand))
+                workers = stack.enter_context(_workers(hand))
                 lanes = {
-                    name: _lane(known, solvers[name], pool, publisher, ticks, period_ns, links, monitors)
+                    name: _lane(known, solvers[name], workers, publisher, ticks, period_ns, links, monitors)
                     for name, known in facts.items()
                 }
                 # Undone in this order from below: SYNC stops, nodes fall silent, mainlines end, boxes are
@@ -209,15 +210,15 @@ def _ignore(data: bytes, t_ns: int) -> None:
     pass
 
 
-def _pool(hand: HandConfig) -> ThreadPoolExecutor:
-    workers = hand.solver.workers or len(os.sched_getaffinity(0))
-    return ThreadPoolExecutor(min(workers, len(hand.patches)), thread_name_prefix="solve")
+def _workers(hand: HandConfig) -> Workers:
+    count = hand.solver.workers or len(os.sched_getaffinity(0))
+    return Workers(min(count, len(hand.patches)), "solve")
 
 
 def _lane(
     facts: NodeFacts,
     solver: Solver,
-    pool: ThreadPoolExecutor,
+    workers: Workers,
     publisher: Publisher,
     ticks: Ticks,
     period_ns: int,
@@ -233,7 +234,7 @@ def _lane(
         node_id=patch.node_id,
         on_reject=link.reject,
     )
-    lane = Lane(facts, solver, assembler, pool, publisher, ticks.find, monitors[patch.name].on_scan)
+    lane = Lane(facts, solver, assembler, workers, publisher, ticks.find, monitors[patch.name].on_scan)
     link.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
     link.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
     link.poll_with(lane.poll)

@@ -11,7 +11,6 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from skinnode.errors import ConfigError, SkinError
 from skinnode.host.bringup import NodeFacts
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
+from skinnode.host.workers import Workers
 from skinnode.model.config import SolverConfig
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.solve.tracker import Tracker
@@ -89,13 +89,13 @@ class Lane:
         facts: NodeFacts,
         solver: Solver,
         assembler: ScanAssembler,
-        pool: ThreadPoolExecutor,
+        workers: Workers,
         publisher: Publisher,
         tick: Callable[[int], Tick | None],
         on_scan: Callable[[int], None],
     ) -> None:
         self.facts = facts
-        self._solver, self._assembler, self._pool, self._publisher = solver, assembler, pool, publisher
+        self._solver, self._assembler, self._workers, self._publisher = solver, assembler, workers, publisher
         self._tick, self._on_scan = tick, on_scan
         self._box: deque[tuple[Scan, ScanStamp]] = deque(maxlen=1)
         self._token: deque[None] = deque([None])
@@ -147,7 +147,7 @@ class Lane:
             self._token.pop()
         except IndexError:
             return  # a worker is in the lane and looks into the box when it is done
-        self._pool.submit(self._work)
+        self._workers.submit(self._work)
 
     def _work(self) -> None:
         self._taken += 1  # before it leaves the box, so that no reader of the counters sees it nowhere

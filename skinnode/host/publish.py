@@ -40,7 +40,8 @@ class Subscription:
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
-        self._queue: queue.Queue[_Item] = queue.Queue(capacity)
+        self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
+        self._capacity = capacity
         self._timeout_s = timeout_s
         self._wanted = patches
         # One counter a patch: a patch has one worker at a time, so each has a single writer.
@@ -99,16 +100,19 @@ class Subscription:
         """Never blocks."""
         if patch and patch not in self._wanted:
             return
-        while True:
+        self._queue.put(item)
+        ending: _Item | None = None
+        while self._queue.qsize() > self._capacity:
             try:
-                self._queue.put_nowait(item)
-                return
-            except queue.Full:
-                try:
-                    self._queue.get_nowait()
-                    self._dropped[patch] += 1
-                except queue.Empty:
-                    pass
+                oldest = self._queue.get_nowait()
+            except queue.Empty:  # the reader was faster
+                break
+            if isinstance(oldest, FieldFrame):
+                self._dropped[patch] += 1
+            else:
+                ending = oldest
+        if ending is not None:  # the one thing that no reader may miss, even if the queue grows by it
+            self._queue.put(ending)
 
 
 class Publisher:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +15,7 @@ from skinnode.host.bringup import NodeFacts
 from skinnode.host.pipeline import Lane
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Ticks
+from skinnode.host.workers import Workers
 from skinnode.model.config import PatchConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, SolveStats
@@ -71,8 +71,8 @@ def ticks() -> Ticks:
 def lane(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[Lane]:
     facts = NodeFacts(PatchConfig(name="thumb", node_id=11), LAYOUT, PROFILE, CodeScale(), REST_OHM, 0)
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
-    with ThreadPoolExecutor(2) as pool:
-        lane = Lane(facts, stub, assembler, pool, publisher, ticks.find, lambda t_ns: None)
+    with Workers(2, "solve") as workers:
+        lane = Lane(facts, stub, assembler, workers, publisher, ticks.find, lambda t_ns: None)
         yield lane
         stub.go.set()
         lane.close()

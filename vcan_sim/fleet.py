@@ -12,6 +12,7 @@ from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner, PatchNode
 from skinnode.transport import CanPort
+from skinnode.wire.profile import chunk_cob_id, summary_cob_id
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
@@ -24,6 +25,8 @@ class NodeReport:
     node_id: int
     nmt_state: NmtState
     frames_sent: int
+    pdos_sent: int
+    """Those of the frames that carried process data: chunks and summaries."""
     scans_sent: int
     """Scans sent to their end."""
 
@@ -111,15 +114,17 @@ class _Station:
         self.source = source
         self._config = config
         self._node: PatchNode | None = None
-        self._frames = 0
+        self._frames = self._pdos = 0
 
     def connect(self, send: Callable[[int, bytes], None]) -> PatchNode:
         """A new node on the patch, sending by ``send``."""
         config, source = self._config, self.source
+        pdos = {chunk_cob_id(config.node_id), summary_cob_id(config.node_id)}
 
         def counted(can_id: int, data: bytes) -> None:
             send(can_id, data)
             self._frames += 1
+            self._pdos += can_id in pdos
             if not source.started and node.scans_sent:
                 source.start(source.last_read_ns)
 
@@ -138,4 +143,4 @@ class _Station:
         node, config = self._node, self._config
         state = NmtState.INITIALISING if node is None else node.nmt_state
         scans = 0 if node is None else node.scans_sent
-        return NodeReport(config.name, config.node_id, state, self._frames, scans)
+        return NodeReport(config.name, config.node_id, state, self._frames, self._pdos, scans)

@@ -61,8 +61,9 @@ class Report:
     scan_rate_hz: float
     patches: tuple[PatchReport, ...]
     frames_sent: int
-    """By the nodes, SDO and heartbeats included."""
+    """PDOs the nodes sent."""
     frames_received: int
+    """PDOs that became part of a scan."""
     frames_lost: int
     bus_load: float
     """Share of a 1 Mbit/s bus that all frames of the scan phase would have taken, stuff bits counted."""
@@ -176,10 +177,10 @@ class _Progress:
             return
         self._due_s = elapsed_s + _LINE_S
         errors = [watch.history[-1] for watch in self._watches if watch.history]
-        shown = "  ".join(f"{1e6 * depth:.0f} µm ± {1e6 * std:.1f}" for _, depth, _, std in errors)
+        shown = ", ".join(f"{1e6 * abs(depth):.0f}" for _, depth, _, _ in errors) or "-"
         self._console.print(
             f"{elapsed_s:5.1f} s  {received} frames, {lost} lost, {sum(torn.values())} torn, "
-            f"load {100 * load:.0f} %, last frame to field p99 {p99:.1f} ms, depth {shown}",
+            f"load {100 * load:.0f} %, last frame to field p99 {p99:.1f} ms, depth {shown} µm",
             soft_wrap=True,
         )
 
@@ -196,7 +197,8 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
     count = len(hand.patches)
     console.print(
         f"bringing up {count} simulated {'patch' if count == 1 else 'patches'} on a virtual CAN bus: "
-        "boot-up, identity, configuration, start"
+        "boot-up, identity, configuration, start",
+        soft_wrap=True,
     )
     with _responsive_threads(), Fleet(hand) as fleet:
         with Host.from_config(hand) as host:
@@ -231,8 +233,10 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         )
         for name, watch in watches.items()
     )
-    sent = sum(node.frames_sent for node in nodes.values())
-    received = sum(bus.received for bus in stats.buses.values())
+    sent = sum(node.pdos_sent for node in nodes.values())
+    received = sum(
+        lane.assembler.chunks_accepted + lane.assembler.summaries_accepted for lane in stats.patches.values()
+    )
     report = Report(
         seconds=elapsed_s,
         scan_rate_hz=1.0 / hand.sync.period_s,
@@ -301,15 +305,14 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
 
 def print_report(console: Console, report: Report) -> None:
     """The table at the end, and one line for each fault."""
-    table = Table(box=None, header_style="dim", padding=(0, 1))
-    table.add_column("patch")
+    table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
+    table.add_column("patch", vertical="bottom")
     for heading in (
-        "scans sent\nsolved / torn",
+        "scans sent/\nsolved/torn",
         "deepest\nµm",
-        "error RMS\nµm",
+        "error\nRMS µm",
         "reported\n± µm",
-        "16-bit codes\nallow ± µm",
-        "error at\ndeepest",
+        "codes allow\n± µm",
         "in 95 %\ninterval",
         "last frame to field\np50 / p99 ms",
     ):
@@ -318,20 +321,25 @@ def print_report(console: Console, report: Report) -> None:
         score = row.score
         table.add_row(
             row.patch,
-            f"{row.scans_sent}\n{row.scans_solved} / {row.scans_torn}",
+            f"{row.scans_sent}/{row.scans_solved}/{row.scans_torn}",
             f"{1e6 * score.deepest_m:.0f}",
             f"{1e6 * score.error_rms_m:.2f}",
             f"{1e6 * score.reported_rms_m:.2f}",
             f"{1e6 * score.bound_rms_m:.2f}",
-            f"{100 * score.relative_error:.1f} %",
             f"{100 * score.coverage95:.1f} %",
             f"{row.latency_p50_ms:.1f} / {row.latency_p99_ms:.1f}",
         )
     console.print(table)
+    load = f"{100 * report.bus_load:.0f} %"
     console.print(
-        f"{report.frames_sent} frames sent by the nodes, {report.frames_lost} lost; "
-        f"{report.scan_rate_hz:.1f} scans/s a patch; "
-        f"a 1 Mbit/s bus would have been loaded to {100 * report.bus_load:.0f} %"
+        f"{report.frames_sent} PDOs sent, {report.frames_lost} lost; "
+        f"{report.scan_rate_hz:.1f} scans/s a patch; a 1 Mbit/s bus would have been loaded to {load}",
+        soft_wrap=True,
+    )
+    shares = [100 * row.score.relative_error for row in report.patches]
+    console.print(
+        f"error in the deepest scan: {min(shares):.1f} to {max(shares):.1f} % of the displacement field",
+        soft_wrap=True,
     )
     for fault in report.faults:
         console.print(f"[bold red]fault:[/] {fault}")

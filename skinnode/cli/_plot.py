@@ -76,6 +76,8 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
     FigureCanvasAgg(figure)
     grid = figure.subplots(4, count, squeeze=False, height_ratios=[1, 1, 1, 0.9])
     full_um = 1e6 * max(float(-trace.snapshot_truth_m[..., 2].min()) for trace in traces)
+    shear_um = 1e6 * max(float(np.abs(trace.snapshot_truth_m[..., :2]).max()) for trace in traces)
+    highest_um = 1e6 * max(float(np.fmax(trace.error_m, trace.reported_m).max()) for trace in traces)
     errors = [trace.snapshot_m - trace.snapshot_truth_m for trace in traces]
     error_um = 1e6 * max(float(np.abs(error[..., 2]).max()) for error in errors)
     for column, (trace, error) in enumerate(zip(traces, errors, strict=True)):
@@ -86,23 +88,30 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
             image = _map(axes, displacement, trace.rest_m, scale_um=full_um, colours="magma", low=0.0)
             tangential = 1e6 * displacement
             axes.quiver(
-                x, y, tangential[..., 0], tangential[..., 1], color="0.75", scale=12 * full_um, width=0.006
+                x,
+                y,
+                tangential[..., 0],
+                tangential[..., 1],
+                color="tab:cyan",
+                angles="xy",
+                scale=5.0 * max(shear_um, 1e-3),
+                width=0.012,
             )
             if row == 0:
                 axes.set_title(trace.name)
         if column == count - 1:
-            figure.colorbar(image, ax=grid[:2, :].ravel().tolist(), label="depth (µm), arrows: shear")
+            figure.colorbar(image, ax=grid[:2, :].ravel().tolist(), label="depth (µm); arrows: shear")
         image = _map(grid[2, column], error, trace.rest_m, scale_um=error_um, colours="coolwarm", low=-1.0)
         if column == count - 1:
             figure.colorbar(image, ax=grid[2, :].ravel().tolist(), label="error in depth (µm)")
         axes = grid[3, column]
         axes.plot(trace.time_s, 1e6 * trace.error_m, ".", ms=3, color="tab:blue", label="error (RMS)")
         axes.plot(trace.time_s, 1e6 * trace.reported_m, "-", color="tab:orange", label="reported deviation")
-        axes.set_ylim(0, None)
+        axes.set_ylim(0, 1.5 * highest_um)
         axes.set_xlabel("time (s)")
         depth = axes.twinx()
         depth.fill_between(trace.time_s, 1e6 * trace.depth_m, color="0.5", alpha=0.2, lw=0)
-        depth.set_ylim(0, 1.3 * full_um)
+        depth.set_ylim(0, 1.5 * full_um)
         if column == count - 1:
             depth.set_ylabel("true depth (µm), grey")
         else:
@@ -111,7 +120,7 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
             axes.set_ylabel("displacement (µm)")
             axes.legend(loc="upper left", fontsize="small", frameon=False)
         else:
-            axes.sharey(grid[3, 0])
+            axes.set_yticklabels([])
     for row, label in enumerate(("true, deepest scan", "decoded", "decoded − true")):
         grid[row, 0].set_ylabel(label)
     figure.savefig(file, dpi=110)

@@ -81,6 +81,6 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
                 for i, name in enumerate(names)
             ],
             "sync": {"period_ms": _SYNC_MS_PER_PATCH * patches},
-            "simulation": {"seed": seed},
+            "simulation": {"seed": seed, "depth": 0.3},
         }
     )

@@ -17,8 +17,8 @@ _IDLE_S: Final = 0.1
 """Longest wait for a frame: how soon the thread sees that it should end."""
 
 TIMER_SLACK_NS: Final = 2_000_000
-"""How late timers may be. Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 24 % of a core of a small machine when
-the thread wakes for every chunk and 11 % with 2 ms; above, nothing is gained."""
+"""How late timers may be. Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 24 % of a core of a small machine
+when the thread wakes for every chunk and 11 % with 2 ms; above, nothing is gained."""
 
 _RETRY_S: Final = 0.02
 """Pause after an error of the bus: a queue that was full has drained by then."""
@@ -34,14 +34,12 @@ class NodeRunner:
     the thread from :meth:`start` to :meth:`stop`; only counters may be looked at meanwhile. The port stays
     open.
 
-    ``slack_ns`` is how late timers may be, so that one waking serves several: chunks of one inhibit time each then
-    leave two or three at a time, their mean pace unchanged. Frames are served at once whatever the slack. Use 0,
-    and nodes with ``catch_up_ns = 0``, where the inhibit time must hold between any two frames.
+    ``slack_ns`` is how late timers may be, so that one waking serves several: chunks of one inhibit time each
+    then leave two or three at a time, their mean pace unchanged. Frames are served at once whatever the
+    slack. Use 0, and nodes with ``catch_up_ns = 0``, where the inhibit time must hold between any two frames.
     """
 
-    def __init__(
-        self, port: CanPort, nodes: Iterable[PatchNode], *, slack_ns: int = TIMER_SLACK_NS
-    ) -> None:
+    def __init__(self, port: CanPort, nodes: Iterable[PatchNode], *, slack_ns: int = TIMER_SLACK_NS) -> None:
         self._port = port
         self._slack_ns = slack_ns
         self.nodes = tuple(nodes)

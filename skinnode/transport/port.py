@@ -31,7 +31,10 @@ bound an endpoint that nobody reads would eat the memory of the process."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
 """Asked of the kernel where the interface is a socket: a waiting frame takes about 800 bytes of it."""
 
-_SO_RCVBUFFORCE: Final = 33  # <asm-generic/socket.h>; Python has no name for it
+# Python has no names for these. <asm-generic/socket.h>, <linux/in.h>, <linux/in6.h>
+_SO_RCVBUFFORCE: Final = 33
+_IP_MULTICAST_ALL: Final = 49
+_IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
 """A stamp older than this, or of the future, is not of this machine's wall clock: the time of reading
@@ -59,8 +62,8 @@ class Frame(NamedTuple):
 
 
 class _Message(can.Message):
-    """A message that python-can's virtual bus, which deep-copies one for each receiver, copies in a sixth of
-    the time: it is never changed after it was sent, so copies may share its bytes."""
+    """A message that python-can's virtual bus, which deep-copies one for each receiver, copies in a fifth of
+    the time its general way takes."""
 
     __slots__ = ()
 
@@ -122,7 +125,7 @@ class CanPort:
                 f"{self._where}: does not open ({_why(error)}), allowed: {_channel_hint(config)}"
             ) from error
         if config.interface in (_MULTICAST, "socketcan"):
-            _enlarge_receive_buffer(bus.fileno())
+            _tune_socket(bus.fileno())
         return bus
 
     @property
@@ -215,14 +218,20 @@ class CanPort:
         return f"<CanPort {self._where}>"
 
 
-def _enlarge_receive_buffer(fileno: int) -> None:
-    """Ask the kernel for room for bursts. It grants what the machine's net.core.rmem_max and our rights
-    allow."""
+def _tune_socket(fileno: int) -> None:
+    """Ask the kernel for room for bursts, and for the frames of this multicast group only."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
-        duplicate.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
-    except OSError:  # only root may exceed rmem_max
-        duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        try:
+            duplicate.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+        except OSError:  # only root may exceed net.core.rmem_max
+            duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        # python-can binds to any address, and such a socket hears every group that anyone on the machine has
+        # joined: two buses on two groups would be one.
+        if duplicate.family == socket.AF_INET:
+            duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        elif duplicate.family == socket.AF_INET6:
+            duplicate.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
     finally:
         duplicate.close()
 

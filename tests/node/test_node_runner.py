@@ -1,0 +1,253 @@
+"""Nodes on a bus, driven by the thread: a manager of another make talks to them."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+
+import can
+import canopen
+import numpy as np
+import pytest
+
+from skinnode.errors import BusError
+from skinnode.model.config import BusConfig
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.node import NmtState, NodeRunner, PatchNode
+from skinnode.transport import CanPort
+from skinnode.wire.profile import eds_text
+
+WAIT_S = 5.0
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) == before
+
+
+class Steady:
+    def __init__(self, layout: PatchLayout) -> None:
+        self.ohm = np.full(layout.shape, 1234.5)
+        self.error: Exception | None = None
+
+    def read(self, t_ns: int) -> Float:
+        if self.error is not None:
+            raise self.error
+        return self.ohm
+
+
+@pytest.fixture(params=["virtual", "udp_multicast"])
+def config(request: pytest.FixtureRequest) -> BusConfig:
+    channel = "239.74.163.79" if request.param == "udp_multicast" else uuid.uuid4().hex
+    return BusConfig(interface=request.param, channel=channel)
+
+
+@pytest.fixture
+def virtual() -> BusConfig:
+    return BusConfig(channel=uuid.uuid4().hex)
+
+
+def nodes_on(port: CanPort, layout: PatchLayout, *ids: int) -> list[PatchNode]:
+    return [PatchNode(i, layout, Steady(layout), send=port.send, serial=100 + i) for i in ids]
+
+
+def collect(bus: can.BusABC, done: Callable[[list[can.Message]], bool]) -> list[can.Message]:
+    """Frames until ``done`` says so, within a bounded time."""
+    messages: list[can.Message] = []
+    end_s = time.monotonic() + WAIT_S
+    while not done(messages):
+        message = bus.recv(0.1)
+        if message is not None:
+            messages.append(message)
+        assert time.monotonic() < end_s, [str(m) for m in messages]
+    return messages
+
+
+def test_python_can_only(config: BusConfig, layout: PatchLayout) -> None:
+    """Boot-up, SDO, start, SYNC, chunks, summary, heartbeat: two nodes, raw frames."""
+    with can.Bus(interface=config.interface, channel=config.channel) as manager, CanPort(config) as port:
+        nodes = nodes_on(port, layout, 4, 5)
+        with NodeRunner(port, nodes) as runner:
+
+            def send(can_id: int, data: str) -> None:
+                payload = bytes.fromhex(data)
+                manager.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=payload))
+
+            def from_nodes(messages: list[can.Message], *ids: int) -> list[can.Message]:
+                return [m for m in messages if m.arbitration_id in ids]
+
+            boots = collect(manager, lambda ms: len(from_nodes(ms, 0x704, 0x705)) == 2)
+            assert [(m.arbitration_id, bytes(m.data)) for m in from_nodes(boots, 0x704, 0x705)] == [
+                (0x704, b"\0"),
+                (0x705, b"\0"),
+            ]
+            send(0x605, "40 18 10 04 00 00 00 00")
+            answer = collect(manager, lambda ms: bool(from_nodes(ms, 0x585)))
+            assert bytes(from_nodes(answer, 0x585)[0].data) == bytes.fromhex("43 18 10 04 69 00 00 00")
+            send(0x604, "2b 17 10 00 32 00 00 00")  # heartbeat each 50 ms
+            send(0x000, "01 00")
+            send(0x080, "")
+            ids = {0x184: 4, 0x185: 4, 0x284: 1, 0x285: 1}
+            frames = collect(
+                manager,
+                lambda ms: len(from_nodes(ms, *ids)) == sum(ids.values()) and bool(from_nodes(ms, 0x704)),
+            )
+            assert {i: len(from_nodes(frames, i)) for i in ids} == ids
+            for node_id in (4, 5):
+                chunks = from_nodes(frames, 0x180 + node_id)
+                assert [bytes(m.data[:2]) for m in chunks] == [bytes((i, 0)) for i in range(4)]
+            assert bytes(from_nodes(frames, 0x704)[0].data) == b"\x05"
+            assert not runner.failed
+        assert [node.nmt_state for node in nodes] == [NmtState.INITIALISING] * 2
+        while manager.recv(0.0) is not None:
+            pass
+        send(0x604, "40 00 10 00 00 00 00 00")
+        heard = manager.recv(0.15)
+        while heard is not None and heard.arbitration_id not in (0x584, 0x704):
+            heard = manager.recv(0.05)  # udp_multicast hands a sender its own frame
+        assert heard is None
+
+
+def test_canopen_library_as_manager(virtual: BusConfig, layout: PatchLayout, tmp_path) -> None:
+    with CanPort(virtual) as port:
+        nodes = nodes_on(port, layout, 4)
+        eds = tmp_path / "patch.eds"
+        eds.write_text(eds_text(nodes[0].profile), encoding="ascii")
+        network = canopen.Network()
+        network.connect(interface="virtual", channel=virtual.channel)
+        try:
+            remote = network.add_node(4, str(eds))
+            with NodeRunner(port, nodes):
+                remote.nmt.wait_for_bootup(WAIT_S)
+                assert remote.sdo[0x1000].raw == 0
+                assert remote.sdo[0x1018][4].raw == 104
+                assert remote.sdo[0x1008].raw == "skinnode patch"
+                assert remote.sdo[0x2200][1].raw == 1234.5
+                assert len(remote.sdo[0x2300].data) > 100
+                with pytest.raises(canopen.SdoAbortedError) as caught:
+                    remote.sdo[0x1018][4].raw = 1
+                assert caught.value.code == 0x06010002
+                remote.sdo[0x1017].raw = 30
+                remote.nmt.state = "OPERATIONAL"
+                remote.nmt.wait_for_heartbeat(WAIT_S)
+                assert remote.nmt.state == "OPERATIONAL"
+
+                # The TPDO as the library decodes it, by the mapping it reads from the node itself.
+                remote.tpdo.read()
+                assert [v.name for v in remote.tpdo[2].map][:2] == [
+                    "Scan summary.Summary scan counter",
+                    "Scan summary.Flags",
+                ]
+                network.sync.transmit()
+                assert remote.tpdo[2].wait_for_reception(WAIT_S) is not None
+                assert remote.tpdo[2][2].raw == 4  # chunks sent
+
+                # Remapping by the library's own procedure.
+                remote.tpdo[2].clear()
+                remote.tpdo[2].add_variable(0x1001)
+                remote.tpdo[2].add_variable(0x2011, 1)
+                remote.tpdo[2].trans_type = 1
+                remote.tpdo[2].enabled = True
+                remote.tpdo[2].save()
+                network.sync.transmit()
+                assert remote.tpdo[2].wait_for_reception(WAIT_S) is not None
+                assert len(remote.tpdo[2].data) == 2
+                remote.nmt.state = "RESET"
+                remote.nmt.wait_for_bootup(WAIT_S)
+        finally:
+            network.disconnect()
+
+
+def test_error_of_a_source_surfaces_at_stop(virtual: BusConfig, layout: PatchLayout) -> None:
+    with CanPort(virtual) as port, CanPort(virtual) as manager:
+        source = Steady(layout)
+        runner = NodeRunner(port, [PatchNode(4, layout, source, send=port.send)])
+        runner.start()
+        assert manager.recv(WAIT_S) is not None
+        source.error = OSError("the converter is gone")
+        manager.send(0x000, b"\x01\x00")
+        manager.send(0x080, b"")
+        end_s = time.monotonic() + WAIT_S
+        while not runner.failed and time.monotonic() < end_s:
+            time.sleep(0.01)
+        assert runner.failed
+        with pytest.raises(OSError, match="the converter is gone"):
+            runner.stop()
+        runner.stop()
+
+
+def test_source_that_fails_at_power_on(virtual: BusConfig, layout: PatchLayout) -> None:
+    with CanPort(virtual) as port:
+        source = Steady(layout)
+        source.error = OSError("no converter")
+        with (
+            pytest.raises(OSError, match="no converter"),
+            NodeRunner(port, [PatchNode(4, layout, source, send=port.send)]),
+        ):
+            pass
+
+
+def test_bus_that_refuses_frames_for_a_while(virtual: BusConfig, layout: PatchLayout) -> None:
+    """A full transmit queue costs frames, not the node."""
+    with CanPort(virtual) as port, CanPort(virtual) as manager:
+        refuse = threading.Event()
+        refused = threading.Event()
+
+        def send(can_id: int, data: bytes) -> None:
+            if refuse.is_set():
+                refused.set()
+                raise BusError("can0: no buffer space available")
+            port.send(can_id, data)
+
+        with NodeRunner(port, [PatchNode(4, layout, Steady(layout), send=send)]) as runner:
+            assert manager.recv(WAIT_S) is not None
+            refuse.set()
+            manager.send(0x604, bytes.fromhex("4000100000000000"))
+            assert refused.wait(WAIT_S)
+            refuse.clear()
+            manager.send(0x604, bytes.fromhex("4000100000000000"))
+            frame = manager.recv(WAIT_S)
+            assert frame is not None
+            assert frame.can_id == 0x584
+            assert runner.bus_errors >= 1
+
+
+def test_frames_that_are_not_classic_data_are_no_frames_to_a_node(
+    virtual: BusConfig, layout: PatchLayout
+) -> None:
+    with (
+        can.Bus(interface="virtual", channel=virtual.channel) as manager,
+        CanPort(virtual) as port,
+        NodeRunner(port, nodes_on(port, layout, 4)),
+    ):
+        assert manager.recv(WAIT_S) is not None
+        request = bytes.fromhex("4000100000000000")
+        for options in (
+            {"is_extended_id": True},
+            {"is_extended_id": False, "is_fd": True},
+            {"is_extended_id": False, "is_error_frame": True},
+        ):
+            manager.send(can.Message(arbitration_id=0x604, data=request, **options))
+        manager.send(can.Message(arbitration_id=0x604, is_extended_id=False, is_remote_frame=True, dlc=8))
+        assert manager.recv(0.1) is None
+        manager.send(can.Message(arbitration_id=0x604, is_extended_id=False, data=request))
+        answer = manager.recv(WAIT_S)
+        assert answer is not None
+        assert answer.arbitration_id == 0x584
+
+
+def test_nodes_must_differ(virtual: BusConfig, layout: PatchLayout) -> None:
+    with CanPort(virtual) as port:
+        with pytest.raises(ValueError, match=r"node-IDs \[4, 4\], must differ"):
+            NodeRunner(port, nodes_on(port, layout, 4, 4))
+        with pytest.raises(ValueError, match="got none"):
+            NodeRunner(port, [])
+
+
+def test_stop_without_start(virtual: BusConfig, layout: PatchLayout) -> None:
+    with CanPort(virtual) as port:
+        NodeRunner(port, nodes_on(port, layout, 4)).stop()

@@ -1,0 +1,93 @@
+"""The receive thread: bounded, counted, and never dead unheard."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+
+import pytest
+
+from skinnode.errors import BusError
+from skinnode.model.config import BusConfig
+from skinnode.transport import CanPort, Frame, Receiver
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) == before
+
+
+class Script:
+    """A port that plays frames and then an error, or silence."""
+
+    def __init__(self, count: int, error: BusError | None = None) -> None:
+        self.config = BusConfig(name="script")
+        self.left, self.error = count, error
+        self.count = count
+        self.played = threading.Event()
+
+    def recv(self, timeout_s: float) -> Frame | None:
+        if self.left:
+            self.left -= 1
+            return Frame(self.count - self.left - 1, b"", 0)
+        self.played.set()
+        if self.error is not None:
+            raise self.error
+        time.sleep(min(timeout_s, 0.005))
+        return None
+
+
+def test_order_and_batches() -> None:
+    port = Script(10)
+    with Receiver(port) as receiver:
+        assert port.played.wait(5)
+        assert [frame.can_id for frame in receiver.get_batch(1.0, max_frames=4)] == [0, 1, 2, 3]
+        assert receiver.queued == 6
+        assert [frame.can_id for frame in receiver.get_batch(1.0)] == [4, 5, 6, 7, 8, 9]
+        assert receiver.get_batch(0.0) == []
+        assert receiver.get_batch(0.01) == []
+        assert receiver.dropped == 0
+
+
+def test_a_full_queue_drops_the_newest_and_counts() -> None:
+    port = Script(100)
+    with Receiver(port, capacity=30) as receiver:
+        assert port.played.wait(5)
+        assert [frame.can_id for frame in receiver.get_batch(0.0)] == list(range(30))
+        assert receiver.dropped == 70
+
+
+def test_an_error_is_raised_to_the_reader_after_the_frames_before_it() -> None:
+    error = BusError("script: gone")
+    port = Script(3, error)
+    with Receiver(port) as receiver:
+        assert port.played.wait(5)
+        assert len(receiver.get_batch(1.0)) == 3
+        for _ in range(2):
+            with pytest.raises(BusError, match="script: gone"):
+                receiver.get_batch(1.0)
+
+
+def test_capacity() -> None:
+    with pytest.raises(ValueError, match="capacity: got 0, must be at least 1"):
+        Receiver(Script(0), capacity=0)
+
+
+@pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
+def test_on_a_bus(interface: str) -> None:
+    channel = "239.74.163.78" if interface == "udp_multicast" else uuid.uuid4().hex
+    config = BusConfig(interface=interface, channel=channel)
+    with CanPort(config) as ours, CanPort(config) as theirs, Receiver(theirs) as receiver:
+        for number in range(200):
+            ours.send(number, b"12345678")
+        frames: list[Frame] = []
+        end_s = time.monotonic() + 5
+        while len(frames) < 200 and time.monotonic() < end_s:
+            frames += receiver.get_batch(0.1)
+        assert [frame.can_id for frame in frames] == list(range(200))
+        receiver.close()
+        receiver.close()

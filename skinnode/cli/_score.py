@@ -76,12 +76,12 @@ class Scorer:
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """The bound changes slowly; it is computed for one scan in this many."""
+    """The bound changes slowly; it is computed for one scan in this many, and not before :meth:`score`."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0
     _variances: float = 0.0
-    _bounds: list[float] = field(default_factory=list)
+    _bound_at: list[Float] = field(default_factory=list)
     _largest: float = 0.0
     _covered: int = 0
     _worst: float = 0.0
@@ -98,9 +98,7 @@ class Scorer:
         std = frame.displacement_std_m
         deviations = np.abs(error) / std
         if self._scans % self.bound_every == 0:
-            at_rest = potential_per_m(self.layout, self.layout.upper_m)
-            relative = self.code_std * potential_per_m(self.layout, true_upper_m) / at_rest  # R0 / R = F / F0
-            self._bounds.append(float(np.mean(bound_std_m(self.layout, true_upper_m, relative) ** 2)))
+            self._bound_at.append(true_upper_m)
         self._scans += 1
         self._squares += float(np.mean(error**2))
         self._variances += float(np.mean(std**2))
@@ -115,13 +113,19 @@ class Scorer:
     def score(self) -> Score:
         """The figures so far."""
         count = self._scans or float("nan")
+        at_rest = potential_per_m(self.layout, self.layout.upper_m)
+        bounds = [
+            # of R, relative: R0 / R = F / F0
+            bound_std_m(self.layout, upper_m, self.code_std * potential_per_m(self.layout, upper_m) / at_rest)
+            for upper_m in self._bound_at
+        ]
         return Score(
             scans=self._scans,
             untrusted=self._untrusted,
             deepest_m=self._deepest[0],
             error_rms_m=float(np.sqrt(self._squares / count)),
             reported_rms_m=float(np.sqrt(self._variances / count)),
-            bound_rms_m=float(np.sqrt(np.mean(self._bounds))) if self._bounds else float("nan"),
+            bound_rms_m=float(np.sqrt(np.mean(np.square(bounds)))) if bounds else float("nan"),
             error_max_m=self._largest,
             relative_error=self._deepest[1],
             coverage95=self._covered / (count * self.layout.upper_m.size),

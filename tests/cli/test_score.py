@@ -27,7 +27,7 @@ def field(displacement_m: Float, std_m: float, status: Status = Status.CONVERGED
 
 
 def test_the_bound_is_what_a_linear_estimate_scatters_by() -> None:
-    """Monte Carlo: one Newton step from the truth on noisy resistances, by finite differences of the model."""
+    """Monte Carlo: a Newton step from the truth on noisy resistances, by finite differences of the model."""
     wire = PatchLayout(LAYOUT.upper_m[4:5], LAYOUT.lower_m, LAYOUT.resistivity_ohm_per_m)
     relative = np.full(wire.shape, 1e-5)
     exact = resistance_ohm(wire, wire.upper_m).ravel()

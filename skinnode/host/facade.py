@@ -18,7 +18,7 @@ from skinnode.host import bringup
 from skinnode.host.bringup import Abandoned, Bringer, NodeFacts, check_eds
 from skinnode.host.health import OPERATIONAL, NodeMonitor, PatchHealth
 from skinnode.host.link import BusLink, BusStats, Handler
-from skinnode.host.pipeline import Lane, LaneStats, Solver
+from skinnode.host.pipeline import Lane, LaneStats, Solver, check_solvable
 from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
 from skinnode.host.sync import SyncProducer, SyncStats, Ticks
 from skinnode.host.workers import Workers
@@ -121,9 +121,10 @@ class Host:
             boot_deadline_s: how long a node may take to answer for the first time.
             cancelled: asked during bring-up; when it says True, bring-up ends with BringUpCancelled.
 
-        Raises ConfigError for options that contradict the hand and for EDS files that do; BusError for an
-        interface that does not open; NodeTimeout for a node, or a whole bus, that does not answer; NodeError
-        for a node that is not what the hand says or does not keep its configuration.
+        Raises ConfigError for options or EDS files that contradict the hand, and for a layout that cannot be
+        solved; BusError for an interface that does not open or a bus on which no node answers; NodeTimeout
+        for a node that does not answer; NodeError for one that is not what the hand says or does not keep its
+        configuration.
         """
         hand = hand.on(interface, channel)
         for patch in hand.patches:
@@ -140,13 +141,14 @@ class Host:
                 if hand.patches_on(bus.name)
             }
             ticks = Ticks(hand.sync.counter_overflow)
-            period_ns = hand.sync.period_ms * 1_000_000
+            for patch in hand.patches:
+                check_solvable(patch, hand.solver)
             try:
                 facts = _bring_up(hand, links, boot_deadline_s, cancelled)
                 solvers = {name: Solver(known, hand.solver) for name, known in facts.items()}
                 workers = stack.enter_context(_workers(hand))
                 lanes = {
-                    name: _lane(known, solvers[name], workers, publisher, ticks, period_ns, links, monitors)
+                    name: _lane(hand, known, solvers[name], workers, publisher, ticks, links, monitors)
                     for name, known in facts.items()
                 }
                 # Undone in this order from below: SYNC stops, nodes fall silent, mainlines end, boxes are
@@ -158,8 +160,10 @@ class Host:
                 for patch in hand.patches:
                     stack.callback(_stand_by, links[patch.bus], monitors[patch.name])
                 _start(hand, links, monitors)
-            except BusError as error:
-                raise publisher.failure or error from error.__cause__
+            except BusError:
+                if publisher.failure is not None:  # the nodes fell silent because the bus failed
+                    raise publisher.failure from publisher.failure.__cause__
+                raise
             senders = [link.send for link in links.values()]
             sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
             yield cls(hand, links, lanes, monitors, sync, publisher)
@@ -216,12 +220,12 @@ def _workers(hand: HandConfig) -> Workers:
 
 
 def _lane(
+    hand: HandConfig,
     facts: NodeFacts,
     solver: Solver,
     workers: Workers,
     publisher: Publisher,
     ticks: Ticks,
-    period_ns: int,
     links: Mapping[str, BusLink],
     monitors: Mapping[str, NodeMonitor],
 ) -> Lane:
@@ -230,7 +234,7 @@ def _lane(
     assembler = ScanAssembler(
         facts.profile,
         counter_overflow=ticks.counter_overflow,
-        period_ns=period_ns,
+        period_ns=hand.sync.period_ms * 1_000_000,
         node_id=patch.node_id,
         on_reject=link.reject,
     )

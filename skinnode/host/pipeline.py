@@ -20,7 +20,8 @@ from skinnode.host.bringup import NodeFacts
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
 from skinnode.host.workers import Workers
-from skinnode.model.config import SolverConfig
+from skinnode.model.config import PatchConfig, SolverConfig
+from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.solve.tracker import Tracker
 from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
@@ -34,19 +35,13 @@ class Solver:
 
     def __init__(self, facts: NodeFacts, config: SolverConfig) -> None:
         self._facts = facts
-        try:
-            self._tracker = Tracker(
-                facts.layout,
-                operator=config.operator,
-                relative_noise=facts.config.relative_noise,
-                baseline_ohm=facts.baseline_ohm,
-                stiffness_n_per_m=config.stiffness_n_per_m,
-            )
-        except ValueError as error:  # a layout that can be sensed but not solved
-            raise ConfigError(f"patch {facts.config.name!r}", facts.layout.name, str(error)) from None
-        # The first call compiles the kernels or reads them from the cache: not while a scan waits.
-        self._tracker.update(facts.baseline_ohm)
-        self._tracker.reset()
+        self._tracker = Tracker(
+            facts.layout,
+            operator=config.operator,
+            relative_noise=facts.config.relative_noise,
+            baseline_ohm=facts.baseline_ohm,
+            stiffness_n_per_m=config.stiffness_n_per_m,
+        )
         self._quantisation_ohm = facts.scale.relative_std * facts.baseline_ohm
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
@@ -64,6 +59,16 @@ class Solver:
             frame.resistance_ohm, frame.valid, np.where(frame.valid, noise, 1.0)
         )
         return replace(field, stamp=replace(frame.stamp, t_solved_ns=time.monotonic_ns()))
+
+
+def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
+    """Raise ConfigError for a layout that can be sensed but not solved. The first call compiles the kernels,
+    or reads them from the cache: not while a node waits."""
+    layout = patch.layout.build()
+    try:
+        Tracker(layout, operator=config.operator).update(resistance_ohm(layout, layout.upper_m))
+    except ValueError as error:
+        raise ConfigError(f"patch {patch.name!r}", layout.name, str(error)) from None
 
 
 @dataclass(frozen=True, slots=True)

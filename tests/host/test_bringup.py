@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import SMALL, eventually, heard
 
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
 from skinnode.host import BringUpCancelled, Host
@@ -22,6 +21,8 @@ from skinnode.node.runner import NodeRunner
 from skinnode.transport import CanPort
 from skinnode.wire.profile import PatchProfile, eds_text
 from vcan_sim.fleet import Fleet
+
+from .conftest import SMALL, eventually, heard
 
 LAYOUT = PatchLayout.preset("staggered", **SMALL)
 

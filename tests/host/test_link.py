@@ -5,13 +5,14 @@ from __future__ import annotations
 import queue
 
 import pytest
-from conftest import eventually
 
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host.link import BusLink
 from skinnode.model.config import HandConfig
 from skinnode.transport import CanPort
 from skinnode.wire.timing import exact_bits
+
+from .conftest import eventually
 
 
 def fail(error: SkinError) -> None:

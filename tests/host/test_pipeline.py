@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import SMALL, eventually
 
 from skinnode.errors import SkinError
 from skinnode.host.bringup import NodeFacts
@@ -24,6 +23,8 @@ from skinnode.model.status import Status
 from skinnode.wire.assembler import Scan, ScanAssembler
 from skinnode.wire.codec import CodeScale, SummaryFlag, encode, pack_scan, pack_summary
 from skinnode.wire.profile import PatchProfile
+
+from .conftest import SMALL, eventually
 
 LAYOUT = PatchLayout.preset("staggered", **SMALL)
 PROFILE = PatchProfile.from_layout(LAYOUT)

@@ -13,7 +13,6 @@ from collections.abc import Callable
 import can
 import numpy as np
 import pytest
-from conftest import SMALL, eventually, heard
 
 from skinnode.errors import BusError, ConfigError
 from skinnode.host import Condition, Host, Subscription
@@ -22,6 +21,8 @@ from skinnode.model.frames import FieldFrame, ScanStamp
 from skinnode.node.nmt import NmtState
 from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
+
+from .conftest import SMALL, eventually, heard
 
 
 def take(fields: Subscription, count: int) -> list[FieldFrame]:

@@ -1,0 +1,267 @@
+"""``skinnode host`` as its user meets it: two processes on a bus, Ctrl-C, exit statuses, one-line errors."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from skinnode.cli.main import main
+from skinnode.errors import BusError
+from skinnode.model.config import BusConfig, HandConfig
+from skinnode.transport import CanPort
+from skinnode.transport.receiver import drain
+
+from .conftest import SMALL, eventually
+
+HOST = [sys.executable, "-W", "error", "-c", "from skinnode.cli.main import main; main()", "host"]
+SIMULATOR = [sys.executable, "-W", "error", "-c", "from vcan_sim.cli import main; main()"]
+PATIENCE_S = 60.0
+TABLE = """
+[[buses]]
+name = "can0"
+interface = "{interface}"
+channel = "{channel}"
+
+[sync]
+period_ms = 40
+
+[[patches]]
+name = "thumb"
+node_id = 11
+layout = {layout}
+
+[[patches]]
+name = "index"
+node_id = 12
+layout = {layout}
+"""
+LAYOUT = "{ " + ", ".join(f"{key} = {value}" for key, value in SMALL.items()) + " }"
+
+
+def write_hand(folder: Path, interface: str, channel: str) -> Path:
+    path = folder / "hand.toml"
+    path.write_text(TABLE.format(interface=interface, channel=channel, layout=LAYOUT))
+    return path
+
+
+class Process:
+    """A command with its output as it comes."""
+
+    def __init__(self, command: list[str]) -> None:
+        self.child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.child.stdout is not None
+        self.lines.extend(line.rstrip("\n") for line in self.child.stdout)
+
+    def says(self, text: str) -> bool:
+        """Whether a line with ``text`` comes."""
+        return eventually(
+            lambda: any(text in line for line in self.lines) or self.child.poll() is not None, PATIENCE_S
+        ) and any(text in line for line in self.lines)
+
+    def end(self, number: int | None = None) -> tuple[int, str]:
+        """Exit status and stderr, after signal ``number``."""
+        if number is not None:
+            self.child.send_signal(number)
+        try:
+            status = self.child.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.child.kill()
+            self.child.wait()
+            raise
+        finally:
+            self._reader.join()
+            assert self.child.stderr is not None
+            errors = self.child.stderr.read()
+            self.child.stderr.close()
+            assert self.child.stdout is not None
+            self.child.stdout.close()
+        return status, errors
+
+
+@contextmanager
+def process(command: list[str]) -> Iterator[Process]:
+    running = Process(command)
+    try:
+        yield running
+    finally:
+        if running.child.poll() is None:
+            running.end(signal.SIGKILL)
+
+
+@pytest.fixture
+def multicast(tmp_path: Path) -> tuple[Path, BusConfig]:
+    """A hand on a multicast group of its own."""
+    group = f"239.74.{random.randrange(256)}.{random.randrange(256)}"
+    bus = BusConfig(interface="udp_multicast", channel=group)
+    try:
+        with CanPort(bus) as port, CanPort(bus) as other:
+            port.send(0x7FF, b"")
+            if other.recv(2.0) is None:
+                pytest.skip("no multicast on this machine")
+    except BusError:
+        pytest.skip("no multicast on this machine")
+    return write_hand(tmp_path, bus.interface, bus.channel), bus
+
+
+def heartbeats(bus: BusConfig) -> dict[int, int]:
+    """The newest state that each node says in the next second."""
+    with CanPort(bus) as port:
+        return {
+            frame.can_id - 0x700: frame.data[0] for frame in drain(port, 1.0) if frame.can_id & 0x780 == 0x700
+        }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_two_processes_on_one_bus(multicast: tuple[Path, BusConfig], number: int) -> None:
+    path, bus = multicast
+    with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path), "--json"]) as host:
+        assert host.says('"elapsed_s"')
+        assert eventually(lambda: sum('"elapsed_s"' in line for line in host.lines) >= 2)
+        assert host.end(number) == (0, "")
+        last = json.loads([line for line in host.lines if "elapsed_s" in line][-1])
+        assert set(last["patches"]) == {"thumb", "index"}
+        for patch in last["patches"].values():
+            assert patch["condition"] == "operational"
+            assert patch["solved"] > 0
+            assert patch["torn"] == patch["missed"] == patch["chunks_lost"] == 0
+        assert json.loads(host.lines[-1]) == {"note": "nodes are pre-operational"}
+        assert heartbeats(bus) == {11: 127, 12: 127}
+        status, errors = simulator.end(number)
+        assert (status, errors) == (0, "")
+
+
+def test_interrupted_while_it_waits_for_nodes(multicast: tuple[Path, BusConfig]) -> None:
+    path, bus = multicast
+    with CanPort(bus) as listener, process([*HOST, str(path)]) as host:
+        while listener.recv(PATIENCE_S) is None:  # its first question
+            pass
+        assert host.end(signal.SIGINT) == (0, "")
+
+
+def test_wrong_length_is_one_line_and_status_2(multicast: tuple[Path, BusConfig]) -> None:
+    path, bus = multicast
+    with process([*SIMULATOR, str(path)]), process([*HOST, str(path)]) as host:
+        assert host.says("operational on can0")
+        with CanPort(bus) as stranger:
+            stranger.send(0x18B, bytes(7))
+        assert eventually(lambda: sum(" s  thumb" in line for line in host.lines) >= 2)
+        status, errors = host.end(signal.SIGINT)
+    line = "COB-ID 0x18B: got 7 bytes (00 00 00 00 00 00 00), allowed: 8 bytes (chunk)"
+    assert status == 2
+    assert errors.splitlines() == [f"can0: {line}; rejected, as are others like it", f"error: {line}"]
+    assert host.lines[-1] == "nodes are pre-operational"
+
+
+def run(*arguments: str) -> int:
+    """Exit status of ``skinnode host`` in this process."""
+    with pytest.raises(SystemExit) as caught:
+        main(["host", *arguments])
+    return int(caught.value.code or 0)
+
+
+@pytest.fixture
+def error_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run ``skinnode host`` with these arguments, which it cannot: the one line that it says."""
+
+    def error(*arguments: str) -> str:
+        handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+        assert run(*arguments) == 2
+        assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        return lines[0]
+
+    return error
+
+
+def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: HandConfig) -> None:
+    channel = hand.buses[0].channel
+    assert error_of(str(write_hand(tmp_path, "virtual", channel))) == (
+        f"error: can0: interface 'virtual', channel '{channel}': got no answer from any node, "
+        "allowed: an answer within 3 s from 11 (thumb), 12 (index)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (
+            "node_id = 12",
+            "node_id = 11",
+            "patches[1].node_id: got 11, allowed: one that patches[0] does not use",
+        ),
+        (
+            "node_id = 12",
+            'node_id = 12\neds = "none.eds"',
+            "patches[1].eds: got 'none.eds', "
+            "allowed: the path of an EDS file; there is no file {folder}/none.eds",
+        ),
+        (
+            "period_ms = 40",
+            "periode_ms = 40",
+            "sync.periode_ms: got 40, allowed: no such key (did you mean period_ms?); "
+            "the keys here are period_ms, counter_overflow",
+        ),
+        (
+            "period_ms = 40",
+            "period_ms 40",
+            "line 8, column 11: got 'period_ms 40', "
+            "allowed: TOML (Expected '=' after a key in a key/value pair)",
+        ),
+        (
+            "period_ms = 40",
+            'period_ms = "40"',
+            "sync.period_ms: got '40', allowed: an integer from 1 to 60000",
+        ),
+    ],
+)
+def test_hand_file_that_cannot_be_used(
+    error_of: Callable[..., str], tmp_path: Path, old: str, new: str, line: str
+) -> None:
+    path = write_hand(tmp_path, "virtual", "none")
+    path.write_text(path.read_text().replace(old, new))
+    assert error_of(str(path)) == f"error: {path}: {line.format(folder=tmp_path)}"
+
+
+def test_no_such_file(error_of: Callable[..., str], tmp_path: Path) -> None:
+    path = tmp_path / "none.toml"
+    assert error_of(str(path)) == (
+        f"error: hand file: got '{path}', allowed: a file that can be read (No such file or directory)"
+    )
+
+
+def test_interface_that_does_not_open(error_of: Callable[..., str], tmp_path: Path) -> None:
+    path = write_hand(tmp_path, "socketcan", "nocan0")
+    line = error_of(str(path))
+    assert re.fullmatch(
+        r"error: can0: interface 'socketcan', channel 'nocan0': does not open \(.+\), allowed: .+", line
+    )
+    assert error_of(str(path), "--interface", "smoke-signal").startswith(
+        "error: can0: interface 'smoke-signal', channel 'nocan0': no such interface, allowed: "
+    )
+
+
+def test_option_out_of_range_is_the_users_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert run(str(write_hand(tmp_path, "virtual", "none")), "--seconds", "-1") == 2
+    assert "--seconds" in capsys.readouterr().err
+
+
+def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    text = capsys.readouterr().out
+    assert all(option in text for option in ("--interface", "--channel", "--seconds", "--json"))

@@ -32,7 +32,7 @@ from skinnode.wire.codec import CodeScale
 from vcan_sim.fleet import Fleet
 
 BITRATE_BPS: Final = 1_000_000
-_REDRAW_S: Final = 0.125
+_REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
 """No field for this long: the scans of one SYNC are solved and the next are still on their way."""

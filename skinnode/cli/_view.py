@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from rich.color import Color
 from rich.columns import Columns
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.measure import Measurement
 from rich.panel import Panel
+from rich.segment import Segment
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
@@ -16,6 +22,8 @@ from skinnode.model.layout import Float
 
 # Five points of matplotlib's "magma" (CC0): equal steps of depth look like equal steps of brightness.
 _COLOURS = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], dtype=float)
+_LEVELS = 48
+"""Shades on the screen; more could not be told apart and would cost time to draw."""
 _ARROWS = "→↗↑↖←↙↓↘"
 MAP_SIZE = 16
 """Characters across a height map; two pixels above each other make one character, so it is square."""
@@ -49,11 +57,17 @@ class BusView:
     latency_p99_ms: float
 
 
-def _colour(level: float) -> str:
-    position = float(np.clip(level, 0.0, 1.0)) * (len(_COLOURS) - 1)
+@functools.lru_cache(maxsize=_LEVELS * _LEVELS)
+def _style(above: int, below: int) -> Style:
+    """A character's upper half in the colour of one level, its lower half in that of another."""
+    return Style(color=Color.from_rgb(*_rgb(above)), bgcolor=Color.from_rgb(*_rgb(below)))
+
+
+def _rgb(level: int) -> tuple[float, float, float]:
+    position = level / (_LEVELS - 1) * (len(_COLOURS) - 1)
     low = min(int(position), len(_COLOURS) - 2)
     red, green, blue = _COLOURS[low] + (position - low) * (_COLOURS[low + 1] - _COLOURS[low])
-    return f"rgb({red:.0f},{green:.0f},{blue:.0f})"
+    return float(red), float(green), float(blue)
 
 
 def _resample(grid: Float, size: int) -> Float:
@@ -63,16 +77,26 @@ def _resample(grid: Float, size: int) -> Float:
     return np.stack([np.interp(rows, np.arange(grid.shape[0]), column) for column in across.T], axis=1)
 
 
-def height_map(displacement_m: Float, full_scale_m: float) -> Text:
-    """Depth of the surface as coloured half blocks; the first upper wire is at the bottom."""
-    depth = _resample(-displacement_m[..., 2], MAP_SIZE)[::-1] / full_scale_m
-    text = Text(no_wrap=True)
-    for upper, lower in zip(depth[0::2], depth[1::2], strict=True):
-        for above, below in zip(upper, lower, strict=True):
-            text.append("▀", style=f"{_colour(above)} on {_colour(below)}")
-        text.append("\n")
-    text.rstrip()
-    return text
+class HeightMap:
+    """Depth of the surface as coloured half blocks; the first upper wire is at the bottom.
+
+    Segments are made directly, a run of equal colours in one: as text with a style a character it would cost
+    the host milliseconds a redraw.
+    """
+
+    def __init__(self, displacement_m: Float | None, full_scale_m: float) -> None:
+        depth = np.zeros((2, 2)) if displacement_m is None else -displacement_m[..., 2] / full_scale_m
+        levels = np.rint(np.clip(_resample(depth, MAP_SIZE), 0.0, 1.0) * (_LEVELS - 1))
+        self._levels = levels[::-1].astype(int).tolist()
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement(MAP_SIZE, MAP_SIZE)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for upper, lower in zip(self._levels[0::2], self._levels[1::2], strict=True):
+            for pair, run in itertools.groupby(zip(upper, lower, strict=True)):
+                yield Segment("▀" * sum(1 for _ in run), _style(*pair))
+            yield Segment.line()
 
 
 def shear_arrow(displacement_m: Float) -> str:
@@ -96,10 +120,8 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
     rows.add_column(style="dim")
     rows.add_column(justify="right")
     if patch.displacement_m is None:
-        picture: RenderableType = Text("\n" * (MAP_SIZE // 2 - 1))
         depth, shear = float("nan"), "-"
     else:
-        picture = height_map(patch.displacement_m, full_scale_m)
         depth, shear = float(-patch.displacement_m[..., 2].min()), shear_arrow(patch.displacement_m)
     rows.add_row("depth", _micro(depth))
     rows.add_row("±", _micro(patch.peak_std_m))
@@ -108,7 +130,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
     rows.add_row("rate", f"{patch.rate_hz:.1f} Hz")
     good = patch.health == "operational" and patch.torn == 0
     return Panel(
-        Group(picture, rows),
+        Group(HeightMap(patch.displacement_m, full_scale_m), rows),
         title=patch.name,
         subtitle=f"[{'green' if good else 'red'}]{patch.health}[/]",
         width=MAP_SIZE + 4,

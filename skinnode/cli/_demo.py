@@ -294,10 +294,10 @@ def _percentile(values: Sequence[float], percent: float) -> float:
 def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
     found = []
     if lost:
-        found.append(f"{lost} frames lost")
+        found.append(f"{lost} {'frame' if lost == 1 else 'frames'} lost")
     for row in rows:
         if row.scans_torn:
-            found.append(f"{row.patch}: {row.scans_torn} scans torn")
+            found.append(f"{row.patch}: {row.scans_torn} {'scan' if row.scans_torn == 1 else 'scans'} torn")
         if row.score.scans == 0:
             found.append(f"{row.patch}: no scan solved")
         elif not row.score.within_uncertainty:

@@ -1,0 +1,56 @@
+"""What the README says runs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+
+
+def python_blocks() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_the_first_example_prints_what_it_claims() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", python_blocks()[0]], capture_output=True, text=True, timeout=100, check=True
+    )
+    error, _, status = done.stdout.splitlines()[0].partition(" ")
+    assert float(error) < 1e-6 * 150e-6  # the press of 150 µm is recovered to a millionth
+    assert "CONVERGED" in status
+    assert done.stdout.splitlines()[1].endswith("True")
+
+
+def test_commands_of_the_table_exist() -> None:
+    commands = set(re.findall(r"\| `(skinnode|vcan-sim)(?: (\w+))?", README))
+    assert ("skinnode", "demo") in commands
+    for program, command in commands:
+        arguments = [str(Path(sys.executable).with_name(program)), *filter(None, [command]), "--help"]
+        if program == "vcan-sim":
+            arguments = [arguments[0], "--help"]
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+def test_the_second_example_runs_against_simulated_patches() -> None:
+    folder = Path(__file__).parents[1]
+    simulator = subprocess.Popen(
+        [str(Path(sys.executable).with_name("vcan-sim")), "examples/hand.toml"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        code = python_blocks()[1].rstrip() + "\n        if field.stamp.scan >= 12:\n            break\n"
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=100, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        patches = {line.split()[0] for line in done.stdout.splitlines()}
+        assert patches == {"thumb", "index", "middle", "palm"}
+    finally:
+        simulator.terminate()
+        simulator.communicate(timeout=20)

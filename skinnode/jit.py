@@ -61,12 +61,14 @@ def is_cold() -> bool:
     return folder is None or not any(folder.rglob("*.nbc"))
 
 
-_OPTIONS = {"nogil": True, "error_model": "numpy"}
+_OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def njit_part(function: _F) -> _F:
-    """Compile ``function`` for other kernels only: Python cannot call it, and the kernels that use it keep its
-    code. Building no entry for Python saves a fifth of the compile time."""
+    """Compile ``function`` for other kernels only: Python cannot call it, and its code is kept with theirs.
+
+    Building no entry for Python saves a fifth of the compile time.
+    """
     compiled: _F = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
     return compiled
 

@@ -1,7 +1,8 @@
 """The paper's method: the samples taken while the press happens lead the solver to the last one.
 
-H(X, t) = F(X) − ρ / R(t); X(0) is the grid at rest, each sample is solved from the solution of the one before
-(Lahaye), the intermediate ones at a loose tolerance, the last at a tight one (Xu et al. 2018, sections 3.2, 5).
+H(X, t) = F(X) − ρ / R(t); X(0) is the grid at rest, each sample is solved from the solution of the one
+before (Lahaye), the intermediate ones at a loose tolerance, the last at a tight one (Xu et al. 2018,
+sections 3.2, 5).
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class PathResult:
     status: tuple[Status, ...]
     """One for each upper wire."""
     error_estimate_m: Float
-    """(U,) largest error of a coordinate left by tolerance and rounding, given exact samples; inf where unknown."""
+    """(U,) largest error of a coordinate left by tolerance and rounding, given exact samples; inf where
+    unknown."""
     residual: Float
     """(U,) RMS of F/b − 1 at the end."""
     sample: NDArray[np.int64]

@@ -1,9 +1,10 @@
 """Small dense factorisations for the step loops: LU of a square Jacobian, QR of a tall one.
 
-Written by hand because at 30 unknowns a LAPACK call costs more than the arithmetic, and ``numpy.linalg`` inside
-compiled code costs seconds of compile time. The LU is taken of Jᵀ, which is how the kernels store J: every
-inner loop then runs through a contiguous row and no sum has to be reordered to vectorise. Normal equations are
-avoided; they square the condition number (Golub & Van Loan, Matrix Computations, 4th ed., 3.4, 5.2, 5.3).
+Written by hand because at 30 unknowns a LAPACK call costs more than the arithmetic, and ``numpy.linalg``
+inside compiled code costs seconds of compile time. The LU is taken of Jᵀ, which is how the kernels store J:
+every inner loop then runs through a contiguous row and no sum has to be reordered to vectorise. Normal
+equations are avoided; they square the condition number (Golub & Van Loan, Matrix Computations, 4th ed.,
+3.4, 5.2, 5.3).
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.jit import njit
+from skinnode.jit import njit_part
 from skinnode.model.layout import Float
 
 Index = NDArray[np.int64]
 
 
-@njit
+@njit_part
 def dot(a: Float, b: Float) -> float:
     """a·b in four partial sums: as exact as one, and four times less latency."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -34,7 +35,7 @@ def dot(a: Float, b: Float) -> float:
     return (s0 + s1) + (s2 + s3)
 
 
-@njit
+@njit_part
 def largest(a: Float) -> float:
     """max |a_i|; NaN where there is one."""
     top = 0.0
@@ -45,9 +46,10 @@ def largest(a: Float) -> float:
     return top
 
 
-@njit
+@njit_part
 def lu_factor(a: Float, pivot: Index) -> int:
-    """LU of ``a`` (n, n) in place with row exchanges in ``pivot``; sign of det ``a``, 0 where it is singular."""
+    """LU of ``a`` (n, n) in place with row exchanges in ``pivot``; sign of det ``a``, 0 where it is
+    singular."""
     n = a.shape[0]
     sign = 1
     for j in range(n):
@@ -79,7 +81,7 @@ def lu_factor(a: Float, pivot: Index) -> int:
     return sign
 
 
-@njit
+@njit_part
 def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
     """Solve aᵀ s = b for the ``a`` of :func:`lu_factor`; s replaces ``b`` (n,)."""
     n = b.size
@@ -100,7 +102,7 @@ def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
             b[i], b[p] = b[p], b[i]
 
 
-@njit
+@njit_part
 def lu_inverse_transposed(lu: Float, pivot: Index, inverse: Float) -> None:
     """(aᵀ)⁻¹ of the ``a`` of :func:`lu_factor` into ``inverse`` (n, n)."""
     n = lu.shape[0]
@@ -130,7 +132,7 @@ def lu_inverse_transposed(lu: Float, pivot: Index, inverse: Float) -> None:
                 row[c], other[c] = other[c], row[c]
 
 
-@njit
+@njit_part
 def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:
     """Householder QR of J = ``jt``ᵀ, (m, n) with m ≥ n. 1, or 0 where a diagonal element of R vanishes.
 
@@ -169,7 +171,7 @@ def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> in
     return full
 
 
-@njit
+@njit_part
 def qr_project(a: Float, beta: Float, b: Float) -> None:
     """Qᵀ b in place of ``b`` (m,)."""
     m, n = a.shape
@@ -182,7 +184,7 @@ def qr_project(a: Float, beta: Float, b: Float) -> None:
             b[i] -= total * a[i, k]
 
 
-@njit
+@njit_part
 def r_solve(a: Float, diagonal: Float, b: Float) -> None:
     """Solve R s = b; s replaces the first n elements of ``b``."""
     for i in range(diagonal.size - 1, -1, -1):
@@ -193,7 +195,7 @@ def r_solve(a: Float, diagonal: Float, b: Float) -> None:
         b[i] = total / diagonal[i]
 
 
-@njit
+@njit_part
 def r_solve_transposed(a: Float, diagonal: Float, b: Float) -> None:
     """Solve Rᵀ s = b; s replaces the first n elements of ``b``."""
     for i in range(diagonal.size):
@@ -204,33 +206,7 @@ def r_solve_transposed(a: Float, diagonal: Float, b: Float) -> None:
             b[j] -= value * row[j]
 
 
-@njit
-def qr_inverse(a: Float, diagonal: Float, jt: Float, inverse: Float) -> None:
-    """J⁺ = (RᵀR)⁻¹ Jᵀ into ``inverse`` (n, m), by the seminormal equations: good for covariances."""
-    n, m = jt.shape
-    for i in range(n):
-        row, source = inverse[i], jt[i]
-        scale = 1.0 / diagonal[i]
-        for c in range(m):
-            row[c] = source[c]
-        for k in range(i):
-            factor, above = a[k, i], inverse[k]
-            for c in range(m):
-                row[c] -= factor * above[c]
-        for c in range(m):
-            row[c] *= scale
-    for i in range(n - 1, -1, -1):
-        row = inverse[i]
-        scale = 1.0 / diagonal[i]
-        for k in range(i + 1, n):
-            factor, below = a[i, k], inverse[k]
-            for c in range(m):
-                row[c] -= factor * below[c]
-        for c in range(m):
-            row[c] *= scale
-
-
-@njit
+@njit_part
 def damped_solve(
     a: Float, diagonal: Float, qtb: Float, damping: Float, s: Float, sd: Float, d: Float, x: Float
 ) -> None:

@@ -1,24 +1,27 @@
 """Gauss-Newton, Levenberg-Marquardt and trust-region dogleg, written once as reverse communication.
 
     begin      r and J at x are in the workspace
-    propose    factor J, return a status or put the next trial point into ``trial``
+    propose    factor J; x is a root, or Newton's step is the next ``trial``
+    shorten    the trial of the trust region where Newton's step leaves it
     judge      r at ``trial`` is in ``r_trial``: take it or not, update the radius, return what is next
 
-The caller evaluates the functions, so the same compiled steps serve the compiled driver of a skin wire and any
-pair of Python callables. Symbols are the paper's: r residual (m,), J its Jacobian (m, n), stored transposed,
-lam the Levenberg-Marquardt parameter, radius that of the trust region ‖D s‖ ≤ radius, D the running maximum of
-the column norms of J (Moré 1978), so that the unit of an unknown does not matter.
+The caller evaluates the functions, so the same compiled steps serve the compiled driver of a skin wire and
+any pair of Python callables. Symbols are the paper's: r residual (m,), J its Jacobian (m, n), stored
+transposed, lam the Levenberg-Marquardt parameter, radius that of the trust region ‖D s‖ ≤ radius, D the
+running maximum of the column norms of J (Moré 1978), so that the unit of an unknown does not matter.
 
-Gauss-Newton takes every step in full, as the paper's does; the other two take a step only when r gets smaller.
+Gauss-Newton takes every step in full, as the paper's does; the other two take a step only when r gets
+smaller.
 
 What CONVERGED means. Square systems: a root, that is max|r| ≤ tol_f *and* a simplified Newton correction
 ‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞), by the factors at hand. Where rounding keeps r above tol_f, r within the
-rounding of J·x counts as zero. Tall systems: a minimum, ‖P r‖ ≤ tol_f ‖r‖ with P the projection on the range of J,
-and the same correction. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED: J is singular there.
+rounding of J·x counts as zero. Tall systems: a minimum, ‖P r‖ ≤ tol_f ‖r‖ with P the projection on the
+range of J, and the same correction. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED: J
+is singular there.
 
-Sources: Moré, The Levenberg-Marquardt algorithm, 1978 (parameter iteration, radius factors 1/4, 3/4, 0.0001);
-Powell, A hybrid method for nonlinear equations, 1970 (dogleg); Deuflhard, Newton methods for nonlinear problems,
-2004 (simplified correction as the error estimate); Xu et al. 2018, eqs. 8-10.
+Sources: Moré, The Levenberg-Marquardt algorithm, 1978 (parameter iteration, radius factors 1/4, 3/4,
+0.0001); Powell, A hybrid method for nonlinear equations, 1970 (dogleg); Deuflhard, Newton methods for
+nonlinear problems, 2004 (simplified correction as the error estimate); Xu et al. 2018, eqs. 8-10.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from skinnode.jit import njit
+from skinnode.jit import njit, njit_part
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
 from skinnode.solve.linear import (
@@ -40,7 +43,6 @@ from skinnode.solve.linear import (
     lu_inverse_transposed,
     lu_solve_transposed,
     qr_factor,
-    qr_inverse,
     qr_project,
     r_solve,
     r_solve_transposed,
@@ -50,10 +52,11 @@ OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
 GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
 LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
 
-# What propose and judge return besides a terminal Status, which is ≥ 0.
+# What the steps return besides a terminal Status, which is ≥ 0.
 TRY: Final = -1
 ACCEPTED: Final = -2
 REJECTED: Final = -3
+OUTSIDE: Final = -4
 
 # The compiled code sees plain integers.
 CONVERGED: Final = int(Status.CONVERGED)
@@ -65,6 +68,7 @@ NON_FINITE: Final = int(Status.NON_FINITE)
 INVALID_START: Final = int(Status.INVALID_START)
 
 EPS: Final = float(np.finfo(np.float64).eps)
+ROOT_EPS: Final = EPS**0.5
 STATIONARY: Final = 1e-7
 """A gradient below this share of ‖J_j‖ ‖r‖ is zero: r² is then flat to rounding, about √eps."""
 STALL_LIMIT: Final = 8
@@ -116,15 +120,16 @@ class Work(NamedTuple):
 
 def workspace(n: int, m: int) -> Work:
     """A zeroed workspace for m equations in n unknowns."""
-    vectors = [np.zeros(n) for _ in range(13)]
-    equations = [np.zeros(m) for _ in range(4)]
-    matrices = [np.zeros((n, m)), np.zeros((n, n)), np.zeros((m, n)), np.zeros((n, n))]
+    v, e = np.zeros((13, n)), np.zeros((4, m))
     return Work(
-        *vectors, *equations, *matrices, np.zeros(n, np.int64), np.zeros(SCALARS), np.zeros(FLAGS, np.int64)
-    )
+        x=v[0], trial=v[1], step=v[2], newton=v[3], gradient=v[4], scale=v[5], diagonal=v[6], beta=v[7],
+        qtr=v[8], v=v[9], d=v[10], damping=v[11], sd=v[12], r=e[0], r_trial=e[1], js=e[2], e=e[3],
+        jt=np.zeros((n, m)), lu=np.zeros((n, n)), qr=np.zeros((m, n)), triangle=np.zeros((n, n)),
+        pivot=np.zeros(n, np.int64), s=np.zeros(SCALARS), flag=np.zeros(FLAGS, np.int64),
+    )  # fmt: skip
 
 
-@njit
+@njit_part
 def begin(w: Work) -> int:
     """Start from x, r and J in the workspace. TRY, or INVALID_START where r is not finite or m < n."""
     s, flag = w.s, w.flag
@@ -142,16 +147,17 @@ def begin(w: Work) -> int:
     return TRY
 
 
-@njit
+@njit_part
 def _weighted(scale: Float, v: Float) -> float:
     """‖D v‖₂"""
     total = 0.0
     for j in range(v.size):
-        total += (scale[j] * v[j]) ** 2
+        weighted = scale[j] * v[j]
+        total += weighted * weighted
     return math.sqrt(total)
 
 
-@njit
+@njit_part
 def _times_jacobian(jt: Float, v: Float, out: Float) -> None:
     """J v into ``out`` (m,)."""
     for k in range(out.size):
@@ -162,7 +168,7 @@ def _times_jacobian(jt: Float, v: Float, out: Float) -> None:
             out[k] += factor * row[k]
 
 
-@njit
+@njit_part
 def _correction(w: Work, r: Float, out: Float) -> float:
     """−J⁺ r into ``out`` (n,) with the factors at hand; its largest element."""
     n = out.size
@@ -180,44 +186,22 @@ def _correction(w: Work, r: Float, out: Float) -> float:
     return largest(out)
 
 
-@njit
-def _factor(w: Work) -> None:
-    """Factor J at x and compute the Newton step."""
-    n = w.x.size
-    flag = w.flag
-    flag[FACTORED] = 1
-    flag[HAS_QR] = 0
-    if w.r.size == n:
-        for j in range(n):
-            target, source = w.lu[j], w.jt[j]
-            for k in range(n):
-                target[k] = source[k]
-        flag[SIGN] = lu_factor(w.lu, w.pivot)
-        flag[SINGULAR] = int(flag[SIGN] == 0)
-    else:
-        flag[HAS_QR] = 1
-        flag[SINGULAR] = 1 - qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v)
-    if flag[SINGULAR] == 0:
-        w.s[ERROR] = _correction(w, w.r, w.newton)
-        flag[SINGULAR] = int(not w.s[ERROR] < math.inf)
-
-
-@njit
-def _within_rounding(w: Work, r: Float) -> bool:
-    """True where every r is what rounding x alone can cause: |r_k| ≤ 4 eps Σ_j |J_kj x_j|."""
-    for k in range(r.size):
+@njit_part
+def _rounding(w: Work, x: Float) -> float:
+    """What rounding x to the nearest double does to r, eps Σ_j |J_kj x_j|, into ``e``; max |x|."""
+    top = 0.0
+    for k in range(w.e.size):
         w.e[k] = 0.0
-    for j in range(w.x.size):
-        row, size = w.jt[j], abs(w.x[j])
-        for k in range(r.size):
+    for j in range(x.size):
+        row, size = w.jt[j], EPS * abs(x[j])
+        if size > top:
+            top = size
+        for k in range(w.e.size):
             w.e[k] += abs(row[k]) * size
-    for k in range(r.size):
-        if not abs(r[k]) <= 4.0 * EPS * w.e[k]:
-            return False
-    return True
+    return top / EPS
 
 
-@njit
+@njit_part
 def _slope(w: Work) -> float:
     """Gradient Jᵀr into the workspace; its largest cosine |J_j·r| / (D_j ‖r‖)."""
     top = 0.0
@@ -227,7 +211,7 @@ def _slope(w: Work) -> float:
     return top
 
 
-@njit
+@njit_part
 def _dogleg_step(w: Work) -> None:
     """Powell's step: along −D⁻²g to the Cauchy point, from there towards Newton, to the radius."""
     n, radius = w.x.size, w.s[RADIUS]
@@ -259,7 +243,7 @@ def _dogleg_step(w: Work) -> None:
         w.step[j] += share * (w.newton[j] - w.step[j])
 
 
-@njit
+@njit_part
 def _marquardt_step(w: Work) -> None:
     """The step with ‖D s‖ within a tenth of the radius, by Newton's method on lam (Moré 1978, section 5)."""
     n, s = w.x.size, w.s
@@ -309,19 +293,45 @@ def _marquardt_step(w: Work) -> None:
     s[LAM] = lam
 
 
-@njit
+@njit_part
+def _lay_trial(operator: int, w: Work) -> None:
+    for j in range(w.x.size):
+        w.trial[j] = w.x[j] + w.step[j]
+    if operator != GAUSS_NEWTON:
+        w.s[LENGTH] = _weighted(w.scale, w.step)
+        _times_jacobian(w.jt, w.step, w.js)
+
+
+@njit_part
 def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
-    """Next trial point: TRY with ``trial``, ``step`` and ``js`` set, or a Status."""
+    """Newton's step as the next trial point: TRY with ``trial``, ``step`` and ``js`` set, OUTSIDE where the
+    step is longer than the radius or there is none (call :func:`shorten`), or a Status."""
     n, s, flag = w.x.size, w.s, w.flag
+    square = w.r.size == n
     if flag[FACTORED] == 0:
-        _factor(w)
-        if flag[SINGULAR] == 1:
+        flag[FACTORED] = 1
+        flag[HAS_QR] = 0
+        if square:
+            for j in range(n):
+                target, source = w.lu[j], w.jt[j]
+                for k in range(n):
+                    target[k] = source[k]
+            flag[SIGN] = lu_factor(w.lu, w.pivot)
+            full = flag[SIGN] != 0
+        else:
+            flag[HAS_QR] = 1
+            full = qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v) == 1
+        if full:
+            s[ERROR] = _correction(w, w.r, w.newton)
+            full = s[ERROR] < math.inf
+        flag[SINGULAR] = 0 if full else 1
+        if not full:
             for j in range(n):
                 if not largest(w.jt[j]) < math.inf:
                     return NON_FINITE
         else:
             settled = largest(w.r) <= tol_f
-            if w.r.size > n:
+            if not square:
                 _times_jacobian(w.jt, w.newton, w.js)
                 s[ANGLE] = math.sqrt(dot(w.js, w.js)) / s[NORM] if s[NORM] > 0.0 else 0.0
                 settled = settled or s[ANGLE] <= tol_f
@@ -338,118 +348,149 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
                 if s[LIMIT] > 0.0:
                     s[RADIUS] = s[LIMIT] * math.sqrt(dot(w.scale, w.scale))
             s[NEWTON_LENGTH] = _weighted(w.scale, w.newton) if flag[SINGULAR] == 0 else math.inf
-    full = flag[SINGULAR] == 0
+    regular = flag[SINGULAR] == 0
     if operator == GAUSS_NEWTON:
-        if not full:
+        if not regular:
             return ILL_CONDITIONED
-    elif full:
-        full = s[NEWTON_LENGTH] <= (1.1 if operator == LEVENBERG_MARQUARDT else 1.0) * s[RADIUS]
-    if full:
-        s[LAM] = 0.0
-        for j in range(n):
-            w.step[j] = w.newton[j]
-    elif _slope(w) <= EPS:
-        return CONVERGED if w.r.size > n and flag[SINGULAR] == 0 else ILL_CONDITIONED
-    elif operator == LEVENBERG_MARQUARDT:
-        _marquardt_step(w)
-    else:
-        _dogleg_step(w)
+    elif not (regular and s[NEWTON_LENGTH] <= (1.1 if operator == LEVENBERG_MARQUARDT else 1.0) * s[RADIUS]):
+        return OUTSIDE
+    s[LAM] = 0.0
     for j in range(n):
-        w.trial[j] = w.x[j] + w.step[j]
-    if operator != GAUSS_NEWTON:
-        s[LENGTH] = _weighted(w.scale, w.step)
-        _times_jacobian(w.jt, w.step, w.js)
+        w.step[j] = w.newton[j]
+    _lay_trial(operator, w)
     return TRY
 
 
-@njit
-def _take(w: Work, norm: float) -> None:
-    for j in range(w.x.size):
-        w.x[j] = w.trial[j]
-    for k in range(w.r.size):
-        w.r[k] = w.r_trial[k]
-    w.s[NORM] = norm
-    w.flag[FACTORED] = 0
+@njit_part
+def shorten(operator: int, w: Work) -> int:
+    """The step within the trust region where Newton's leaves it: TRY, or a Status at a stationary point."""
+    if _slope(w) <= EPS:
+        return CONVERGED if w.flag[SINGULAR] == 0 and w.r.size > w.x.size else ILL_CONDITIONED
+    if operator == LEVENBERG_MARQUARDT:
+        _marquardt_step(w)
+    else:
+        _dogleg_step(w)
+    _lay_trial(operator, w)
+    return TRY
 
 
-@njit
-def _ended(w: Work) -> int:
-    """The status of a search that cannot get r any smaller."""
-    slope = _slope(w)
-    if w.r.size > w.x.size:
-        return CONVERGED if w.flag[SINGULAR] == 0 and w.s[ANGLE] <= STATIONARY else STEP_TOO_SMALL
-    return ILL_CONDITIONED if slope <= STATIONARY else STEP_TOO_SMALL
-
-
-@njit
+@njit_part
 def judge(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
     """Judge ``r_trial``: ACCEPTED (the caller evaluates J at x), REJECTED or a Status."""
     s, flag = w.s, w.flag
-    norm = math.sqrt(dot(w.r_trial, w.r_trial))
+    square, regular = w.r.size == w.x.size, flag[SINGULAR] == 0
+    before, norm = s[NORM], math.sqrt(dot(w.r_trial, w.r_trial))
     finite = norm < math.inf
-    if finite and norm > 0.25 * s[NORM] and flag[SINGULAR] == 0 and _within_rounding(w, w.r_trial):
-        _take(w, norm)  # no closer to the root in this arithmetic
-        s[ERROR] = _correction(w, w.r, w.newton)
-        return CONVERGED
+    exhausted = False  # rounding hides whatever r is left
+    if finite and norm > 0.25 * before and regular:
+        _rounding(w, w.trial)
+        exhausted = True
+        for k in range(w.r.size):
+            if not abs(w.r_trial[k]) <= 4.0 * w.e[k]:
+                exhausted = False
     if operator == GAUSS_NEWTON:
         if not finite:
             return NON_FINITE
-    else:
-        gain, predicted = -1.0, 1.0
+    elif not exhausted:
+        gain, predicted, slope = -1.0, 1.0, 0.0
         if finite:
-            gain = 1.0 - (norm / s[NORM]) ** 2
-            predicted = -(2.0 * dot(w.r, w.js) + dot(w.js, w.js)) / s[NORM] ** 2
-        if predicted <= 4.0 * EPS and abs(gain) <= 64.0 * EPS:  # ‖r‖ cannot tell any more
+            slope = dot(w.r, w.js) / (before * before)
+            gain = 1.0 - (norm / before) * (norm / before)
+            predicted = -2.0 * slope - dot(w.js, w.js) / (before * before)
+        if finite and predicted <= 4.0 * EPS and abs(gain) <= 64.0 * EPS:  # ‖r‖ cannot tell any more
             flag[STALLED] += 1
-            if w.r.size == w.x.size or flag[STALLED] > STALL_LIMIT:
-                return _ended(w)
+            if square:
+                return ILL_CONDITIONED if _slope(w) <= STATIONARY else STEP_TOO_SMALL
+            if flag[STALLED] > STALL_LIMIT:
+                return CONVERGED if regular and s[ANGLE] <= STATIONARY else STEP_TOO_SMALL
         else:
             ratio = gain / predicted if predicted > 0.0 else -1.0
             if ratio < 0.25:
                 shrink = 0.1
-                if finite and norm < 10.0 * s[NORM]:  # minimiser of the parabola through both residuals
-                    slope = dot(w.r, w.js) / s[NORM] ** 2
-                    shrink = 0.5 if gain >= 0.0 else max(0.1, min(0.5, 0.5 * slope / (slope + 0.5 * gain)))
-                s[RADIUS] = shrink * min(s[RADIUS], 10.0 * s[LENGTH])
+                if gain >= 0.0:
+                    shrink = 0.5
+                elif norm < 10.0 * before:  # the minimiser of the parabola through both residuals
+                    shrink = 0.5 * slope / (slope + 0.5 * gain)
+                    shrink = 0.1 if shrink < 0.1 else (0.5 if shrink > 0.5 else shrink)
+                reach = 10.0 * s[LENGTH]
+                s[RADIUS] = shrink * (reach if reach < s[RADIUS] else s[RADIUS])
                 s[LAM] /= shrink
             elif s[LAM] == 0.0 or ratio >= 0.75:
-                s[RADIUS] = max(s[RADIUS], 2.0 * s[LENGTH]) if s[LAM] == 0.0 else 2.0 * s[LENGTH]
+                reach = 2.0 * s[LENGTH]
+                if s[LAM] > 0.0 or reach > s[RADIUS]:
+                    s[RADIUS] = reach
                 s[LAM] *= 0.5
             if not ratio >= 1e-4:
                 if s[RADIUS] <= EPS * _weighted(w.scale, w.x) or s[RADIUS] < 1e-300:
                     return RADIUS_TOO_SMALL
                 return REJECTED
-    _take(w, norm)
-    if flag[SINGULAR] == 0:
+    for j in range(w.x.size):
+        w.x[j] = w.trial[j]
+    for k in range(w.r.size):
+        w.r[k] = w.r_trial[k]
+    s[NORM] = norm
+    flag[FACTORED] = 0
+    if regular:
         s[ERROR] = _correction(w, w.r, w.newton)
-        if largest(w.r) <= tol_f and s[ERROR] <= tol_x * max(1.0, largest(w.x)):
+        if exhausted or (largest(w.r) <= tol_f and s[ERROR] <= tol_x * max(1.0, largest(w.x))):
             return CONVERGED
     return ACCEPTED
 
 
-@njit
+@njit_part
 def certify(w: Work, inverse: Float) -> float:
-    """J⁺ of the last factors into ``inverse`` (n, m); what rounding of r leaves open in x, max over x.
+    """J⁺ of the last factors into ``inverse`` (n, m); the error estimate of a converged solve.
 
-    Inf where J is singular. Added to the error estimate of a converged solve.
+    That is the correction still to come and what rounding leaves open through the condition of J, as a
+    share of max(1, ‖x‖∞). Above √eps the root is not known to half its digits: ILL_CONDITIONED. Inf where J
+    is singular.
     """
+    n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:
         return math.inf
-    if w.r.size == w.x.size:
+    if m == n:
         lu_inverse_transposed(w.lu, w.pivot, inverse)
     else:
-        qr_inverse(w.qr, w.diagonal, w.jt, inverse)
-    for k in range(w.r.size):
-        w.e[k] = 0.0
-    for j in range(w.x.size):
-        row, size = w.jt[j], abs(w.x[j])
-        for k in range(w.r.size):
-            w.e[k] += abs(row[k]) * size
+        for k in range(m):
+            for i in range(m):
+                w.r_trial[i] = 0.0
+            w.r_trial[k] = -1.0
+            _correction(w, w.r_trial, w.v)
+            for j in range(n):
+                inverse[j, k] = w.v[j]
+    size = _rounding(w, w.x)
     top = 0.0
-    for j in range(w.x.size):
+    for j in range(n):
         row, total = inverse[j], 0.0
-        for k in range(w.r.size):
+        for k in range(m):
             total += abs(row[k]) * w.e[k]
         if not total <= top:
             top = total
-    return EPS * top
+    return float((w.s[ERROR] + top) / max(1.0, size))
+
+
+@njit
+def start(w: Work) -> int:
+    """:func:`begin` for callers in Python."""
+    return begin(w)
+
+
+@njit
+def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
+    """:func:`judge` the trial of the last call, then :func:`propose`, for callers in Python.
+
+    ``went`` is what the last call returned, ``REJECTED`` at first. Returns TRY (evaluate r at ``trial`` into
+    ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
+    """
+    if went == TRY:
+        went = judge(operator, w, tol_f, tol_x)
+        if went != REJECTED:
+            return went
+    went = propose(operator, w, tol_f, tol_x)
+    return shorten(operator, w) if went == OUTSIDE else went
+
+
+@njit
+def assure(w: Work, inverse: Float) -> float:
+    """:func:`certify` for callers in Python."""
+    return certify(w, inverse)

@@ -1,9 +1,10 @@
 """One patch as a set of dimensionless systems, one an upper wire.
 
-Lengths are in pitches and the residual is relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k, so that
-one residual is one share of a resistance, whatever the rubber and the size of the patch. With measured rest
-resistances R₀ the resistivity and the gain of the front end cancel; without, R₀ F₀ is the layout's resistivity.
-w_k = σ_min / σ_k weighs equations of unequal noise (a tall system minimises χ²); 0 drops an equation.
+Lengths are in pitches and the residual is relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k, so
+that one residual is one share of a resistance, whatever the rubber and the size of the patch. With measured
+rest resistances R₀ the resistivity and the gain of the front end cancel; without, R₀ F₀ is the layout's
+resistivity. w_k = σ_min / σ_k weighs equations of unequal noise (a tall system minimises χ²); 0 drops an
+equation.
 """
 
 from __future__ import annotations
@@ -68,8 +69,9 @@ class PatchProblem:
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
         """(U,) wires with an electrode farther from rest than it was from the nearest lower electrode.
 
-        F is the same for electrodes mirrored at the lower layer and for two that changed places; both roots lie
-        that far away, and no rubber pressed on from outside moves by more than its own thickness.
+        F is the same for electrodes mirrored at the lower layer and for two that changed places; both roots
+        lie that far away, and no rubber pressed on from outside moves by more than its own thickness.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
-        return np.asarray((np.sqrt((moved**2).sum(axis=-1)) > self.clearance).any(axis=1))
+        with np.errstate(over="ignore"):
+            return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))

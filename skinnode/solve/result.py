@@ -23,6 +23,6 @@ class Solution:
     optimality: float
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
-    """Estimate of max |x − x*|: the Newton correction still to come plus what rounding of F leaves open through
-    the condition of J. Inf where no root or minimum was found."""
+    """Estimate of max |x − x*|: the Newton correction still to come plus what rounding of F leaves open
+    through the condition of J. Inf where no root or minimum was found."""
     stats: SolveStats

@@ -73,27 +73,26 @@ def solve_system(
     if m >= n:
         refresh_jacobian()
         jacobians += 1
-    went = op.begin(w)
-    if went == op.TRY and not np.isfinite(w.jt).all():
-        went = op.INVALID_START
+    went = op.start(w)
+    if went == op.TRY:
+        went = op.REJECTED if np.isfinite(w.jt).all() else op.INVALID_START
     while went < 0:
-        went = op.propose(code, w, tol_f, tol_x)
-        if went != op.TRY:
-            break
-        if steps == max_steps:
-            went = op.MAX_STEPS
-            break
-        steps += 1
-        evaluations += 1
-        w.r_trial[:] = require_array("residual(x)", residual(w.trial.copy()), (m,), finite=False)
-        went = op.judge(code, w, tol_f, tol_x)
+        went = op.advance(code, w, went, tol_f, tol_x)
         if went == op.ACCEPTED:
             refresh_jacobian()
             jacobians += 1
+        elif went == op.TRY:
+            if steps == max_steps:
+                went = op.MAX_STEPS
+                break
+            steps += 1
+            evaluations += 1
+            w.r_trial[:] = require_array("residual(x)", residual(w.trial.copy()), (m,), finite=False)
     error = math.inf
     if went == op.CONVERGED:
-        error = float(w.s[op.ERROR]) + op.certify(w, np.empty((n, m)))
-        if not error <= math.sqrt(op.EPS) * max(1.0, float(np.abs(w.x).max())):
+        share = op.assure(w, np.empty((n, m)))
+        error = share * max(1.0, float(np.abs(w.x).max()))
+        if not share <= op.ROOT_EPS:
             went = op.ILL_CONDITIONED
     with np.errstate(all="ignore"):
         return Solution(

@@ -1,13 +1,12 @@
 """The path of the paper run for ever: a live stream of frames, each solved from the one before.
 
-predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway
-correct    the operator, to a tolerance far below any noise
-bridge     a wire that fails: R interpolated from the last solved frame to the new one, steps halved and doubled
-restart    the same from the rest position
-hold       a wire that still fails keeps its last trusted position, with an infinite deviation and a status
+predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway correct    the
+operator, to a tolerance far below any noise bridge     a wire that fails: R interpolated from the last
+solved frame to the new one, steps halved and doubled restart    the same from the rest position hold
+a wire that still fails keeps its last trusted position, with an infinite deviation and a status
 
-A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and no
-electrode moves farther than its clearance from the lower layer.
+A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and
+no electrode moves farther than its clearance from the lower layer.
 """
 
 from __future__ import annotations
@@ -36,8 +35,9 @@ FRAME_STEPS: Final = 12
 """Most steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
 BRIDGE_SOLVES: Final = 16
 """Most solves of a bridge."""
-RECOVERY_STEPS: Final = 600
-"""Most steps all bridges of a frame may take together, about 20 ms: a broken frame must not stop the stream."""
+RECOVERY_STEPS: Final = 300
+"""Most steps all bridges of a frame may take together, about 15 ms: a broken frame must
+not stop the stream."""
 
 
 class Tracker:
@@ -171,7 +171,8 @@ class Tracker:
     def _bridge(
         self, u: int, x_from: Float, a_from: Float, a: Float, weight: Float, sigma: float, budget: int
     ) -> tuple[int, int]:
-        """Solve wire u along the straight line of its resistances from ``a_from`` to ``a``, step lengths adapted.
+        """Solve wire u along the straight line of its resistances from ``a_from`` to ``a``, step lengths
+        adapted.
 
         Returns the evaluations and steps it took; the outcome is the solver's report of the wire.
         """

@@ -8,19 +8,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.jit import njit
+from skinnode.jit import njit, njit_part
 from skinnode.model.kernels import potential_jacobian
 from skinnode.model.layout import Float
 from skinnode.solve.linear import Index, dot, largest
 from skinnode.solve.operators import (
     ACCEPTED,
     CONVERGED,
-    EPS,
     ERROR,
     ILL_CONDITIONED,
     LIMIT,
     MAX_STEPS,
     NON_FINITE,
+    OUTSIDE,
+    ROOT_EPS,
     SIGN,
     TRY,
     Work,
@@ -28,6 +29,7 @@ from skinnode.solve.operators import (
     certify,
     judge,
     propose,
+    shorten,
     workspace,
 )
 from skinnode.solve.problem import PatchProblem
@@ -36,6 +38,10 @@ from skinnode.solve.problem import PatchProblem
 STATUS, EVALUATIONS, STEPS, BRANCH, REPORT = range(5)
 # Columns of the real report of a wire
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, MEASURES = range(4)
+
+A_MIN: Final = 1e-12
+A_MAX: Final = 1e12
+"""An a outside is no resistance: at rest it is about 1 / N M."""
 
 # What to do with a wire
 LEAVE: Final = 0
@@ -48,6 +54,18 @@ COVARIANCE: Final = 1
 """Compute J⁻¹, and with it the deviation of x and whether rounding leaves x open."""
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
+
+
+@njit_part
+def _evaluate(x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
+    """r = w (a F − 1) and its Jacobian."""
+    potential_jacobian(x, lower, r, jt)
+    for k in range(r.size):
+        r[k] = weight[k] * (a[k] * r[k] - 1.0)
+    for j in range(jt.shape[0]):
+        row = jt[j]
+        for k in range(r.size):
+            row[k] *= weight[k] * a[k]
 
 
 @njit
@@ -74,11 +92,11 @@ def solve_wires(
 ) -> None:
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo`` (U,).
 
-    ``x`` (U, n) start, then solution, pitches; ``a`` and ``weight`` (U, K), where an ``a`` that is not positive and
-    finite loses its weight; ``sigma`` deviation of a residual of weight 1; ``inverse`` (U, n, K) and ``a_solved``
-    (U, K) keep ∂x/∂r and a of the last converged solve of each wire for the prediction; ``std`` (U, n) is inf
-    where not known. A wire with fewer equations than unknowns keeps its x and is ILL_CONDITIONED, or NON_FINITE
-    where an ``a`` lost its weight.
+    ``x`` (U, n) start, then solution, pitches; ``a`` and ``weight`` (U, K), where an ``a`` that is no
+    resistance loses its weight; ``sigma`` deviation of a residual of weight 1; ``inverse`` (U, n, K) and
+    ``a_solved`` (U, K) keep ∂x/∂r and a of the last converged solve of each wire for the prediction;
+    ``std`` (U, n) is inf where not known. A wire with fewer equations than unknowns keeps its x and is
+    ILL_CONDITIONED, or NON_FINITE where an ``a`` lost its weight.
     """
     unknowns = x.shape[1]
     equations = a.shape[1]
@@ -90,7 +108,7 @@ def solve_wires(
         count, lost = 0, 0
         for k in range(equations):
             if w_u[k] > 0.0:
-                if a_u[k] > 0.0 and a_u[k] < math.inf:
+                if A_MIN < a_u[k] < A_MAX:
                     count += 1
                     continue
                 lost += 1
@@ -113,8 +131,7 @@ def solve_wires(
                     w.e[k] = a_u[k] / a_solved[u, k] - 1.0 if w_u[k] > 0.0 else 0.0
                 for j in range(unknowns):
                     w.x[j] -= dot(inverse_u[j], w.e)
-            potential_jacobian(w.x, lower, w.r, w.jt)
-            _scale(w.r, w.jt, a_u, w_u)
+            _evaluate(w.x, lower, a_u, w_u, w.r, w.jt)
             evaluations = 1
             w.s[LIMIT] = step_limit
             status = begin(w)
@@ -127,6 +144,8 @@ def solve_wires(
                     w.s[ERROR] = 0.0
             while status < 0:
                 status = propose(operator, w, tol_f, tol_x)
+                if status == OUTSIDE:
+                    status = shorten(operator, w)
                 if status != TRY:
                     break
                 if steps == max_steps:
@@ -134,8 +153,7 @@ def solve_wires(
                     break
                 steps += 1
                 evaluations += 1
-                potential_jacobian(w.trial, lower, w.r_trial, jt_trial)
-                _scale(w.r_trial, jt_trial, a_u, w_u)
+                _evaluate(w.trial, lower, a_u, w_u, w.r_trial, jt_trial)
                 status = judge(operator, w, tol_f, tol_x)
                 if status == ACCEPTED:
                     for j in range(unknowns):
@@ -153,9 +171,9 @@ def solve_wires(
                 report[u, BRANCH] = w.flag[SIGN]
                 measure[u, ERROR_ESTIMATE] = w.s[ERROR]
                 if tasks & COVARIANCE:
-                    error = w.s[ERROR] + certify(w, inverse_u)
-                    measure[u, ERROR_ESTIMATE] = error
-                    if not error <= math.sqrt(EPS) * max(1.0, largest(w.x)):
+                    share = certify(w, inverse_u)
+                    measure[u, ERROR_ESTIMATE] = share * max(1.0, largest(w.x))
+                    if not share <= ROOT_EPS:
                         status = ILL_CONDITIONED
                     else:
                         for k in range(equations):
@@ -173,17 +191,6 @@ def solve_wires(
         report[u, STATUS] = status
         report[u, EVALUATIONS] = evaluations
         report[u, STEPS] = steps
-
-
-@njit
-def _scale(r: Float, jt: Float, a: Float, weight: Float) -> None:
-    """F and its Jacobian to r = w (a F − 1) and its Jacobian, in place."""
-    for k in range(r.size):
-        r[k] = weight[k] * (a[k] * r[k] - 1.0)
-    for j in range(jt.shape[0]):
-        row = jt[j]
-        for k in range(r.size):
-            row[k] *= weight[k] * a[k]
 
 
 class Solver:

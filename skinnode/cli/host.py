@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 import typer
 
 if TYPE_CHECKING:
+    from skinnode.errors import CodecError
     from skinnode.host import Host, HostStats
     from skinnode.model.frames import FieldFrame
 
@@ -41,28 +42,38 @@ def host(
     Ctrl-C ends it; the nodes are left pre-operational. Exit status 2 if the hand could not be run, or if a
     node sent frames that are not what their identifier promises.
     """
+    with _until_told() as told:
+        malformed = _run(hand, interface, channel, seconds, _JsonReport() if as_json else _TextReport(), told)
+    if malformed:
+        raise malformed[0]
+
+
+def _run(
+    hand: Path,
+    interface: str | None,
+    channel: str | None,
+    seconds: float | None,
+    report: _Report,
+    told: threading.Event,
+) -> tuple[CodecError, ...]:
+    """Run the hand until told to end or time is up; returns the frames that broke their promise."""
     from skinnode.host import BringUpCancelled, Host
     from skinnode.jit import is_cold
     from skinnode.model.config import load_hand
 
     plan = load_hand(hand).on(interface, channel)
-    report: _Report = _JsonReport() if as_json else _TextReport()
     if is_cold():
         report.note("compiling the kernels, once: takes some seconds")
-    with _until_told() as told:
-        try:
-            with Host.from_config(plan, cancelled=told.is_set) as running:
-                where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-                report.note(
-                    f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends"
-                )
-                _watch(running, told, seconds, report)
-                malformed = running.stats().malformed
-        except BringUpCancelled:
-            return
+    try:
+        with Host.from_config(plan, cancelled=told.is_set) as running:
+            where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
+            report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
+            _watch(running, told, seconds, report)
+            malformed = running.stats().malformed
+    except BringUpCancelled:
+        return ()
     report.note("nodes are pre-operational")
-    if malformed:
-        raise malformed[0]
+    return malformed
 
 
 @contextmanager

@@ -58,6 +58,11 @@ def _never() -> bool:
     return False
 
 
+def _go_on_unless(cancelled: Callable[[], bool]) -> None:
+    if cancelled():
+        raise BringUpCancelled("bring-up was cancelled")
+
+
 class Host:
     """A hand, running. Made by :meth:`from_toml` or :meth:`from_config`, which bring it up and shut it down::
 
@@ -142,6 +147,7 @@ class Host:
             }
             ticks = Ticks(hand.sync.counter_overflow)
             for patch in hand.patches:
+                _go_on_unless(cancelled)
                 check_solvable(patch, hand.solver)
             try:
                 facts = _bring_up(hand, links, boot_deadline_s, cancelled)
@@ -275,8 +281,7 @@ def _bring_up(
         if isinstance(failure, NodeTimeout) and patch not in answered:
             raise _silence(hand, patch, answered, boot_deadline_s) from None
         raise failure
-    if cancelled():
-        raise BringUpCancelled("bring-up was cancelled")
+    _go_on_unless(cancelled)
     return {name: job.result() for name, job in jobs.items()}
 
 

@@ -70,18 +70,25 @@ def test_one_number_names_one_instant_on_all_patches(hand: HandConfig, fleet: Fl
     assert all(len(times) == 1 for times in sync_of.values())
 
 
-def test_field_agrees_with_the_truth_within_what_it_claims(hand: HandConfig, fleet: Fleet) -> None:
+def test_field_agrees_with_the_truth_within_what_it_claims(make_hand: Callable[..., HandConfig]) -> None:
     """The simulator knows where the electrodes really are; the host knows nothing but the frames."""
-    scores = []
-    with Host.from_config(hand) as host:
-        for field in take(host.fields(timeout_s=10, capacity=1000), 80):
-            assert field.trusted
-            patch = hand.patch(stamp(field).patch).layout.build()
-            truth_m = fleet.truth_m(stamp(field).patch, stamp(field).device_time_us) - patch.upper_m
-            scores.append((field.displacement_m - truth_m) / field.displacement_std_m)
-    # Normalised errors of a Gaussian have RMS 1. Those of one wire hang together and the baseline has a noise
-    # of its own: the claim is refuted above 2, and an idle claim (deviations too large) below 0.3.
-    assert 0.3 < float(np.sqrt(np.mean(np.square(scores)))) < 2.0
+    hand = make_hand(simulation={"cycle_s": 2.0})
+    scores: list[float] = []
+    with Fleet(hand) as fleet, Host.from_config(hand) as host:
+        for field in host.fields(timeout_s=10, capacity=1000):
+            rest_m = hand.patch(stamp(field).patch).layout.build().upper_m
+            truth_m = fleet.truth_m(stamp(field).patch, stamp(field).device_time_us) - rest_m
+            if (
+                np.abs(truth_m).max() > 50e-6
+            ):  # at rest a code has no rounding error, and the claim is generous
+                assert field.trusted
+                error_m = field.displacement_m - truth_m
+                assert np.abs(error_m).max() < 0.2 * np.abs(truth_m).max()
+                scores.append(float(np.mean((error_m / field.displacement_std_m) ** 2)))
+            if len(scores) == 60:
+                break
+    # Normalised errors of a Gaussian have RMS 1, over these many about 1 ± 0.1 (those of one wire hang together).
+    assert 0.7 < float(np.sqrt(np.mean(scores))) < 1.4
 
 
 def test_latest_is_there_for_a_control_loop(hand: HandConfig, fleet: Fleet) -> None:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 import typer
 
 if TYPE_CHECKING:
-    from skinnode.errors import CodecError
     from skinnode.host import Host, HostStats
     from skinnode.model.frames import FieldFrame
 
@@ -43,9 +42,11 @@ def host(
     node sent frames that are not what their identifier promises.
     """
     with _until_told() as told:
-        malformed = _run(hand, interface, channel, seconds, _JsonReport() if as_json else _TextReport(), told)
-    if malformed:
-        raise malformed[0]
+        as_promised = _run(
+            hand, interface, channel, seconds, _JsonReport() if as_json else _TextReport(), told
+        )
+    if not as_promised:
+        raise typer.Exit(2)
 
 
 def _run(
@@ -55,8 +56,9 @@ def _run(
     seconds: float | None,
     report: _Report,
     told: threading.Event,
-) -> tuple[CodecError, ...]:
-    """Run the hand until told to end or time is up; returns the frames that broke their promise."""
+) -> bool:
+    """Run the hand until told to end or time is up. False if a frame was not what its identifier promises; the
+    host has said so in the log, which Python writes to stderr."""
     from skinnode.host import BringUpCancelled, Host
     from skinnode.jit import is_cold
     from skinnode.model.config import load_hand
@@ -69,11 +71,11 @@ def _run(
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)
-            malformed = running.stats().malformed
+            as_promised = not running.stats().malformed
     except BringUpCancelled:
-        return ()
+        return True
     report.note("nodes are pre-operational")
-    return malformed
+    return as_promised
 
 
 @contextmanager

@@ -87,7 +87,7 @@ def test_field_agrees_with_the_truth_within_what_it_claims(make_hand: Callable[.
                 scores.append(float(np.mean((error_m / field.displacement_std_m) ** 2)))
             if len(scores) == 60:
                 break
-    # Normalised errors of a Gaussian have RMS 1, over these many about 1 ± 0.1 (those of one wire hang together).
+    # Normalised errors of a Gaussian have RMS 1; over these many, which hang together, about 1 ± 0.1.
     assert 0.7 < float(np.sqrt(np.mean(scores))) < 1.4
 
 

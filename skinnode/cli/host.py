@@ -57,8 +57,8 @@ def _run(
     report: _Report,
     told: threading.Event,
 ) -> bool:
-    """Run the hand until told to end or time is up. False if a frame was not what its identifier promises; the
-    host has said so in the log, which Python writes to stderr."""
+    """Run the hand until told to end or time is up. False if a frame was not what its identifier promises:
+    the host has said so in the log, which Python writes to stderr."""
     from skinnode.host import BringUpCancelled, Host
     from skinnode.jit import is_cold
     from skinnode.model.config import load_hand

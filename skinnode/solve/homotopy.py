@@ -112,7 +112,7 @@ def solve_path(
     optimality = np.zeros(shape)
     todo = np.full(shape[1], wires.SOLVE, np.uint8)
     weight = np.ones(layout.shape)
-    branch = np.zeros(shape[1], np.int64)
+    branch = solver.solve_rest()
     crossed = np.zeros(shape[1], bool)
     for s, (sample, tolerance, most) in enumerate(stages):
         tasks = wires.COVARIANCE if s == len(stages) - 1 else wires.SKIP

@@ -68,10 +68,13 @@ NON_FINITE: Final = int(Status.NON_FINITE)
 INVALID_START: Final = int(Status.INVALID_START)
 
 EPS: Final = float(np.finfo(np.float64).eps)
-ROOT_EPS: Final = EPS**0.5
-STATIONARY: Final = 1e-7
+ROOT_SHARE: Final = EPS ** (1 / 2)
+MINIMUM_SHARE: Final = EPS ** (1 / 3)
+"""An error estimate above this share of max(1, ‖x‖∞) is no root, no minimum: half the digits of a root are
+given, and ‖r‖² does not fix those of a minimum to better than √eps."""
+STATIONARY: Final = 1e-6
 """A gradient below this share of ‖J_j‖ ‖r‖ is zero: r² is then flat to rounding, about √eps."""
-STALL_LIMIT: Final = 8
+STALL_LIMIT: Final = 30
 """Steps below the rounding of ‖r‖² that a tall system may take to settle its x."""
 
 # Scalars of a solve, in Work.s
@@ -397,12 +400,17 @@ def judge(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
             slope = dot(w.r, w.js) / (before * before)
             gain = 1.0 - (norm / before) * (norm / before)
             predicted = -2.0 * slope - dot(w.js, w.js) / (before * before)
-        if finite and predicted <= 4.0 * EPS and abs(gain) <= 64.0 * EPS:  # ‖r‖ cannot tell any more
+        noise = 4.0 * EPS  # of gain
+        if finite and predicted < 1e-6:
+            _rounding(w, w.x)
+            for k in range(w.r.size):
+                noise += 8.0 * abs(w.r[k]) * w.e[k] / (before * before)
+        if finite and predicted <= noise and abs(gain) <= 16.0 * noise:  # ‖r‖ cannot tell any more
             flag[STALLED] += 1
-            if square:
-                return ILL_CONDITIONED if _slope(w) <= STATIONARY else STEP_TOO_SMALL
-            if flag[STALLED] > STALL_LIMIT:
-                return CONVERGED if regular and s[ANGLE] <= STATIONARY else STEP_TOO_SMALL
+            if square or flag[STALLED] > STALL_LIMIT:
+                if _slope(w) > STATIONARY:
+                    return STEP_TOO_SMALL
+                return CONVERGED if regular and not square else ILL_CONDITIONED
         else:
             ratio = gain / predicted if predicted > 0.0 else -1.0
             if ratio < 0.25:
@@ -441,9 +449,8 @@ def judge(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 def certify(w: Work, inverse: Float) -> float:
     """J⁺ of the last factors into ``inverse`` (n, m); the error estimate of a converged solve.
 
-    That is the correction still to come and what rounding leaves open through the condition of J, as a
-    share of max(1, ‖x‖∞). Above √eps the root is not known to half its digits: ILL_CONDITIONED. Inf where J
-    is singular.
+    That is the correction still to come and what rounding of x leaves open through the condition of J, as a
+    share of max(1, ‖x‖∞). Inf where J is singular.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -92,7 +92,7 @@ def solve_system(
     if went == op.CONVERGED:
         share = op.assure(w, np.empty((n, m)))
         error = share * max(1.0, float(np.abs(w.x).max()))
-        if not share <= op.ROOT_EPS:
+        if not share <= (op.ROOT_SHARE if m == n else op.MINIMUM_SHARE):
             went = op.ILL_CONDITIONED
     with np.errstate(all="ignore"):
         return Solution(

@@ -74,17 +74,7 @@ class Tracker:
         self._stiffness = stiffness_n_per_m
         self._noise, self._sigma = self._checked_noise(relative_noise)
         self._solver = wires.Solver(self._problem, operator_code(operator))
-        self._every = np.full(layout.shape[0], wires.SOLVE, np.uint8)
-        self._solver.solve(
-            self._every,
-            self._problem.a_rest.copy(),
-            np.ones(layout.shape),
-            wires.COVARIANCE,
-            TOLERANCE,
-            TOLERANCE,
-            1,
-        )
-        self._rest_branch = self._solver.report[:, wires.BRANCH].copy()
+        self._rest_branch = self._solver.solve_rest()
         self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
         self._rest_inverse = self._solver.inverse.copy()
         self.reset()
@@ -177,7 +167,7 @@ class Tracker:
         Returns the evaluations and steps it took; the outcome is the solver's report of the wire.
         """
         solver = self._solver
-        todo = np.zeros_like(self._every)
+        todo = np.zeros(self.layout.shape[0], np.uint8)
         todo[u] = wires.SOLVE
         between = a.copy()
         x, at, stride = x_from.copy(), 0.0, 1.0

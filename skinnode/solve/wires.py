@@ -21,7 +21,7 @@ from skinnode.solve.operators import (
     MAX_STEPS,
     NON_FINITE,
     OUTSIDE,
-    ROOT_EPS,
+    ROOT_SHARE,
     SIGN,
     TRY,
     Work,
@@ -42,6 +42,9 @@ RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, MEASURES = range(4)
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
 """An a outside is no resistance: at rest it is about 1 / N M."""
+
+REST_TOLERANCE: Final = 1e-9
+"""The rest position is a root by construction, to rounding."""
 
 # What to do with a wire
 LEAVE: Final = 0
@@ -173,7 +176,7 @@ def solve_wires(
                 if tasks & COVARIANCE:
                     share = certify(w, inverse_u)
                     measure[u, ERROR_ESTIMATE] = share * max(1.0, largest(w.x))
-                    if not share <= ROOT_EPS:
+                    if not share <= ROOT_SHARE:
                         status = ILL_CONDITIONED
                     else:
                         for k in range(equations):
@@ -217,6 +220,14 @@ class Solver:
     def cost(self) -> tuple[int, int]:
         """Evaluations and steps of the last call, of all wires."""
         return int(self.report[:, EVALUATIONS].sum()), int(self.report[:, STEPS].sum())
+
+    def solve_rest(self) -> Index:
+        """Solve the rest position itself, for its inverse; sign of det J (U,) there, 0 where it has none."""
+        todo, weight = np.full(len(self.x), SOLVE, np.uint8), np.ones_like(self.a_solved)
+        self.x[:] = self.problem.rest
+        self.solve(todo, self.problem.a_rest.copy(), weight, COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
+        self.x[:] = self.problem.rest
+        return self.report[:, BRANCH].copy()
 
     def solve(
         self,

@@ -7,7 +7,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,9 @@ BRING_UP_THREADS: Final = 16
 
 START_DEADLINE_S: Final = 1.0
 """How long a node may take to say that it is operational: four heartbeats."""
+
+LAST_SCAN_S: Final = 0.5
+"""How long the end of a host may wait for the last scans, at most."""
 
 _POLL_S: Final = 0.005
 
@@ -157,8 +160,8 @@ class Host:
                     name: _lane(hand, known, solvers[name], workers, publisher, ticks, links, monitors)
                     for name, known in facts.items()
                 }
-                # Undone in this order from below: SYNC stops, nodes fall silent, mainlines end, boxes are
-                # emptied, workers end, interfaces close, subscribers hear the end.
+                # Undone in this order from below: SYNC stops, the scans under way end, nodes fall silent,
+                # mainlines end, boxes are emptied, workers end, interfaces close, subscribers hear the end.
                 for lane in lanes.values():
                     stack.callback(lane.close)
                 for link in links.values():
@@ -171,6 +174,7 @@ class Host:
                     raise publisher.failure from publisher.failure.__cause__
                 raise
             senders = [link.send for link in links.values()]
+            stack.callback(_let_scans_end, tuple(lanes.values()), ticks, hand.sync.period_s, publisher)
             sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
             yield cls(hand, links, lanes, monitors, sync, publisher)
 
@@ -320,6 +324,15 @@ def _start(hand: HandConfig, links: Mapping[str, BusLink], monitors: Mapping[str
                 )
             time.sleep(_POLL_S)
         monitor.running = True
+
+
+def _let_scans_end(lanes: Sequence[Lane], ticks: Ticks, period_s: float, publisher: Publisher) -> None:
+    """Wait for the scans of the last SYNC, so that no scan is cut off by the end of the program."""
+    end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
+    while not all(lane.settled(ticks.newest) for lane in lanes) and publisher.failure is None:
+        if time.monotonic() > end_s:
+            return
+        time.sleep(_POLL_S)
 
 
 def _stand_by(link: BusLink, monitor: NodeMonitor) -> None:

@@ -105,6 +105,7 @@ class Lane:
         self._box: deque[tuple[Scan, ScanStamp]] = deque(maxlen=1)
         self._token: deque[None] = deque([None])
         self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
+        self._newest = 0
 
     # --- mainline
 
@@ -141,9 +142,13 @@ class Lane:
             t_sync_ns=0 if tick is None else tick.t_ns,
             t_receive_ns=scan.t_last_ns,
         )
-        self._offered += 1
+        self._offered, self._newest = self._offered + 1, stamp.scan
         self._box.append((scan, stamp))  # a deque of one: pushes out a scan that nobody took
         self._call_worker()
+
+    def settled(self, scan: int) -> bool:
+        """Whether ``scan`` or a newer one has come, and nothing is left to solve."""
+        return self._newest >= scan and not self._box and bool(self._token)
 
     # --- worker
 

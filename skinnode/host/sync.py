@@ -39,11 +39,14 @@ class Ticks:
     def __init__(self, counter_overflow: int) -> None:
         self.counter_overflow = counter_overflow
         self._ticks: list[Tick | None] = [None] * (counter_overflow + 1)
+        self.newest = 0
+        """Number of the newest SYNC, 0 before the first."""
 
     def note(self, number: int, t_ns: int) -> int:
         """Remember SYNC ``number`` and return its counter, 1 to ``counter_overflow``."""
         counter = (number - 1) % self.counter_overflow + 1
         self._ticks[counter] = Tick(number, t_ns)
+        self.newest = number
         return counter
 
     def find(self, counter: int) -> Tick | None:

@@ -21,8 +21,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numba
+import numba as typed_numba
 
+numba: Any = typed_numba  # its type hints leave out configuration and options that are used here
 _F = TypeVar("_F", bound=Callable[..., Any])
 _KERNEL_FILES = ("jit.py", "model/kernels.py", "solve/*.py")
 

@@ -144,7 +144,8 @@ class PatchLayout:
     @property
     def unknowns(self) -> int:
         """3 N, the coordinates of one upper wire."""
-        return 3 * self.upper_m.shape[1]
+        electrodes: int = self.upper_m.shape[1]
+        return 3 * electrodes
 
     @functools.cached_property
     def pitch_m(self) -> float:

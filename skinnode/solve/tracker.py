@@ -1,9 +1,10 @@
 """The path of the paper run for ever: a live stream of frames, each solved from the one before.
 
-predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway correct    the
-operator, to a tolerance far below any noise bridge     a wire that fails: R interpolated from the last
-solved frame to the new one, steps halved and doubled restart    the same from the rest position hold
-a wire that still fails keeps its last trusted position, with an infinite deviation and a status
+predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway
+correct    the operator, to a tolerance far below any noise
+bridge     a wire that fails: its R interpolated from the last trusted frame to the new one
+restart    the same from the rest position
+hold       a wire that still fails keeps its last trusted position, with an infinite deviation and a status
 
 A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and
 no electrode moves farther than its clearance from the lower layer.
@@ -33,8 +34,12 @@ BRIDGE_TOLERANCE: Final = 1e-6
 """Of the substeps of a bridge, the paper's intermediate tolerance."""
 FRAME_STEPS: Final = 12
 """Most steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
-BRIDGE_SOLVES: Final = 16
-"""Most solves of a bridge."""
+BRIDGES: Final = (3, 5, 10)
+"""Substeps of the bridges tried in turn. On staggered, h = 0.5, from rest: 3 bring every wire through
+a 50 % press between two frames, 5 all but one of 24 through 70 %. Steps halved and doubled, and held to the
+trusted branch, do worse: the straight line crosses singular points that the press does not."""
+BRIDGE_STEPS: Final = 20
+"""Most steps of a substep."""
 RECOVERY_STEPS: Final = 300
 """Most steps all bridges of a frame may take together, about 15 ms: a broken frame must
 not stop the stream."""
@@ -73,6 +78,8 @@ class Tracker:
         self._problem = PatchProblem.of(layout, baseline_ohm)
         self._stiffness = stiffness_n_per_m
         self._noise, self._sigma = self._checked_noise(relative_noise)
+        self._tall = layout.shape[1] > layout.unknowns
+        self._evaluations = self._steps = 0  # of the frame at hand
         self._solver = wires.Solver(self._problem, operator_code(operator))
         self._rest_branch = self._solver.solve_rest()
         self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
@@ -85,6 +92,7 @@ class Tracker:
         self._a = self._problem.a_rest.copy()
         self._solver.inverse[:] = self._rest_inverse
         self._solver.a_solved[:] = self._a
+        self._weight = np.ones(self.layout.shape)
         self._predictable = self._rest_known.copy()  # wires whose inverse in the solver belongs to their x
 
     def update(
@@ -115,8 +123,11 @@ class Tracker:
         solver = self._solver
         solver.x[:] = self._x
         todo = np.where(self._predictable, wires.PREDICT, wires.SOLVE).astype(np.uint8)
+        if self._tall and not np.array_equal(weight, self._weight):
+            todo[:] = wires.SOLVE  # J⁺ was made for other weights: what it trusted may be noise by now
+        self._weight = weight.copy()
         solver.solve(todo, a, weight, wires.COVARIANCE, TOLERANCE, TOLERANCE, FRAME_STEPS, sigma)
-        evaluations, steps = solver.cost
+        self._evaluations, self._steps = solver.cost
         status = solver.report[:, wires.STATUS].copy()
         good = self._reached()
         if good.all():
@@ -125,17 +136,8 @@ class Tracker:
             status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
             solvable = np.count_nonzero(weight, axis=1) >= self.layout.unknowns
             for u in np.flatnonzero(~good & solvable).tolist():
-                for x_from, a_from in (
-                    (self._x[u], self._a[u]),
-                    (self._problem.rest[u], self._problem.a_rest[u]),
-                ):
-                    if steps >= RECOVERY_STEPS:
-                        break
-                    cost = self._bridge(u, x_from, a_from, a, weight, sigma, RECOVERY_STEPS - steps)
-                    evaluations, steps = evaluations + cost[0], steps + cost[1]
-                    if self._reached()[u]:
-                        good[u], status[u] = True, op.CONVERGED
-                        break
+                if self._recover(u, a, weight, sigma):
+                    good[u], status[u] = True, op.CONVERGED
             residual = np.where(good, solver.measure[:, wires.RESIDUAL], self._held_residual(a, weight))
             solver.std[~good] = np.inf
         self._x[good] = solver.x[good]
@@ -147,7 +149,7 @@ class Tracker:
             displacement_std_m=(solver.std * self.layout.pitch_m).reshape(displacement.shape),
             status=tuple(map(Status, status.tolist())),
             residual=residual,
-            stats=SolveStats(evaluations, evaluations, steps, time.perf_counter() - start),
+            stats=SolveStats(self._evaluations, self._evaluations, self._steps, time.perf_counter() - start),
             force_n=None if self._stiffness is None else self._stiffness * displacement,
         )
 
@@ -158,41 +160,52 @@ class Tracker:
         reached = (report[:, wires.STATUS] == op.CONVERGED) & on_branch
         return np.asarray(reached & ~self._problem.out_of_reach(self._solver.x))
 
-    def _bridge(
-        self, u: int, x_from: Float, a_from: Float, a: Float, weight: Float, sigma: float, budget: int
-    ) -> tuple[int, int]:
-        """Solve wire u along the straight line of its resistances from ``a_from`` to ``a``, step lengths
-        adapted.
+    def _recover(self, u: int, a: Float, weight: Float, sigma: float) -> bool:
+        """Bridge wire u from its last trusted position, then from rest; whether that brought it to a root."""
+        starts = [(self._x[u].copy(), self._a[u].copy())]
+        rest = self._problem.rest[u], self._problem.a_rest[u]
+        if not np.array_equal(starts[0][0], rest[0]):
+            starts.append(rest)
+        for substeps in BRIDGES:
+            for x_from, a_from in starts:
+                if self._steps >= RECOVERY_STEPS:
+                    return False
+                self._bridge(u, x_from, a_from, a, weight, sigma, substeps)
+                if self._reached()[u]:
+                    return True
+        return False
 
-        Returns the evaluations and steps it took; the outcome is the solver's report of the wire.
+    def _bridge(
+        self, u: int, x_from: Float, a_from: Float, a: Float, weight: Float, sigma: float, substeps: int
+    ) -> None:
+        """Solve wire u along the straight line of its resistances from ``a_from`` to ``a``.
+
+        Only the last point counts: the line is no deformation of rubber, so the points between may lie on any
+        branch. The outcome is the solver's report of the wire.
         """
         solver = self._solver
         todo = np.zeros(self.layout.shape[0], np.uint8)
         todo[u] = wires.SOLVE
         between = a.copy()
-        x, at, stride = x_from.copy(), 0.0, 1.0
-        evaluations = steps = 0
-        for _ in range(BRIDGE_SOLVES):
-            to = min(1.0, at + stride)
-            last = to == 1.0
-            between[u] = a[u] if last else a_from + to * (a[u] - a_from)
-            solver.x[u] = x
+        solver.x[u] = x_from
+        for part in range(1, substeps + 1):
+            last = part == substeps
+            between[u] = a[u] if last else a_from + part / substeps * (a[u] - a_from)
             tolerance = TOLERANCE if last else BRIDGE_TOLERANCE
             tasks = wires.COVARIANCE if last else 0
-            solver.solve(todo, between, weight, tasks, tolerance, tolerance, FRAME_STEPS, sigma)
-            evaluations += int(solver.report[u, wires.EVALUATIONS])
-            steps += int(solver.report[u, wires.STEPS])
-            if not self._reached()[u]:
-                stride *= 0.5
-            elif last:
-                break
-            else:
-                x[:], at, stride = solver.x[u], to, 2.0 * stride
-            if steps >= budget:
-                break
-        if at + stride < 1.0 or not last:  # ended between the frames: nothing is known of this one
-            solver.report[u, wires.STATUS] = op.MAX_STEPS
-        return evaluations, steps
+            solver.solve(
+                todo,
+                between,
+                weight,
+                tasks,
+                tolerance,
+                tolerance,
+                BRIDGE_STEPS,
+                sigma,
+                op.LEVENBERG_MARQUARDT,
+            )
+            self._evaluations += int(solver.report[u, wires.EVALUATIONS])
+            self._steps += int(solver.report[u, wires.STEPS])
 
     def _held_residual(self, a: Float, weight: Float) -> Float:
         """(U,) RMS of F/b − 1 at the held positions over the usable resistances; inf where there is none."""

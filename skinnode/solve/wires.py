@@ -119,7 +119,7 @@ def solve_wires(
             w_u[k] = 0.0
         if count < unknowns:
             status = ILL_CONDITIONED if lost == 0 else NON_FINITE
-        evaluations, steps = 0, 0
+        evaluations, steps, skipped = 0, 0, False
         report[u, BRANCH] = 0
         measure[u, RESIDUAL] = math.inf
         measure[u, OPTIMALITY] = math.inf
@@ -144,6 +144,7 @@ def solve_wires(
                     top = max(top, abs(dot(w.jt[j], w.r)))
                 if top <= tol_f:
                     status = CONVERGED
+                    skipped = True
                     w.s[ERROR] = 0.0
             while status < 0:
                 status = propose(operator, w, tol_f, tol_x)
@@ -165,6 +166,8 @@ def solve_wires(
                             target[k] = source[k]
             for j in range(unknowns):
                 x_u[j] = w.x[j]
+                if status == CONVERGED and not skipped:  # the correction that proved convergence, for nothing
+                    x_u[j] += w.newton[j]
             measure[u, RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)
             top = 0.0
             for j in range(unknowns):
@@ -239,11 +242,28 @@ class Solver:
         tol_x: float,
         max_steps: int,
         sigma: float = 0.0,
+        operator: int | None = None,
     ) -> None:
         """Solve the wires in ``todo`` from :attr:`x` on, into :attr:`x`, :attr:`std`, :attr:`report` and
         :attr:`measure`. ``a`` and ``weight`` (U, K) may be overwritten."""
         solve_wires(
-            self.operator, tasks, todo, self.x, a, weight, sigma, self.problem.lower, tol_f, tol_x, max_steps,
-            self._step_limit, self._work, self._jt_trial, self.inverse, self.a_solved, self.std, self.report,
+            self.operator if operator is None else operator,
+            tasks,
+            todo,
+            self.x,
+            a,
+            weight,
+            sigma,
+            self.problem.lower,
+            tol_f,
+            tol_x,
+            max_steps,
+            self._step_limit,
+            self._work,
+            self._jt_trial,
+            self.inverse,
+            self.a_solved,
+            self.std,
+            self.report,
             self.measure,
-        )  # fmt: skip
+        )

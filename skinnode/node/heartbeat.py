@@ -22,10 +22,6 @@ class HeartbeatProducer:
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
-    def stop(self) -> None:
-        """Fall silent."""
-        self.set_period(0, 0)
-
     def beat(self, t_ns: int) -> bool:
         """Whether a heartbeat is due at ``t_ns``; the next one is then planned."""
         if t_ns < self.deadline_ns:
@@ -50,6 +46,8 @@ class HeartbeatConsumer:
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
         self._expected: dict[int, _Expected] = {}
+        self.deadline_ns = NO_DEADLINE_NS
+        """When the next heartbeat is missed."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property
@@ -57,29 +55,30 @@ class HeartbeatConsumer:
         """Who is listened to."""
         return list(self._expected)
 
-    @property
-    def deadline_ns(self) -> int:
-        """When the next one is missed."""
-        return min([item.deadline_ns for item in self._expected.values()], default=NO_DEADLINE_NS)
-
     def reload(self) -> None:
         """Take over what was written to 0x1016. Monitoring begins anew."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         expected = [_Expected(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         self._expected = {item.node_id: item for item in expected if item.node_id and item.within_ns}
+        self._plan()
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
         """A node is alive."""
         item = self._expected.get(node_id)
         if item is not None:
             item.deadline_ns = t_ns + item.within_ns
+            self._plan()
 
     def missed(self, t_ns: int) -> list[int]:
         """Nodes whose heartbeat has just been missed. They are listened to again from their next one on."""
         late = [item for item in self._expected.values() if t_ns >= item.deadline_ns]
         for item in late:
             item.deadline_ns = NO_DEADLINE_NS
+        self._plan()
         return [item.node_id for item in late]
+
+    def _plan(self) -> None:
+        self.deadline_ns = min([item.deadline_ns for item in self._expected.values()], default=NO_DEADLINE_NS)
 
     def _guard(self, subindex: int, value: int) -> None:
         if subindex == 0:

@@ -100,8 +100,6 @@ class PdoRecords:
         match subindex:
             case od.PDO_COB_ID:
                 check_cob_id(value, self._store.integer(self._parameter, od.PDO_COB_ID))
-                if not value & INVALID_BIT:
-                    self._check_mapping(self._store.integer(self._mapping, 0))
             case od.PDO_TYPE:
                 if SYNC_CYCLIC_MAX < value < EVENT_TYPES[0]:  # reserved, and on remote request
                     raise Refused(AbortCode.INVALID_VALUE)

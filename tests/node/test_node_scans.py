@@ -169,6 +169,9 @@ def test_overrun_skips_scans_and_says_so(operational) -> None:
     assert desk.node.overruns == 2
     assert (EMCY, "00 00 00 10 81 00 00 00") in scan(desk, "05")
     assert desk.read(0x1001, 0) == 0
+    for counter in (6, 7, 8):
+        desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
+    assert (EMCY, "10 81 11 03 00 00 00 00") in desk.take()  # told again, the third in all
 
 
 def test_leaving_operational_drops_the_scan(operational) -> None:
@@ -177,6 +180,7 @@ def test_leaving_operational_drops_the_scan(operational) -> None:
     desk.run(0.6)
     assert len(desk.take()) == 2
     desk.frame(0, "80 00")
+    assert desk.node.next_deadline_ns() is None
     desk.run(50)
     assert desk.take() == []
     desk.frame(0, "01 00")
@@ -196,6 +200,9 @@ def test_disabling_the_chunk_pdo_under_way_is_told_by_the_summary(operational) -
     assert [can_id for can_id, _ in frames] == [0x584, SUMMARY]
     assert frames[1][1][:11] == "01 02 02 00"  # OVERRUN: chunks left out; two were sent
     assert desk.frame(0x80, "02")[-1][1][:11] == "02 02 00 00"
+    desk.write(0x1800, 1, 0x184, 4)
+    frames = scan(desk, "03")
+    assert [data[:5] for can_id, data in frames if can_id == CHUNK] == ["00 03", "01 03", "02 03", "03 03"]
 
 
 class TestChangedOnly:
@@ -310,7 +317,24 @@ class TestTare:
         desk = operational
         (pattern,) = struct.unpack("<I", struct.pack("<f", rest_ohm[0, 0] * 2))
         desk.write(0x2200, 1, pattern, 4)
-        assert abs(codes_of(scan(desk, "01"))[0][0] - round(0.25 * STEPS)) <= 1
+        frames = scan(desk, "01")
+        assert abs(codes_of(frames)[0][0] - round(0.25 * STEPS)) <= 1
+        assert frames[-1][1][:5] == "01 08"  # BASELINE_CHANGED
+
+    def test_survives_a_power_cycle(self, operational, rest_ohm) -> None:
+        desk = operational
+        desk.source.ohm = rest_ohm * 0.6
+        desk.node.power_off()
+        desk.power_on()
+        assert abs(_float(desk.read(0x2200, 1)) / rest_ohm[0, 0] - 1) < 1e-6
+
+    def test_only_on_command(self, operational, rest_ohm) -> None:
+        desk = operational
+        desk.source.ohm = rest_ohm * 0.6
+        desk.write(0x2021, 2, 1, 1)
+        desk.write(0x2021, 4, 0, 4)
+        desk.frame(0x204, "00 00 00 00 00 00")
+        assert abs(_float(desk.read(0x2200, 1)) / rest_ohm[0, 0] - 1) < 1e-6
 
 
 def test_averaging_reads_more_often(operational) -> None:
@@ -319,8 +343,9 @@ def test_averaging_reads_more_often(operational) -> None:
     scan(desk, "01")
     assert desk.source.reads == reads + 1
     desk.write(0x2021, 2, 8, 1)
-    scan(desk, "02")
+    codes = codes_of(scan(desk, "02"))
     assert desk.source.reads == reads + 9
+    assert abs(codes[0][0] - REST) <= 1
 
 
 class TestOwnTimer:

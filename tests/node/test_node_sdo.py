@@ -175,6 +175,27 @@ def test_silent_client_is_aborted(desk) -> None:
     assert desk.take() == []
 
 
+def test_slow_client_that_goes_on_is_not_aborted(desk) -> None:
+    desk.sdo("20 17 10 00 00 00 00 00")
+    desk.run(900)
+    assert desk.sdo("0c e8 00 00 00 00 00 00") == "20 00 00 00 00 00 00 00"
+    desk.run(900)
+    assert desk.sdo("1d 03 00 00 00 00 00 00") == "30 00 00 00 00 00 00 00"
+    desk.sdo("40 08 10 00 00 00 00 00")
+    desk.run(900)
+    desk.sdo("60 00 00 00 00 00 00 00")
+    desk.run(900)
+    assert desk.sdo("70 00 00 00 00 00 00 00").startswith("11")
+    desk.run(5000)
+    assert all(can_id == 0x704 for can_id, _ in desk.take())  # the heartbeat just set, and no abort
+
+
+def test_refused_initiate_ends_the_transfer_before(desk) -> None:
+    desk.sdo("40 08 10 00 00 00 00 00")
+    assert desk.sdo("40 ff 1f 00 00 00 00 00").endswith(ABORTS["no object"])
+    assert desk.sdo("60 00 00 00 00 00 00 00") == f"80 00 00 00 {ABORTS['command']}"
+
+
 @pytest.mark.parametrize("request_", ["", "40", "40 00 10 00", "40 00 10 00 00 00 00"])
 def test_what_is_no_sdo_is_not_answered(desk, request_: str) -> None:
     assert desk.frame(0x604, request_) == []

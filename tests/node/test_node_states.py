@@ -97,6 +97,33 @@ def test_reset_communication_keeps_the_application(operational) -> None:
     assert desk.take() == []
 
 
+def test_reset_communication_restores_the_pdos(operational) -> None:
+    desk = operational
+    desk.write(0x1800, 1, 0x80000184, 4)
+    desk.write(0x1801, 1, 0x80000284, 4)
+    desk.write(0x1801, 1, 0x2C4, 4)
+    desk.write(0x1005, 0, 0x90, 4)
+    desk.frame(0, "82 00")
+    desk.start()
+    desk.node.on_frame(0x80, b"", desk.t_ns)
+    desk.run(20)
+    assert [can_id for can_id, _ in desk.take()] == [0x184] * 4 + [0x284]
+
+
+def test_emergency_of_a_stopped_node_waits(operational) -> None:
+    desk = operational
+    desk.write(0x1029, 1, 2, 1)
+    desk.write(0x1016, 1, 0x007F_000A, 4)
+    desk.write(0x1015, 0, 10_000, 2)  # 1 s: the second message is held back
+    desk.frame(0x80)
+    desk.frame(0x77F, "05")
+    desk.run(10)
+    assert desk.node.nmt_state is NmtState.STOPPED
+    desk.run(2000)
+    assert desk.take() == []
+    assert desk.frame(0, "80 00") == [(0x084, "30 81 11 7f 00 00 00 00")]
+
+
 def test_reset_node_resets_the_application_but_not_the_baseline(operational) -> None:
     desk = operational
     desk.write(0x2020, 2, 77, 2)
@@ -105,6 +132,18 @@ def test_reset_node_resets_the_application_but_not_the_baseline(operational) -> 
     assert desk.read(0x2020, 2) == 2
     assert desk.read(0x2200, 1) == 0x447A0000
     assert desk.read(0x2000, 10) == desk.layout.layout_hash
+
+
+def test_reset_forgets_errors(operational) -> None:
+    desk = operational
+    desk.source.ohm = np.full((2, 6), np.inf)
+    desk.frame(0x80, "01")
+    assert desk.read(0x1003, 0) == 1
+    desk.frame(0, "82 00")
+    assert desk.read(0x1003, 0) == 0
+    assert desk.read(0x1001, 0) == 0
+    desk.start()
+    assert [data for can_id, data in desk.frame(0x80) if can_id == 0x084] == ["00 50 81 00 00 08 00 00"]
 
 
 def test_heartbeat_names_the_state_and_keeps_its_beat(desk) -> None:

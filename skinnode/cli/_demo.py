@@ -5,13 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import os
 import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -20,10 +18,10 @@ from rich.live import Live
 from rich.table import Table
 
 from skinnode import jit
+from skinnode.cli._files import plain
 from skinnode.cli._plot import PatchTrace
 from skinnode.cli._score import Score, Scorer
 from skinnode.cli._view import BusView, PatchView, render
-from skinnode.errors import ConfigError
 from skinnode.host import Host
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.frames import FieldFrame
@@ -78,15 +76,6 @@ class Run:
 
     report: Report
     traces: tuple[PatchTrace, ...]
-
-
-def require_writable(option: str, file: Path) -> None:
-    """Raises ConfigError, before any work is done, where ``file`` could not be written."""
-    if file.is_dir():
-        raise ConfigError(option, str(file), "the name of a file, not a folder")
-    target = file if file.exists() else file.absolute().parent
-    if not os.access(target, os.W_OK):
-        raise ConfigError(option, str(file), "a file in an existing folder that can be written")
 
 
 @dataclass
@@ -356,13 +345,6 @@ def print_report(console: Console, report: Report) -> None:
 
 def as_json(report: Report) -> dict[str, Any]:
     """The report as plain data; a figure that could not be had is null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [plain(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
 
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

@@ -46,10 +46,11 @@ def demo(
     from rich.console import Console
 
     from skinnode.cli import _demo, _plot
+    from skinnode.cli._files import require_writable
 
     for option, file in (("--json", json_file), ("--plot", plot)):
         if file is not None:
-            _demo.require_writable(option, file)
+            require_writable(option, file)
     if plot is not None:
         _plot.require_matplotlib(plot)
     console = Console(highlight=False)

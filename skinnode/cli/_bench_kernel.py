@@ -104,7 +104,7 @@ def _numpy_step(clock: Clock, wire: NumpyWire, x: Float, a: Float, name: str) ->
         jt = wire.j.reshape(unknowns, -1) * a
         j = jt.T
         if name == "gauss_newton":
-            return np.linalg.solve(j, -r)
+            return np.asarray(np.linalg.solve(j, -r))
         gradient = jt @ r
         scale = np.sqrt((jt**2).sum(axis=1))
         if name == "levenberg_marquardt":

@@ -17,8 +17,8 @@ _IDLE_S: Final = 0.1
 """Longest wait for a frame: how soon the thread sees that it should end."""
 
 TIMER_SLACK_NS: Final = 2_000_000
-"""How late timers may be. Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 24 % of a core of a small machine
-when the thread wakes for every chunk and 11 % with 2 ms; above, nothing is gained."""
+"""How late timers may be. Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 13 % of a core of a small machine
+when the thread wakes for every chunk and 7 % with 2 ms; above, nothing is gained."""
 
 _RETRY_S: Final = 0.02
 """Pause after an error of the bus: a queue that was full has drained by then."""

@@ -1,124 +1,138 @@
-"""Compiled kernels against NumPy: F and J of one wire, and one step of each operator."""
+"""F + J, and one step of each operator, of one wire of the reference patch: compiled against NumPy."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, Final
+
 import numpy as np
 
-from skinnode.cli._bench import Clock, Result, Row, press_m
+from skinnode.cli._bench_timing import machine, take_turns
 from skinnode.model.forward import resistance_ohm
-from skinnode.model.kernels import potential_jacobian
+from skinnode.model.kernels import lower_rows, potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve import wires
 from skinnode.solve.operators import OPERATORS
 from skinnode.solve.problem import PatchProblem
 
-WIRE = 4
+SHORT: Final = 1e-3
+"""Trust radius, pitches a coordinate: well within Newton's step here, so that every operator has to work."""
 
 
 class NumpyWire:
-    """F and J of one wire as a careful NumPy user writes them: broadcast once, arrays allocated once."""
+    """F and Jᵀ of one wire as fast as NumPy does it: broadcast into buffers made once."""
 
     def __init__(self, lower: Float, electrodes: int) -> None:
-        _, charges, wires_ = lower.shape
-        self._lower = np.ascontiguousarray(lower[:, None])  # (3, 1, M, K)
-        self._offset = np.empty((3, electrodes, charges, wires_))
-        self._square = np.empty((electrodes, charges, wires_))
-        self._work = np.empty_like(self._square)
-        self.f = np.empty(wires_)
-        self.j = np.empty((electrodes, 3, wires_))
+        shape = (electrodes, 3, *lower.shape[1:])
+        self._lower = lower
+        self._gap, self._square = np.empty(shape), np.empty(shape)
+        self._near = np.empty((electrodes, *lower.shape[1:]))
+        self._cubed = np.empty_like(self._near)
+        self.f = np.empty(lower.shape[2])
+        self._f_i = np.empty((electrodes, lower.shape[2]))
+        self.jt = np.empty((electrodes, 3, lower.shape[2]))
 
-    def __call__(self, x: Float) -> None:
-        np.subtract(x.reshape(-1, 3).T[:, :, None, None], self._lower, out=self._offset)
-        np.einsum("anmk,anmk->nmk", self._offset, self._offset, out=self._square)
-        np.sqrt(self._square, out=self._work)
-        np.reciprocal(self._work, out=self._work)
-        self._work.sum(axis=(0, 1), out=self.f)
-        np.divide(self._work, self._square, out=self._work)
-        np.einsum("anmk,nmk->nak", self._offset, self._work, out=self.j)
-        np.negative(self.j, out=self.j)
+    def __call__(self, x: Float) -> tuple[Float, Float]:
+        np.subtract(x.reshape(-1, 3, 1, 1), self._lower, out=self._gap)
+        np.multiply(self._gap, self._gap, out=self._square)
+        np.sum(self._square, axis=1, out=self._near)
+        np.sqrt(self._near, out=self._near)
+        np.divide(1.0, self._near, out=self._near)
+        np.sum(self._near, axis=1, out=self._f_i)
+        np.sum(self._f_i, axis=0, out=self.f)
+        np.multiply(self._near, self._near, out=self._cubed)
+        np.multiply(self._cubed, self._near, out=self._cubed)
+        np.multiply(self._gap, self._cubed[:, None], out=self._gap)
+        np.sum(self._gap, axis=2, out=self.jt)
+        np.negative(self.jt, out=self.jt)
+        return self.f, self.jt.reshape(-1, self.f.size)
 
 
-def broadcast(x: Float, lower: Float) -> tuple[Float, Float]:
-    """The same in three lines."""
-    offset = x.reshape(-1, 3).T[:, :, None, None] - lower[:, None]
-    distance = np.sqrt((offset**2).sum(axis=0))
-    return (1.0 / distance).sum(axis=(0, 1)), -(offset / distance**3).sum(axis=2)
+def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
+    """Evaluate, step, evaluate, as one step of the compiled driver does.
+
+    The parameter of Levenberg-Marquardt, which the driver has to search for, is given.
+    """
+    f, jt = wire(x)
+    r, j = a * f - 1.0, (jt * a).T
+    if operator == "gauss_newton":
+        step = -np.linalg.solve(j, r)
+    else:
+        scale = np.linalg.norm(j, axis=0)
+        radius = SHORT * np.linalg.norm(scale)
+        gradient = j.T @ r
+        if operator == "dogleg":
+            newton = -np.linalg.solve(j, r)
+            down = -gradient / scale**2
+            along = j @ down
+            cauchy = down * (-(gradient @ down) / (along @ along))
+            if np.linalg.norm(scale * cauchy) >= radius:
+                step = down * (radius / np.linalg.norm(scale * down))
+            else:
+                leg, from_ = scale * (newton - cauchy), scale * cauchy
+                p, q = leg @ leg, leg @ from_
+                step = cauchy + (newton - cauchy) * (
+                    (np.sqrt(q * q + p * (radius**2 - from_ @ from_)) - q) / p
+                )
+        else:
+            q_, r_ = np.linalg.qr(np.vstack([j, np.diag(0.1 * scale)]))
+            step = -np.linalg.solve(r_, q_[: r.size].T @ r)
+    trial = x + step
+    f, _ = wire(trial)
+    return np.asarray(a * f - 1.0)
 
 
-def measure(clock: Clock) -> Result:
-    """All rows; every ratio is against the compiled twin in the same run."""
-    layout = PatchLayout.preset("staggered")
+def run(rounds: int) -> dict[str, Any]:
+    """The figures of the benchmark, µs a wire and ratios to NumPy."""
+    layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
-    moved = press_m(layout, 0.3, (0.018, 0.017))
-    start = (problem.rest.reshape(layout.upper_m.shape) + moved / layout.pitch_m).reshape(layout.shape[0], -1)
-    x = np.ascontiguousarray(start[WIRE])
-    f, jt = np.empty(layout.shape[1]), np.empty((layout.unknowns, layout.shape[1]))
-    numpy_wire = NumpyWire(problem.lower, layout.upper_m.shape[1])
+    rng = np.random.default_rng(1)
+    pressed = layout.upper_m - rng.uniform(0.0, 0.2, (10, 10, 1)) * np.array([0.2, 0.1, 1.0]) * 2e-3
+    a = resistance_ohm(layout, pressed) * problem.gain
+    lower = lower_rows(layout.lower_m / layout.pitch_m)
+    x = problem.rest[5].copy()
+    f, jt = np.empty(30), np.empty((30, 30))
+    wire = NumpyWire(lower, 10)
+    np.testing.assert_allclose(potential_of(x, lower), wire(x)[0], rtol=1e-12)
 
-    compiled = clock.microseconds(lambda: potential_jacobian(x, problem.lower, f, jt))
-    prepared = clock.microseconds(lambda: numpy_wire(x))
-    plain = clock.microseconds(lambda: broadcast(x, problem.lower))
-    numpy_wire(x)
-    error = float(np.abs(numpy_wire.j.reshape(jt.shape) - jt).max() / np.abs(jt).max())
-    rows = [
-        Row("F + J, compiled", compiled, 1.0),
-        Row("F + J, NumPy, preallocated", prepared, prepared / compiled, error),
-        Row("F + J, NumPy, broadcast", plain, plain / compiled),
-    ]
-    a = resistance_ohm(layout, layout.upper_m) * problem.gain  # the frame at rest: several steps away
-    for name in OPERATORS:
-        ours = _compiled_step(clock, problem, start, a, name)
-        theirs = _numpy_step(clock, numpy_wire, x, a[WIRE], name)
-        rows.append(Row(f"step of {name}, compiled", ours, 1.0))
-        rows.append(Row(f"step of {name}, NumPy", theirs, theirs / ours))
-    reached = rows[1].ratio
-    return Result(
-        "kernel",
-        "one wire, 10 electrodes over 30 lower wires of 10; error: compiled against NumPy, relative",
-        tuple(rows),
-        (f"F + J {reached:.1f} times faster than preallocated NumPy (set: 8)",),
-    )
+    def broadcast() -> Float:
+        gap = x.reshape(10, 1, 1, 3) - layout.lower_m / layout.pitch_m
+        distance = np.linalg.norm(gap, axis=-1, keepdims=True)
+        return np.asarray((1.0 / distance).sum() - (gap / distance**3).sum(axis=2))
+
+    pairs: dict[str, dict[str, Callable[[], object]]] = {
+        "F + J": {
+            "compiled": lambda: potential_jacobian(x, lower, f, jt),
+            "NumPy, preallocated": lambda: wire(x),
+            "NumPy, broadcast": broadcast,
+        }
+    }
+    todo, ones = np.full(10, wires.SOLVE, np.uint8), np.ones_like(a)
+    for operator, code in OPERATORS.items():
+        solver = wires.Solver(problem, code)
+        solver.step_limit = SHORT
+
+        def compiled(solver: wires.Solver = solver) -> None:
+            solver.x[:] = problem.rest
+            solver.solve(todo, a, ones, 0, 1e-14, 1e-14, 1)
+
+        def plain(operator: str = operator) -> None:
+            for u in range(10):
+                numpy_step(operator, wire, problem.rest[u], a[u])
+
+        pairs[f"step of {operator}"] = {"compiled": compiled, "NumPy, preallocated": plain}
+    rows = []
+    for what, candidates in pairs.items():
+        wires_a_call = 1 if what == "F + J" else 10
+        for name, timing in take_turns(candidates, rounds=rounds).items():
+            rows.append(
+                {"what": what, "who": name, "us": timing.call_us / wires_a_call, "ratio": timing.ratio}
+            )
+    return {"benchmark": "kernel", "machine": machine(), "rows": rows}
 
 
-def _compiled_step(clock: Clock, problem: PatchProblem, start: Float, a: Float, name: str) -> float:
-    """Two steps less one step, of all wires in one call: what a step costs with its evaluation of F and J."""
-    solver = wires.Solver(problem, OPERATORS[name])
-    todo = np.full(len(start), wires.SOLVE, np.uint8)
-    weight = np.ones_like(a)
-
-    def run(steps: int) -> None:
-        solver.x[:] = start
-        solver.solve(todo, a, weight, 0, 1e-300, 1e-300, steps)
-
-    times = [clock.microseconds(lambda steps=steps: run(steps)) for steps in (1, 2)]  # type: ignore[misc]  # bound at once
-    return (times[1] - times[0]) / len(start)
-
-
-def _numpy_step(clock: Clock, wire: NumpyWire, x: Float, a: Float, name: str) -> float:
-    """F, J and the step of one operator in NumPy and LAPACK."""
-    unknowns = x.size
-
-    def step() -> Float:
-        wire(x)
-        r = a * wire.f - 1.0
-        jt = wire.j.reshape(unknowns, -1) * a
-        j = jt.T
-        if name == "gauss_newton":
-            return np.asarray(np.linalg.solve(j, -r))
-        gradient = jt @ r
-        scale = np.sqrt((jt**2).sum(axis=1))
-        if name == "levenberg_marquardt":
-            tall = np.vstack([j, np.diag(1e-3 * scale)])
-            q, upper = np.linalg.qr(tall)
-            return np.asarray(np.linalg.solve(upper, q.T @ np.concatenate([-r, np.zeros(unknowns)])))
-        newton = np.linalg.solve(j, -r)
-        descent = -gradient / scale**2
-        slope = j @ descent
-        cauchy = (gradient @ -descent) / (slope @ slope) * descent
-        radius = 0.5 * np.linalg.norm(scale * newton)
-        leg = newton - cauchy
-        b, c = (scale * leg) @ (scale * cauchy), np.linalg.norm(scale * cauchy) ** 2 - radius**2
-        square = np.linalg.norm(scale * leg) ** 2
-        return np.asarray(cauchy + (np.sqrt(max(b * b - square * c, 0.0)) - b) / square * leg)
-
-    return clock.microseconds(step)
+def potential_of(x: Float, lower: Float) -> Float:
+    """F of one wire by the compiled kernel."""
+    f, jt = np.empty(lower.shape[2]), np.empty((x.size, lower.shape[2]))
+    potential_jacobian(x, lower, f, jt)
+    return f

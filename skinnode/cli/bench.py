@@ -1,57 +1,64 @@
-"""``skinnode bench``: speed beside error, ratios taken in one run. No benchmark fails on an absolute time."""
+"""``skinnode bench``: ratios taken in one run, never a judgement on an absolute time."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from skinnode.cli._bench import Result
+app = typer.Typer(help="Measure the solver against its peers on this machine.", no_args_is_help=True)
 
-app = typer.Typer(help="Measure speed beside error; ratios are of one run.", no_args_is_help=True)
-
-_Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.", metavar="FILE")]
-_Repeat = Annotated[
-    int, typer.Option(min=1, max=10_000, help="Timings of each case; the shortest counts.", metavar="N")
+JsonFile = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to FILE as well.")
 ]
+Rounds = Annotated[int, typer.Option(min=1, help="How often each candidate has its turn.")]
 
 
 @app.command()
-def kernel(json_file: _Json = None, repeat: _Repeat = 30) -> None:
-    """F and J of one wire, and one step of each operator: compiled against NumPy."""
-    from skinnode.cli import _bench, _bench_kernel
+def kernel(json: JsonFile = None, rounds: Rounds = 31) -> None:
+    """F + J and one step of each operator: compiled against NumPy."""
+    from skinnode.cli import _bench_kernel
 
-    _check(json_file)
-    _report(_bench_kernel.measure(_bench.Clock(repeat)), json_file)
+    _say_if_cold()
+    figures = _bench_kernel.run(rounds)
+    _print_machine(figures)
+    typer.echo(f"{'':28}{'':22}{'µs a wire':>10}{'ratio':>8}")
+    for row in figures["rows"]:
+        typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
+    _write(json, figures)
 
 
 @app.command()
-def solve(json_file: _Json = None, repeat: _Repeat = 10) -> None:
-    """One wire to 1e-9 from the frame before: ours, SciPy and Ceres on the same compiled F and J."""
-    from skinnode.cli import _bench, _bench_solve
+def solve(json: JsonFile = None, rounds: Rounds = 31) -> None:
+    """One wire to 1e-9 from a near start: ours, SciPy's and Ceres' solvers on the same compiled F and J."""
+    from skinnode.cli import _bench_solve
 
-    _check(json_file)
-    _report(_bench_solve.measure(_bench.Clock(repeat)), json_file)
+    _say_if_cold()
+    figures = _bench_solve.run(rounds)
+    _print_machine(figures)
+    typer.echo(f"{'':42}{'µs a wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
+    for row in figures["rows"]:
+        spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
+        typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
+    if not any("pyceres" in row["who"] for row in figures["rows"]):
+        typer.echo("Ceres is not installed: pip install 'skinnode[bench]' measures it too.")
+    _write(json, figures)
 
 
-def _check(json_file: Path | None) -> None:
-    from skinnode.cli._files import require_writable
+def _say_if_cold() -> None:
+    from skinnode.jit import is_cold
 
-    if json_file is not None:
-        require_writable("--json", json_file)
+    if is_cold():
+        typer.echo("Compiling the kernels; the next start finds them ready.", err=True)
 
 
-def _report(result: Result, json_file: Path | None) -> None:
-    import json
+def _print_machine(figures: dict[str, Any]) -> None:
+    typer.echo(", ".join(f"{key} {value}" for key, value in figures["machine"].items()))
 
-    from rich.console import Console
 
-    from skinnode.cli import _bench
+def _write(path: Path | None, figures: dict[str, Any]) -> None:
+    if path is not None:
+        from skinnode.cli._bench_timing import write_json
 
-    console = Console(highlight=False)
-    _bench.show(result, console)
-    if json_file is not None:
-        json_file.write_text(json.dumps(_bench.as_json(result), indent=2, allow_nan=False) + "\n")
-        console.print(f"figures written to {json_file}", soft_wrap=True)
+        write_json(path, figures)

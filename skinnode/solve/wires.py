@@ -217,7 +217,7 @@ class Solver:
         self.measure = np.zeros((wires, MEASURES))
         self._work = workspace(unknowns, lower)
         self._jt_trial = np.zeros((unknowns, lower))
-        self._step_limit = problem.step_limit
+        self.step_limit = problem.step_limit
 
     @property
     def cost(self) -> tuple[int, int]:
@@ -258,7 +258,7 @@ class Solver:
             tol_f,
             tol_x,
             max_steps,
-            self._step_limit,
+            self.step_limit,
             self._work,
             self._jt_trial,
             self.inverse,

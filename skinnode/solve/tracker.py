@@ -19,7 +19,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
@@ -130,19 +129,21 @@ class Tracker:
         self._evaluations, self._steps = solver.cost
         status = solver.report[:, wires.STATUS].copy()
         good = self._reached()
-        if good.all():
-            residual = solver.measure[:, wires.RESIDUAL].copy()
-        else:
+        if not good.all():
             status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
             solvable = np.count_nonzero(weight, axis=1) >= self.layout.unknowns
             for u in np.flatnonzero(~good & solvable).tolist():
-                if self._recover(u, a, weight, sigma):
-                    good[u], status[u] = True, op.CONVERGED
-            residual = np.where(good, solver.measure[:, wires.RESIDUAL], self._held_residual(a, weight))
+                good[u] = self._recover(u, a, weight, sigma)
+                ended = int(solver.report[u, wires.STATUS])
+                status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
             solver.std[~good] = np.inf
+            self._predictable &= ~solvable  # what was not tried keeps its inverse
+        residual = solver.measure[:, wires.RESIDUAL].copy()
+        for u in np.flatnonzero(~good).tolist():
+            residual[u] = self._held_residual(u, a, weight)
         self._x[good] = solver.x[good]
         self._a[good] = solver.a_solved[good]
-        self._predictable = good
+        self._predictable |= good
         displacement = self._problem.displacement_m(self._x)
         return FieldFrame(
             displacement_m=displacement,
@@ -193,27 +194,19 @@ class Tracker:
             between[u] = a[u] if last else a_from + part / substeps * (a[u] - a_from)
             tolerance = TOLERANCE if last else BRIDGE_TOLERANCE
             tasks = wires.COVARIANCE if last else 0
-            solver.solve(
-                todo,
-                between,
-                weight,
-                tasks,
-                tolerance,
-                tolerance,
-                BRIDGE_STEPS,
-                sigma,
-                op.LEVENBERG_MARQUARDT,
-            )
+            method = op.LEVENBERG_MARQUARDT  # the sturdiest across a gap, whatever follows the stream
+            solver.solve(todo, between, weight, tasks, tolerance, tolerance, BRIDGE_STEPS, sigma, method)
             self._evaluations += int(solver.report[u, wires.EVALUATIONS])
             self._steps += int(solver.report[u, wires.STEPS])
 
-    def _held_residual(self, a: Float, weight: Float) -> Float:
-        """(U,) RMS of F/b − 1 at the held positions over the usable resistances; inf where there is none."""
-        potential = potential_per_m(self.layout, self.layout.upper_m + self._problem.displacement_m(self._x))
-        relative = np.where(weight > 0, a * potential * self.layout.pitch_m - 1.0, 0.0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            rms = np.sqrt((relative**2).sum(axis=1) / np.count_nonzero(weight, axis=1))
-        return np.asarray(np.where(np.isfinite(rms), rms, np.inf))
+    def _held_residual(self, u: int, a: Float, weight: Float) -> float:
+        """RMS of F/b − 1 of wire u at its held position over the usable resistances; inf if there is none."""
+        used = weight[u] > 0
+        if not used.any():
+            return math.inf
+        gaps = self._x[u].reshape(-1, 1, 3, 1) - self._problem.lower.transpose(1, 0, 2)[None]
+        potential = (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))
+        return float(np.sqrt(np.mean((a[u, used] * potential[used] - 1.0) ** 2)))
 
     def _checked_noise(self, relative_noise: ArrayLike) -> tuple[Float, float]:
         """(U, K) deviations and the smallest of them."""

@@ -36,7 +36,7 @@ from skinnode.solve.problem import PatchProblem
 
 # Columns of the integer report of a wire
 STATUS, EVALUATIONS, STEPS, BRANCH, REPORT = range(5)
-# Columns of the real report of a wire
+# Columns of the real report of a wire; the residual is the weighted RMS over the equations in use
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, MEASURES = range(4)
 
 A_MIN: Final = 1e-12

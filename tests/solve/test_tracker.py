@@ -289,3 +289,14 @@ def test_bad_shapes_are_named(staggered, rest):
         tracker.update(rest, np.ones((10, 30), np.int64))
     with pytest.raises(ValueError, match="layout: got 29 lower wires for 30 unknowns"):
         sk.Tracker(sk.PatchLayout.preset("staggered", lower_wires=29))
+
+
+def test_residual_of_a_held_wire_says_how_far_off_it_is(staggered, stream, rest):
+    tracker = sk.Tracker(staggered)
+    frame = stream[12][1]
+    valid = np.ones(frame.shape, bool)
+    valid[4, :3] = False
+    field = tracker.update(frame, valid)  # wire 4 is held at rest, where its F is that of the rest frame
+    assert field.residual[4] == pytest.approx(np.sqrt(np.mean((frame / rest - 1)[4, 3:] ** 2)), rel=1e-9)
+    assert field.residual[5] < 1e-9
+    assert tracker.update(frame, np.zeros(frame.shape, bool)).residual[4] == np.inf

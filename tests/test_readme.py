@@ -35,16 +35,17 @@ def test_commands_of_the_table_exist() -> None:
         assert done.returncode == 0, done.stderr
 
 
-def test_the_second_example_runs_against_simulated_patches() -> None:
+def test_the_second_example_runs_against_simulated_patches(multicast_group: str) -> None:
     folder = Path(__file__).parents[1]
     simulator = subprocess.Popen(
-        [str(Path(sys.executable).with_name("vcan-sim")), "examples/hand.toml"],
+        [str(Path(sys.executable).with_name("vcan-sim")), "examples/hand.toml", "--channel", multicast_group],
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
     try:
-        code = python_blocks()[1].rstrip() + "\n        if field.stamp.scan >= 12:\n            break\n"
+        code = python_blocks()[1].replace('.toml")', f'.toml", channel="{multicast_group}")').rstrip()
+        code += "\n        if field.stamp.scan >= 12:\n            break\n"
         done = subprocess.run(
             [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=100, check=False
         )

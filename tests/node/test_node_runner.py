@@ -41,8 +41,8 @@ class Steady:
 
 
 @pytest.fixture(params=["virtual", "udp_multicast"])
-def config(request: pytest.FixtureRequest) -> BusConfig:
-    channel = "239.74.163.79" if request.param == "udp_multicast" else uuid.uuid4().hex
+def config(request: pytest.FixtureRequest, multicast_group: str) -> BusConfig:
+    channel = multicast_group if request.param == "udp_multicast" else uuid.uuid4().hex
     return BusConfig(interface=request.param, channel=channel)
 
 

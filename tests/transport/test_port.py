@@ -16,13 +16,12 @@ from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame
 from skinnode.transport import port as port_module
 
-MULTICAST = "239.74.163.77"
 WAIT_S = 5.0
 
 
 @pytest.fixture(params=["virtual", "udp_multicast"])
-def config(request: pytest.FixtureRequest) -> BusConfig:
-    channel = MULTICAST if request.param == "udp_multicast" else uuid.uuid4().hex
+def config(request: pytest.FixtureRequest, multicast_group: str) -> BusConfig:
+    channel = multicast_group if request.param == "udp_multicast" else uuid.uuid4().hex
     return BusConfig(name="can7", interface=request.param, channel=channel)
 
 
@@ -190,20 +189,21 @@ def test_receivers_of_a_virtual_bus_do_not_share_a_message() -> None:
         assert bytes(second.data) == b"\x01"
 
 
-def test_two_multicast_groups_are_two_buses() -> None:
-    one, two = (BusConfig(interface="udp_multicast", channel=f"239.74.163.{last}") for last in (80, 81))
+def test_two_multicast_groups_are_two_buses(multicast_group: str) -> None:
+    another = multicast_group.replace("239.74.", "239.75.")
+    one, two = (BusConfig(interface="udp_multicast", channel=group) for group in (multicast_group, another))
     with CanPort(one) as ours, CanPort(one) as theirs, CanPort(two) as other:
         ours.send(1, b"")
         assert receive(theirs).can_id == 1
         assert other.recv(0.1) is None
 
 
-def test_garbage_in_the_multicast_group_is_counted_and_skipped() -> None:
-    config = BusConfig(interface="udp_multicast", channel=MULTICAST)
+def test_garbage_in_the_multicast_group_is_counted_and_skipped(multicast_group: str) -> None:
+    config = BusConfig(interface="udp_multicast", channel=multicast_group)
     with CanPort(config) as port, CanPort(config) as theirs:
         sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         for packet in (b"\xff\xff", b"", b"\x81\xa4dlc\x00\x01", bytes(2000)):
-            sender.sendto(packet, (MULTICAST, 43113))
+            sender.sendto(packet, (multicast_group, 43113))
         sender.close()
         theirs.send(1, b"")
         assert receive(port).can_id == 1

@@ -78,8 +78,8 @@ def test_capacity() -> None:
 
 
 @pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
-def test_on_a_bus(interface: str) -> None:
-    channel = "239.74.163.78" if interface == "udp_multicast" else uuid.uuid4().hex
+def test_on_a_bus(interface: str, multicast_group: str) -> None:
+    channel = multicast_group if interface == "udp_multicast" else uuid.uuid4().hex
     config = BusConfig(interface=interface, channel=channel)
     with CanPort(config) as ours, CanPort(config) as theirs, Receiver(theirs) as receiver:
         for number in range(200):

@@ -56,10 +56,10 @@ def cache_dir() -> Path | None:
     return next((folder for folder in candidates if _writable(folder)), None)
 
 
-def is_cold() -> bool:
-    """True when the kernels still have to be compiled, so that a command can say why it takes its time."""
+def is_cold(kernel: str = "solve_wires") -> bool:
+    """True when ``kernel`` still has to be compiled, so that a command can say why it takes its time."""
     folder = cache_dir()
-    return folder is None or not any(folder.rglob("*.nbc"))
+    return folder is None or not any(folder.rglob(f"*.{kernel}-*.nbc"))
 
 
 _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}

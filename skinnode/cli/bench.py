@@ -20,7 +20,7 @@ def kernel(json: JsonFile = None, rounds: Rounds = 31) -> None:
     """F + J and one step of each operator: compiled against NumPy."""
     from skinnode.cli import _bench_kernel
 
-    _say_if_cold()
+    _prepare(json)
     figures = _bench_kernel.run(rounds)
     _print_machine(figures)
     typer.echo(f"{'':28}{'':22}{'µs a wire':>10}{'ratio':>8}")
@@ -34,7 +34,7 @@ def solve(json: JsonFile = None, rounds: Rounds = 31) -> None:
     """One wire to 1e-9 from a near start: ours, SciPy's and Ceres' solvers on the same compiled F and J."""
     from skinnode.cli import _bench_solve
 
-    _say_if_cold()
+    _prepare(json)
     figures = _bench_solve.run(rounds)
     _print_machine(figures)
     typer.echo(f"{'':42}{'µs a wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
@@ -46,8 +46,13 @@ def solve(json: JsonFile = None, rounds: Rounds = 31) -> None:
     _write(json, figures)
 
 
-def _say_if_cold() -> None:
+def _prepare(json: Path | None) -> None:
+    """Refuse what could not be written, before the work; say why the first run takes longer."""
+    from skinnode.cli._files import require_writable
     from skinnode.jit import is_cold
+
+    if json is not None:
+        require_writable("--json", json)
 
     if is_cold():
         typer.echo("Compiling the kernels; the next start finds them ready.", err=True)

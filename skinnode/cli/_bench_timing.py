@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from skinnode.cli._files import write_text
+
 ROUNDS: Final = 31
 """Odd, so that the median is a time that was measured."""
 TURN_S: Final = 4e-3
@@ -84,4 +86,4 @@ def _processor() -> str:
 
 def write_json(path: Path, figures: dict[str, Any]) -> None:
     """Write ``figures``, readable and with a stable order."""
-    path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    write_text("--json", path, json.dumps(figures, indent=2) + "\n")

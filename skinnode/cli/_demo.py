@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -191,7 +193,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         "boot-up, identity, configuration, start",
         soft_wrap=True,
     )
-    with _responsive_threads(), Fleet(hand) as fleet:
+    with _responsive_threads(), _ended_by_sigterm(), Fleet(hand) as fleet:
         with Host.from_config(hand) as host:
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
@@ -257,6 +259,19 @@ def _responsive_threads() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(kept)
+
+
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """SIGTERM ends the demo as Ctrl-C does: nodes stopped, terminal as it was."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's alone
+        return
+    kept = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, kept)
 
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:

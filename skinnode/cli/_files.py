@@ -19,6 +19,14 @@ def require_writable(option: str, file: Path) -> None:
         raise ConfigError(option, str(file), "a file in an existing folder that can be written")
 
 
+def write_text(option: str, file: Path, text: str) -> None:
+    """Raises ConfigError where ``file``, the value of ``option``, does not take all of ``text``."""
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(option, str(file), f"a file that can be written ({error.strerror})") from error
+
+
 def plain(value: Any) -> Any:
     """``value`` as JSON can hold it: a figure that could not be had becomes null."""
     if isinstance(value, dict):

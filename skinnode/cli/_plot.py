@@ -42,7 +42,7 @@ def require_matplotlib(file: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     kinds = sorted(FigureCanvasAgg.get_supported_filetypes())
-    if file.suffix.removeprefix(".") not in kinds:
+    if file.suffix.removeprefix(".").lower() not in kinds:
         raise ConfigError("--plot", str(file), f"a file name that ends in one of {', '.join(kinds)}")
 
 

@@ -46,7 +46,7 @@ def demo(
     from rich.console import Console
 
     from skinnode.cli import _demo, _plot
-    from skinnode.cli._files import require_writable
+    from skinnode.cli._files import require_writable, write_text
 
     for option, file in (("--json", json_file), ("--plot", plot)):
         if file is not None:
@@ -57,7 +57,9 @@ def demo(
     run = _demo.play(demo_hand(patches, seed), seconds, console)
     _demo.print_report(console, run.report)
     if json_file is not None:
-        json_file.write_text(json.dumps(_demo.as_json(run.report), indent=2, allow_nan=False) + "\n")
+        write_text(
+            "--json", json_file, json.dumps(_demo.as_json(run.report), indent=2, allow_nan=False) + "\n"
+        )
         console.print(f"figures written to {json_file}")
     if plot is not None:
         _plot.draw_demo(plot, run.traces)

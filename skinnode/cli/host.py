@@ -17,10 +17,14 @@ import typer
 
 if TYPE_CHECKING:
     from skinnode.host import Host, HostStats
+    from skinnode.model.config import HandConfig
     from skinnode.model.frames import FieldFrame
 
 _LONGEST_WAIT_S = 0.1
 """How long Ctrl-C may go unnoticed."""
+
+_FIRST_SCANS = 3
+"""SYNCs after which a patch must have sent a scan."""
 
 
 def host(
@@ -38,44 +42,65 @@ def host(
 ) -> None:
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
-    Ctrl-C ends it; the nodes are left pre-operational. Exit status 2 if the hand could not be run, or if a
-    node sent frames that are not what their identifier promises.
+    Ctrl-C ends it; the nodes are left pre-operational. Exit status 1 if a patch was not operational at the
+    end, or a scan was torn or a frame lost; 2 if the hand could not be run, or if a node sent frames that are
+    not what their identifier promises.
     """
-    with _until_told() as told:
-        as_promised = _run(
-            hand, interface, channel, seconds, _JsonReport() if as_json else _TextReport(), told
-        )
-    if not as_promised:
-        raise typer.Exit(2)
-
-
-def _run(
-    hand: Path,
-    interface: str | None,
-    channel: str | None,
-    seconds: float | None,
-    report: _Report,
-    told: threading.Event,
-) -> bool:
-    """Run the hand until told to end or time is up. False if a frame was not what its identifier promises:
-    the host has said so in the log, which Python writes to stderr."""
-    from skinnode.host import BringUpCancelled, Host
+    from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
     from skinnode.model.config import load_hand
 
     plan = load_hand(hand).on(interface, channel)
+    report = _JsonReport() if as_json else _TextReport()
     if is_cold():
         report.note("compiling the kernels, once: takes some seconds")
+    for patch in plan.patches:  # compiles; nothing is open yet, so Ctrl-C still ends the program by itself
+        check_solvable(patch, plan.solver)
+    with _until_told() as told:
+        status = _run(plan, seconds, report, told)
+    if status:
+        raise typer.Exit(status)
+
+
+def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threading.Event) -> int:
+    """Run the hand until told to end or time is up; the exit status. Of a frame that was not what its
+    identifier promises the host has said so in the log, which Python writes to stderr."""
+    from skinnode.host import BringUpCancelled, Host
+
     try:
         with Host.from_config(plan, cancelled=told.is_set) as running:
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)
-            as_promised = not running.stats().malformed
+            faults = _faults(running)
     except BringUpCancelled:
-        return True
+        return 0
     report.note("nodes are pre-operational")
-    return as_promised
+    for fault in faults:
+        report.note(f"fault: {fault}")
+    if running.stats().malformed:
+        return 2
+    return 1 if faults else 0
+
+
+def _faults(running: Host) -> list[str]:
+    """What was not as it should be, one line each."""
+    stats = running.stats()
+    found = [f"{name}: {bus.dropped} frames dropped" for name, bus in stats.buses.items() if bus.dropped]
+    for name, lane in stats.patches.items():
+        condition = running.health(name).condition
+        begun = lane.offered > 0 or stats.sync.sent > _FIRST_SCANS
+        if condition != "operational" and begun:
+            found.append(f"{name}: {condition} at the end")
+        counts = lane.assembler
+        for count, what in (
+            (counts.scans_torn, "scans torn"),
+            (counts.scans_missed, "scans missed"),
+            (counts.chunks_lost, "chunks lost"),
+        ):
+            if count:
+                found.append(f"{name}: {count} {what}")
+    return found
 
 
 @contextmanager

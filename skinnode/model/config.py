@@ -46,7 +46,21 @@ class _Allowed:
     text: str
 
 
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), _Allowed("a positive number")]
+_Stiffness = Annotated[
+    float, Field(ge=1e-3, le=1e12, allow_inf_nan=False), _Allowed("a number of N/m from 1e-3 to 1e12")
+]
+_Speed = Annotated[
+    float, Field(ge=1e-6, le=10.0, allow_inf_nan=False), _Allowed("a number of m/s from 1e-6 to 10")
+]
+_Cycle = Annotated[
+    float, Field(ge=0.1, le=3600.0, allow_inf_nan=False), _Allowed("a number of seconds from 0.1 to 3600")
+]
+_Length = Annotated[
+    float, Field(ge=1e-6, le=1.0, allow_inf_nan=False), _Allowed("a number of metres from 1e-6 to 1")
+]
+_Resistivity = Annotated[
+    float, Field(ge=1e-3, le=1e15, allow_inf_nan=False), _Allowed("a number of ohm/m from 1e-3 to 1e15")
+]
 _Ratio = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False), _Allowed("a number from 0 to below 1")]
 _Wires = Annotated[int, Field(ge=1, le=254), _Allowed("an integer from 1 to 254")]
 _Name = Annotated[str, Field(min_length=1, max_length=64), _Allowed("a text of 1 to 64 characters")]
@@ -73,13 +87,13 @@ class LayoutConfig(_Table):
     """Geometry of a patch: the arguments of :meth:`skinnode.PatchLayout.preset`."""
 
     preset: Annotated[Preset, _Allowed(" or ".join(get_args(Preset)))] = "staggered"
-    pitch_m: _Positive = 4e-3
-    height_m: _Positive = 2e-3
+    pitch_m: _Length = 4e-3
+    height_m: _Length = 2e-3
     upper_wires: _Wires = 10
     upper_electrodes: _Wires = 10
     lower_wires: _Wires | None = None
     lower_electrodes: _Wires | None = None
-    resistivity_ohm_per_m: _Positive = 1e7
+    resistivity_ohm_per_m: _Resistivity = 1e7
 
     def build(self) -> PatchLayout:
         """The layout. Raises ValueError where the geometry is impossible."""
@@ -153,7 +167,7 @@ class SolverConfig(_Table):
     """How resistances become displacements."""
 
     operator: Annotated[Operator, _Allowed(" or ".join(get_args(Operator)))] = "dogleg"
-    stiffness_n_per_m: _Positive | None = None
+    stiffness_n_per_m: _Stiffness | None = None
     """Stiffness of the rubber under one electrode; with it a field carries forces."""
     workers: Annotated[int | None, Field(ge=1, le=64), _Allowed("an integer from 1 to 64")] = None
     """Threads that solve patches side by side; None is one a processor core, at most one a patch."""
@@ -163,7 +177,7 @@ class SimulationConfig(_Table):
     """The scene ``vcan-sim`` plays on simulated patches: press, slide, lift, again. The host ignores it."""
 
     seed: Annotated[int, Field(ge=0), _Allowed("an integer of at least 0")] = 1
-    indenter_radius_m: _Positive = 0.04
+    indenter_radius_m: _Length = 0.04
     depth: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False), _Allowed("a number between 0 and 1")] = (
         0.1
     )
@@ -172,8 +186,8 @@ class SimulationConfig(_Table):
         float, Field(ge=0, le=2, allow_inf_nan=False), _Allowed("a number from 0 to 2")
     ] = 0.3
     """Tangential over normal load while sliding, the coefficient of friction."""
-    slide_speed_m_per_s: _Positive = 0.008
-    cycle_s: _Positive = 4.0
+    slide_speed_m_per_s: _Speed = 0.008
+    cycle_s: _Cycle = 4.0
     """Time of one press, slide and lift."""
     converter_noise: _Ratio = 3e-6
     """Standard deviation of the noise of the simulated converter, relative to the resistance."""
@@ -379,7 +393,7 @@ def _tables_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Marks below a union, as in ``_Positive | None``."""
+    """Marks below a union, as in ``_Stiffness | None``."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, _Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]
 

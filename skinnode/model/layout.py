@@ -29,9 +29,12 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
     Raises ValueError naming the argument, what it was and what it must be.
     """
     try:
+        kind = np.asarray(value).dtype.kind
+        if kind not in "biufO":  # a cast would drop the imaginary part, or read dates as numbers
+            raise TypeError(f"of {np.asarray(value).dtype}")
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: not an array of numbers ({error})") from None
+        raise ValueError(f"{name}: not an array of real numbers ({error})") from None
     wanted = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
     fits = array.ndim == len(shape) and all(
         isinstance(want, str) or want == got for want, got in zip(shape, array.shape, strict=True)

@@ -94,6 +94,7 @@ class PatchNode:
         self._rpdo = PdoRecords(self._store, od.RPDO1_PARAMETER, od.RPDO1_MAPPING, transmits=False)
         self._command = self._rpdo.read()
         self._pending_command: bytes | None = None  # of a synchronous RPDO, until the next SYNC
+        self._wrong_sync_length: int | None = None
         self._handlers: dict[int, Handler] = {}
         self._application = PatchApplication(
             layout,
@@ -189,6 +190,7 @@ class PatchNode:
         self._enter(NmtState.INITIALISING, t_ns)
         self._store.restore(*objects)
         self._emcy.reset()
+        self._wrong_sync_length = None
         self._tpdos.restore()
         self._application.reset()
         self._reload()
@@ -233,8 +235,11 @@ class PatchNode:
             return
         counted = self._store.integer(od.SYNC_COUNTER_OVERFLOW) > 0
         if len(data) != counted:
-            self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(data), counted)), t_ns)
+            if len(data) != self._wrong_sync_length:  # once, not with every SYNC
+                self._wrong_sync_length = len(data)
+                self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(data), counted)), t_ns)
             return
+        self._wrong_sync_length = None
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         if self._pending_command is not None:

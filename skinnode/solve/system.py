@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import time
 from collections.abc import Callable
 
@@ -18,7 +19,7 @@ from skinnode.solve.result import Solution
 
 def operator_code(name: str) -> int:
     """Number of an operator in the compiled code. ValueError for a name that is none."""
-    if name not in op.OPERATORS:
+    if not isinstance(name, str) or name not in op.OPERATORS:
         raise ValueError(f"operator: got {name!r}, must be one of {', '.join(op.OPERATORS)}")
     return op.OPERATORS[name]
 
@@ -28,8 +29,8 @@ def require_tolerances(tol_f: float, tol_x: float, max_steps: int) -> None:
     for name, value in (("tol_f", tol_f), ("tol_x", tol_x)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}: got {value}, must be positive and finite")
-    if max_steps < 1:
-        raise ValueError(f"max_steps: got {max_steps}, must be at least 1")
+    if not isinstance(max_steps, numbers.Integral) or max_steps < 1:
+        raise ValueError(f"max_steps: got {max_steps}, must be an integer of at least 1")
 
 
 def solve_system(
@@ -82,7 +83,7 @@ def solve_system(
             refresh_jacobian()
             jacobians += 1
         elif went == op.TRY:
-            if steps == max_steps:
+            if steps >= max_steps:
                 went = op.MAX_STEPS
                 break
             steps += 1

@@ -212,13 +212,12 @@ class Tracker:
         """(U, K) deviations and the smallest of them."""
         try:
             noise = np.broadcast_to(np.asarray(relative_noise, np.float64), self.layout.shape)
-        except (TypeError, ValueError):
-            shape = np.shape(relative_noise)
-            raise ValueError(
-                f"relative_noise: got shape {shape}, must be a number or {self.layout.shape}"
-            ) from None
+        except (TypeError, ValueError) as error:
+            got = f"got shape {np.shape(relative_noise)}" if np.ndim(relative_noise) else f"{error}"
+            raise ValueError(f"relative_noise: {got}, must be a number or {self.layout.shape}") from None
         if not ((noise > 0) & (noise < np.inf)).all():
-            raise ValueError("relative_noise: must be positive and finite everywhere")
+            worst = noise[~((noise > 0) & (noise < np.inf))][0]
+            raise ValueError(f"relative_noise: got {worst}, must be positive and finite everywhere")
         return noise, float(noise.min())
 
     def _checked_mask(self, valid: ArrayLike) -> NDArray[np.bool_]:

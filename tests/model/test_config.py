@@ -113,12 +113,12 @@ def test_example_says_the_defaults() -> None:
         (
             ["patches", 0, "layout", "height_m"],
             0,
-            "patches[0].layout.height_m: got 0, allowed: a positive number",
+            "patches[0].layout.height_m: got 0, allowed: a number of metres from 1e-6 to 1",
         ),
         (
             ["patches", 0, "layout", "height_m"],
             float("nan"),
-            "patches[0].layout.height_m: got nan, allowed: a positive number",
+            "patches[0].layout.height_m: got nan, allowed: a number of metres from 1e-6 to 1",
         ),
         (
             ["patches", 0, "layout", "lower_wires"],

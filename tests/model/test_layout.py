@@ -100,7 +100,7 @@ def test_scale_of_a_wire_with_one_electrode_is_its_clearance():
             (np.ones((1, 1, 3)), np.zeros((1, 1, 3)), -1.0),
             "resistivity_ohm_per_m: got -1.0, must be positive",
         ),
-        ((["a"], np.zeros((1, 1, 3))), "upper_m: not an array of numbers"),
+        ((["a"], np.zeros((1, 1, 3))), "upper_m: not an array of real numbers"),
     ],
 )
 def test_bad_geometry_is_named(arguments, complaint):
@@ -120,3 +120,9 @@ def test_bad_geometry_is_named(arguments, complaint):
 def test_bad_presets_are_named(options, complaint):
     with pytest.raises(ValueError, match=complaint):
         sk.PatchLayout.preset(**{"name": "staggered"} | options)
+
+
+@pytest.mark.parametrize("value", [1j * np.ones((2, 2, 3)), np.zeros((2, 2, 3), "datetime64[s]")])
+def test_what_a_cast_would_change_is_refused(value):
+    with pytest.raises(ValueError, match="upper_m: not an array of real numbers"):
+        sk.PatchLayout(value, np.zeros((6, 2, 3)))

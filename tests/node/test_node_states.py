@@ -247,6 +247,14 @@ class TestEmergencies:
         assert desk.read(0x1001, 0) == 0  # over as soon as told
         assert desk.read(0x1003, 0) == 2
 
+    def test_sync_of_one_wrong_length_is_told_once(self, operational) -> None:
+        """A node that was reset hears the SYNC of its master with a counter it knows nothing of, for ever."""
+        desk = operational
+        told = [desk.frame(0x80) for _ in range(5)]
+        assert told == [[(0x084, "40 82 11 00 01 00 00 00")], [], [], [], []]
+        desk.frame(0x80, "01")
+        assert desk.frame(0x80) == [(0x084, "40 82 11 00 01 00 00 00")]
+
     def test_history_is_the_newest_first_and_can_be_cleared(self, operational) -> None:
         desk = operational
         for length in range(2, 9):
@@ -263,8 +271,8 @@ class TestEmergencies:
         desk = operational
         desk.write(0x1015, 0, 100, 2)  # 10 ms
         start_ns = desk.t_ns
-        for _ in range(3):
-            desk.node.on_frame(0x80, b"", desk.t_ns)
+        for length in (0, 2, 3):
+            desk.node.on_frame(0x80, bytes(length), desk.t_ns)
         desk.run(50)
         assert [t_ns - start_ns for can_id, _, t_ns in desk.sent if can_id == 0x084] == [
             0,

@@ -203,3 +203,15 @@ def test_bad_arguments_are_named(options, complaint):
     arguments = {"residual": lambda x: x, "jacobian": lambda x: np.eye(x.size), "x0": [1.0]} | options
     with pytest.raises(ValueError, match=complaint):
         sk.solve_system(**arguments)
+
+
+@pytest.mark.parametrize("max_steps", [0, 2.5, np.nan])
+def test_a_number_of_steps_is_an_integer(max_steps):
+    with pytest.raises(ValueError, match="max_steps: got"):
+        sk.solve_system(lambda x: x, lambda x: np.eye(1), [1.0], max_steps=max_steps)
+
+
+def test_complex_functions_are_refused():
+    """Their real part has roots that they have not."""
+    with pytest.raises(ValueError, match="real numbers"):
+        sk.solve_system(lambda x: x**2 - 2 + 1j, lambda x: np.array([[2 * x[0]]]), [5.0])

@@ -269,7 +269,7 @@ def test_frames_given_are_not_written_to(staggered, stream):
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        ({"relative_noise": 0.0}, "relative_noise: must be positive and finite"),
+        ({"relative_noise": 0.0}, "relative_noise: got 0.0, must be positive and finite"),
         ({"relative_noise": np.ones(7)}, r"relative_noise: got shape \(7,\), must be a number or \(10, 30\)"),
         ({"operator": "simplex"}, "operator: got 'simplex'"),
         ({"stiffness_n_per_m": -1.0}, "stiffness_n_per_m: got -1.0"),

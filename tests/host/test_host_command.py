@@ -167,6 +167,17 @@ def test_wrong_length_is_one_line_and_status_2(multicast: tuple[Path, BusConfig]
     assert host.lines[-1] == "nodes are pre-operational"
 
 
+def test_patches_that_vanish_are_named_and_status_1(multicast: tuple[Path, BusConfig]) -> None:
+    path, _ = multicast
+    with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path)]) as host:
+        assert host.says(" s  thumb operational")
+        simulator.end(signal.SIGKILL)
+        assert host.says("thumb lost")
+        assert host.end(signal.SIGINT) == (1, "")
+    for patch in ("thumb", "index"):
+        assert f"fault: {patch}: lost at the end" in host.lines
+
+
 def run(*arguments: str) -> int:
     """Exit status of ``skinnode host`` in this process."""
     with pytest.raises(SystemExit) as caught:

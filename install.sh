@@ -1,12 +1,17 @@
 #!/bin/sh
 # install.sh [EXTRA]: make the virtual environment .venv beside this file and install skinnode into it.
 #   sh install.sh          what a robot needs, and plots
-#   sh install.sh test     the above, editable, with everything the tests use
+#   sh install.sh bench    what a robot needs, and Ceres to measure against
+#   sh install.sh test     the first, editable, with everything the tests use
 # Needs Python 3.11 or newer (PYTHON=... chooses one). On a Debian without the venv module it installs that first.
 set -eu
 cd "$(dirname "$0")"
 python=${PYTHON:-python3}
 extra=${1:-plot}
+case $extra in
+    plot | bench | test) ;;
+    *) echo "install.sh: got $extra, allowed: plot, bench or test" >&2; exit 2 ;;
+esac
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
     echo "install.sh: $("$python" --version 2>&1) at $python, needed: Python 3.11 or newer (set PYTHON=...)" >&2
@@ -24,5 +29,5 @@ if [ ! -x .venv/bin/pip ]; then
 fi
 case $extra in
     test) .venv/bin/pip install --quiet --editable '.[test]' ;;
-    *) .venv/bin/pip install --quiet ".[$extra]" ;;
+    plot | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
 esac

@@ -22,8 +22,8 @@ from rich.table import Table
 from skinnode import jit
 from skinnode.cli._files import plain
 from skinnode.cli._plot import PatchTrace
-from skinnode.cli._score import Score, Scorer
-from skinnode.cli._view import BusView, PatchView, render
+from skinnode.cli._score import EXCESS_LIMIT, Score, Scorer
+from skinnode.cli._view import BusView, PatchView, panels_in, render
 from skinnode.host import Host
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.frames import FieldFrame
@@ -119,7 +119,7 @@ class _Watch:
             name=self.config.name,
             health=health,
             displacement_m=None if frame is None else frame.displacement_m,
-            peak_std_m=math.nan if frame is None else float(frame.displacement_std_m.max()),
+            depth_std_m=math.nan if frame is None else _depth_std_m(frame),
             error_m=self.history[-1][2] if self.history else math.nan,
             rate_hz=self.rate_hz,
             torn=torn,
@@ -132,6 +132,12 @@ class _Watch:
         _, truth, decoded = self.deepest
         rest = self.scorer.layout.upper_m
         return PatchTrace(self.config.name, rest, time_s, depth_m, error_m, reported_m, truth, decoded)
+
+
+def _depth_std_m(frame: FieldFrame) -> float:
+    """Reported deviation of the depth of the deepest electrode."""
+    deepest = frame.displacement_m[..., 2].argmin()
+    return float(frame.displacement_std_m[..., 2].flat[deepest])
 
 
 class _Progress:
@@ -166,7 +172,8 @@ class _Progress:
                 for watch in self._watches
             ]
             bus = BusView(elapsed_s, self._seconds, load, received, lost, float(p50), float(p99))
-            self._live.update(render(views, bus, self._full_scale_m), refresh=True)
+            room = panels_in(self._console.width, self._console.height)
+            self._live.update(render(views, bus, self._full_scale_m, room), refresh=True)
             return
         self._due_s = elapsed_s + _LINE_S
         errors = [watch.history[-1] for watch in self._watches if watch.history]
@@ -347,15 +354,24 @@ def print_report(console: Console, report: Report) -> None:
         f"{report.scan_rate_hz:.1f} scans/s a patch; a 1 Mbit/s bus would have been loaded to {load}",
         soft_wrap=True,
     )
-    shares = [100 * row.score.relative_error for row in report.patches]
-    console.print(
-        f"error in the deepest scan: {min(shares):.1f} to {max(shares):.1f} % of the displacement field",
-        soft_wrap=True,
-    )
+    pressed = [row.score for row in report.patches if row.score.deepest_m > 10 * row.score.reported_rms_m]
+    if pressed:
+        shares = [100 * score.relative_error for score in pressed]
+        console.print(
+            f"error in the deepest scan: {min(shares):.1f} to {max(shares):.1f} % of the displacement field",
+            soft_wrap=True,
+        )
+    else:
+        console.print("nothing was pressed in this time; give it more --seconds")
     for fault in report.faults:
         console.print(f"[bold red]fault:[/] {fault}")
     if not report.faults:
-        console.print("[green]no scan torn, no frame lost, every error within its reported uncertainty[/]")
+        worst = max(row.score.worst_deviations for row in report.patches)
+        console.print(
+            "[green]no scan torn, no frame lost, errors as large as reported[/] "
+            f"(RMS within {EXCESS_LIMIT} of it, worst coordinate {worst:.1f} deviations)",
+            soft_wrap=True,
+        )
 
 
 def as_json(report: Report) -> dict[str, Any]:

@@ -37,7 +37,8 @@ class PatchView:
     health: str
     displacement_m: Float | None
     """(U, N, 3)"""
-    peak_std_m: float
+    depth_std_m: float
+    """Reported deviation of the depth of the deepest electrode."""
     error_m: float
     """RMS error of the last field against the true deformation."""
     rate_hz: float
@@ -124,9 +125,9 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
     else:
         depth, shear = float(-patch.displacement_m[..., 2].min()), shear_arrow(patch.displacement_m)
     rows.add_row("depth", _micro(depth))
-    rows.add_row("±", _micro(patch.peak_std_m))
+    rows.add_row("±", _micro(patch.depth_std_m))
     rows.add_row("shear", shear)
-    rows.add_row("error", _micro(patch.error_m))
+    rows.add_row("err RMS", _micro(patch.error_m))
     rows.add_row("rate", f"{patch.rate_hz:.1f} Hz")
     good = patch.health == "operational" and patch.torn == 0
     return Panel(
@@ -138,8 +139,16 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
     )
 
 
-def render(patches: Sequence[PatchView], bus: BusView, full_scale_m: float) -> RenderableType:
-    """The whole screen. ``full_scale_m`` is the depth drawn brightest."""
+def panels_in(columns: int, lines: int) -> int:
+    """How many patches a terminal of this size has room for."""
+    across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 7)
+    return max(1, across) * max(1, down)
+
+
+def render(
+    patches: Sequence[PatchView], bus: BusView, full_scale_m: float, room: int = 1000
+) -> RenderableType:
+    """The whole screen. ``full_scale_m`` is the depth drawn brightest, ``room`` the most patches to draw."""
     line = Text.assemble(
         f" {bus.elapsed_s:.1f} of {bus.seconds:g} s   ",
         ("bus load ", "dim"),
@@ -155,5 +164,7 @@ def render(patches: Sequence[PatchView], bus: BusView, full_scale_m: float) -> R
         ("bright = ", "dim"),
         f"{1e6 * full_scale_m:.0f} µm deep",
     )
-    panels = Columns([_patch_panel(p, full_scale_m) for p in patches], padding=(0, 0))
+    panels = Columns([_patch_panel(p, full_scale_m) for p in patches[:room]], padding=(0, 0))
+    if len(patches) > room:
+        line.append(f"   and {len(patches) - room} more patches", style="dim")
     return Group(panels, line, timing)

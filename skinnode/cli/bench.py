@@ -26,6 +26,9 @@ def kernel(json: JsonFile = None, rounds: Rounds = 31) -> None:
     typer.echo(f"{'':28}{'':22}{'µs a wire':>10}{'ratio':>8}")
     for row in figures["rows"]:
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
+    typer.echo(
+        "A step has its evaluations in it; the trust radius is held short, so that it has to be searched."
+    )
     _write(json, figures)
 
 
@@ -41,8 +44,9 @@ def solve(json: JsonFile = None, rounds: Rounds = 31) -> None:
     for row in figures["rows"]:
         spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
         typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
+    typer.echo("ratio: to skinnode dogleg; tolerance: the loosest given to the solver that reaches 1e-9.")
     if not any("pyceres" in row["who"] for row in figures["rows"]):
-        typer.echo("Ceres is not installed: pip install 'skinnode[bench]' measures it too.")
+        typer.echo("Ceres is not installed: with pip install pyceres it is measured too.")
     _write(json, figures)
 
 

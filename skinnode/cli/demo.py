@@ -38,8 +38,8 @@ def demo(
     """Press simulated patches and decode them from real CANopen traffic.
 
     Each patch is a CANopen node on an embedded virtual bus; a spherical indenter presses and slides, the
-    host gathers the PDOs and solves. Exit status 1 if a scan was torn, a frame lost, or an error lies above
-    the uncertainty that was reported with it.
+    host gathers the PDOs and solves. Exit status 1 if a scan was torn, a frame lost, or errors lie above the
+    uncertainty reported with them: RMS over the run above 1.15 of it, or a coordinate beyond 6 deviations.
     """
     import json
 

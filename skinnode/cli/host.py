@@ -183,16 +183,17 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
         "chunks_lost": new.assembler.chunks_lost,
         "trusted": field.trusted if field is not None else None,
         "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
-        "deepest_m": _deepest_m(field),
+        **_deepest(field),
     }
 
 
-def _deepest_m(field: FieldFrame | None) -> float | None:
-    """Deepest displacement into the skin; a press moves electrodes to −z."""
+def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
+    """Depth of the deepest electrode and its deviation; a press moves electrodes to −z."""
     if field is None:
-        return None
-    deepest = -float(field.displacement_m[..., 2].min())
-    return deepest if math.isfinite(deepest) else None
+        return {"deepest_m": None, "deepest_std_m": None}
+    z = field.displacement_m[..., 2]
+    figures = {"deepest_m": -z.min(), "deepest_std_m": field.displacement_std_m[..., 2].flat[z.argmin()]}
+    return {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
@@ -209,29 +210,35 @@ class _Report(Protocol):
 
 
 class _TextReport:
-    """A line a second."""
+    """A line for the bus and one a patch, every second."""
 
     def note(self, text: str) -> None:
         print(text, flush=True)
 
     def second(self, second: _Second) -> None:
-        patches = "  ".join(_patch_text(name, facts) for name, facts in second.patches.items())
         buses = "  ".join(
             f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
             for name, facts in second.buses.items()
         )
         latency = ""
         if second.latency_p50_ms is not None:
-            latency = f"  latency {second.latency_p50_ms:.1f} ms, p99 {second.latency_p99_ms:.1f} ms"
-        print(f"{second.elapsed_s:6.1f} s  {patches}  {buses}{latency}", flush=True)
+            latency = f"  latency {second.latency_p50_ms:.1f}, p99 {second.latency_p99_ms:.1f} ms"
+        lines = [f"{second.elapsed_s:6.1f} s  {buses}{latency}"]
+        lines += [f"          {_patch_text(name, facts)}" for name, facts in second.patches.items()]
+        print("\n".join(lines), flush=True)
 
 
 def _patch_text(name: str, facts: Mapping[str, object]) -> str:
-    deepest_m = facts["deepest_m"]
-    deepest = f" {deepest_m * 1e6:.0f} µm" if isinstance(deepest_m, float) else ""
-    worst = "".join(f" {facts[key]} {key}" for key in ("torn", "missed", "skipped") if facts[key])
-    doubt = " untrusted" if facts["trusted"] is False else ""
-    return f"{name} {facts['condition']} {facts['solved']} fields{deepest}{worst}{doubt}"
+    deepest_m, std_m = facts["deepest_m"], facts["deepest_std_m"]
+    deepest = ""
+    if facts["solved"] and isinstance(deepest_m, float):
+        std = f" ± {std_m * 1e6:.1f}" if isinstance(std_m, float) else ""
+        deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
+    worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "missed", "skipped") if facts[key])
+    doubt = "  untrusted" if facts["trusted"] is False else ""
+    return (
+        f"{name} {facts['condition']}  {facts['solved']} fields{deepest}{doubt}{worst and '  in all' + worst}"
+    )
 
 
 class _JsonReport:

@@ -347,7 +347,9 @@ def _dotted(location: tuple[int | str, ...]) -> str:
 
 def _first_error(error: ValidationError, where: str) -> ConfigError:
     """The first of pydantic's errors in the words of this project."""
-    first = error.errors()[0]
+    found = error.errors()
+    # A misspelt key that is required is missing as well; its misspelling says more.
+    first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, ConfigError):  # from a check of ours that knows its key

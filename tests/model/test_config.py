@@ -290,3 +290,9 @@ def test_options_do_not_change() -> None:
     hand = parse_hand(minimal())
     with pytest.raises(ValueError, match="frozen"):
         hand.name = "other"
+
+
+def test_a_misspelt_required_key_is_named_as_such() -> None:
+    table = {"buses": [{}], "patches": [{"name": "palm", "node_idd": 3}]}
+    with pytest.raises(ConfigError, match=r"patches\[0\]\.node_idd: got 3, .* \(did you mean node_id\?\)"):
+        parse_hand(table)

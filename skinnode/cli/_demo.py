@@ -25,6 +25,7 @@ from skinnode.cli._plot import PatchTrace
 from skinnode.cli._score import EXCESS_LIMIT, Score, Scorer
 from skinnode.cli._view import BusView, PatchView, panels_in, render
 from skinnode.host import Host
+from skinnode.host.pipeline import LaneStats
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
@@ -49,6 +50,8 @@ class PatchReport:
     scans_skipped: int
     """Overtaken by a newer scan before a solver was free."""
     scans_torn: int
+    frames_lost: int
+    """PDOs the node sent that did not become part of a scan."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -232,6 +235,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
             scans_solved=stats.patches[name].solved,
             scans_skipped=stats.patches[name].skipped,
             scans_torn=stats.patches[name].assembler.scans_torn,
+            frames_lost=nodes[name].pdos_sent - _accepted(stats.patches[name]),
             latency_p50_ms=_percentile(watch.latency_ms, 50),
             latency_p99_ms=_percentile(watch.latency_ms, 99),
             score=watch.scorer.score(),
@@ -239,9 +243,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         for name, watch in watches.items()
     )
     sent = sum(node.pdos_sent for node in nodes.values())
-    received = sum(
-        lane.assembler.chunks_accepted + lane.assembler.summaries_accepted for lane in stats.patches.values()
-    )
+    received = sum(map(_accepted, stats.patches.values()))
     report = Report(
         seconds=elapsed_s,
         scan_rate_hz=1.0 / hand.sync.period_s,
@@ -298,6 +300,10 @@ def _losses(host: Host) -> int:
     return dropped + sum(lane.assembler.chunks_lost for lane in stats.patches.values())
 
 
+def _accepted(lane: LaneStats) -> int:
+    return lane.assembler.chunks_accepted + lane.assembler.summaries_accepted
+
+
 def _percentile(values: Sequence[float], percent: float) -> float:
     return float(np.percentile(values, percent)) if values else math.nan
 
@@ -327,10 +333,11 @@ def print_report(console: Console, report: Report) -> None:
     table.add_column("patch", vertical="bottom")
     for heading in (
         "scans sent/\nsolved/torn",
+        "PDOs\nlost",
         "deepest\nµm",
         "error\nRMS µm",
         "reported\n± µm",
-        "codes allow\n± µm",
+        "codes\n± µm",
         "in 95 %\ninterval",
         "last frame to field\np50 / p99 ms",
     ):
@@ -340,6 +347,7 @@ def print_report(console: Console, report: Report) -> None:
         table.add_row(
             row.patch,
             f"{row.scans_sent}/{row.scans_solved}/{row.scans_torn}",
+            f"{row.frames_lost}",
             f"{1e6 * score.deepest_m:.0f}",
             f"{1e6 * score.error_rms_m:.2f}",
             f"{1e6 * score.reported_rms_m:.2f}",

@@ -66,7 +66,7 @@ def test_a_lost_frame_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(CanPort, "send", lossy)
     report = _demo.play(demo_hand(1, 1), 1.0, quiet()).report
-    assert report.frames_lost == 1
+    assert report.frames_lost == report.patches[0].frames_lost == 1
     assert report.patches[0].scans_torn == 1
     assert any("1 frame" in fault for fault in report.faults)
     assert any("torn" in fault for fault in report.faults)

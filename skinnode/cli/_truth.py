@@ -1,0 +1,259 @@
+"""The truth that benchmarks hold the solvers against, made without any of the solvers' assumptions.
+
+Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
+they have no grid and come from no prior. Resistances come from the NumPy reference model, or from
+:class:`Skin`, which can be what the solver does not expect: electrodes of finite size, rubber whose
+resistivity depends on strain, another thickness, a contact resistance in series. Converters spoil them as
+real ones do.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.elastic import HertzContact, Rubber
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.wire.codec import CodeScale, decode, encode
+
+RUBBER: Final = Rubber()
+EXACT_NOISE: Final = 1e-9
+"""Relative deviation told to a tracker whose data has no noise at all: the tolerance it solves to."""
+RING: Final = 4
+"""Points on the rim of a finite electrode. With two rings of them half a step apart, 16 distances a pair."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """A sphere at its deepest; lengths in metres. ``share`` of the methods is the share of the depth."""
+
+    center_m: tuple[float, float]
+    radius_m: float
+    depth_m: float
+    traction_ratio: tuple[float, float] = (0.0, 0.0)
+    shear_only: bool = False
+    """The traction along the surface alone: the contact with friction less the same without."""
+
+    def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
+        """Closed forms with their sign."""
+        depth = share * self.depth_m
+        full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
+        if not self.shear_only:
+            return ((1, full),)
+        return ((1, full), (-1, HertzContact(RUBBER, self.radius_m, depth, self.center_m)))
+
+    def displacement_m(self, points_m: Float, share: float) -> Float:
+        """(P, 3) at surface points (P, 2)."""
+        moved = np.zeros((len(points_m), 3))
+        for sign, contact in self.contacts(share):
+            moved += sign * contact.displacement_m(points_m)
+        return moved
+
+    def force_n(self, share: float) -> Float:
+        """(3,) load on the rubber."""
+        force = np.zeros(3)
+        for sign, contact in self.contacts(share):
+            force += sign * np.array(contact.force_n)
+        return force
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A real patch, of which the solver knows only ``layout``.
+
+    Args:
+        layout: what the solver is told.
+        height: true height of the upper layer as a share of the layout's.
+        electrode: radius of every electrode, pitches; 0 is the point that the solver assumes.
+        strain: β of ρ d (1 + β (d/d₀ − 1)), d₀ the distance at rest.
+        series: contact resistance in series with each pair of wires, as a share of its R₀.
+        points_m: (U, N, 2) place of the electrodes along the surface, where it is not flat.
+        axes: (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
+    """
+
+    layout: PatchLayout
+    height: float = 1.0
+    electrode: float = 0.0
+    strain: float = 0.0
+    series: float = 0.0
+    points_m: Float | None = field(default=None)
+    axes: Float | None = field(default=None)
+
+    @functools.cached_property
+    def body(self) -> PatchLayout:
+        """The layout as it really is."""
+        if self.height == 1.0:
+            return self.layout
+        upper = self.layout.upper_m * np.array([1.0, 1.0, self.height])
+        return PatchLayout(upper, self.layout.lower_m, self.layout.resistivity_ohm_per_m)
+
+    def displacement_m(self, presses: tuple[Press, ...], share: float) -> Float:
+        """(U, N, 3) of the electrodes, presses superposed."""
+        points = self.layout.upper_m[..., :2] if self.points_m is None else self.points_m
+        moved = np.zeros((points.shape[0] * points.shape[1], 3))
+        for press in presses:
+            moved += press.displacement_m(points.reshape(-1, 2), share)
+        moved = moved.reshape(self.layout.upper_m.shape)
+        return moved if self.axes is None else np.asarray(np.einsum("una,unab->unb", moved, self.axes))
+
+    @functools.cached_property
+    def rest_ohm(self) -> Float:
+        """(U, K) at rest, without noise: the baseline that the solver gets."""
+        return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
+
+    def resistance_ohm(self, displacement_m: Float) -> Float:
+        """(U, K)"""
+        upper = self.body.upper_m + displacement_m
+        if self.strain:
+            found = self._strained(upper)
+        elif self.electrode:
+            found = self._finite(upper)
+        else:
+            found = resistance_ohm(self.body, upper)
+        return found if not self.series else found + self.series * self._rest_without_series
+
+    @functools.cached_property
+    def _rest_without_series(self) -> Float:
+        return resistance_ohm(self.body, self.body.upper_m)
+
+    @functools.cached_property
+    def _rest_distance(self) -> Float:
+        return self._distance(self.body.upper_m)
+
+    def _distance(self, upper: Float) -> Float:
+        """(U, K, M, N)"""
+        gap = upper[:, None, None, :, :] - self.body.lower_m[None, :, :, None, :]
+        return np.asarray(np.sqrt(np.einsum("ukmna,ukmna->ukmn", gap, gap)))
+
+    def _strained(self, upper: Float) -> Float:
+        distance = self._distance(upper)
+        path = distance * (1.0 + self.strain * (distance / self._rest_distance - 1.0))
+        return np.asarray(self.layout.resistivity_ohm_per_m / (1.0 / path).sum(axis=(2, 3)))
+
+    def _finite(self, upper: Float) -> Float:
+        """Potential of the rims of the lower electrodes, averaged over the rims of the upper ones."""
+        radius = self.electrode * self.layout.pitch_m
+        rims = []
+        for points, turned in ((upper, 0.0), (self.body.lower_m, 0.5)):
+            angle = 2 * np.pi * (np.arange(RING) + turned) / RING
+            rim = radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+            rims.append((points[:, :, None, :] + rim).reshape(-1, 3))
+        above, below = rims
+        square = (above**2).sum(axis=1)[:, None] + (below**2).sum(axis=1) - 2 * above @ below.T
+        shape = (upper.shape[0], upper.shape[1] * RING, self.layout.shape[1], -1)
+        near = (1.0 / np.sqrt(square)).reshape(shape).sum(axis=(1, 3)) / RING**2
+        return np.asarray(self.layout.resistivity_ohm_per_m / near)
+
+
+@dataclass(frozen=True)
+class Converter:
+    """Noise of every reading (``sigma``, relative) and, where ``bits`` is not 0, codes of R/R₀.
+
+    Codes are as on the wire: from ``lo`` to ``hi``, with three reserved; 16 and 24 bits are written and read
+    by the wire's own codec.
+    """
+
+    sigma: float = 0.0
+    bits: int = 0
+    lo: float = 0.25
+    hi: float = 1.25
+
+    @property
+    def exact(self) -> bool:
+        """Whether a reading is the resistance itself."""
+        return self.sigma == 0.0 and self.bits == 0
+
+    def read(
+        self, resistance: Float, rest: Float, rng: np.random.Generator
+    ) -> tuple[Float, NDArray[np.bool_], Float]:
+        """Resistances, which of them are valid, and the relative deviation of each, all of one shape."""
+        if self.exact:
+            return resistance, np.ones(resistance.shape, bool), np.full(resistance.shape, EXACT_NOISE)
+        noisy = resistance * (1.0 + self.sigma * rng.standard_normal(resistance.shape))
+        noise = np.full(resistance.shape, self.sigma)
+        if not self.bits:
+            return noisy, np.ones(resistance.shape, bool), noise
+        steps = (1 << self.bits) - 4
+        step = (self.hi - self.lo) / steps
+        if self.bits in (16, 24):
+            scale = CodeScale(self.bits, self.lo, self.hi)
+            decoded, valid = decode(encode(noisy, rest, scale), rest, scale)
+        else:
+            code = np.rint((noisy / rest - self.lo) / step)
+            valid = (code >= 0) & (code <= steps)
+            decoded = np.where(valid, (self.lo + code * step) * rest, np.nan)
+        with np.errstate(invalid="ignore"):
+            rounding = step / np.sqrt(12.0) * rest / np.where(valid, decoded, rest)
+        return decoded, valid, np.hypot(noise, rounding)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """What a solver gets, and the truth beside it."""
+
+    frames_ohm: Float
+    """(T, U, K); not finite where not valid."""
+    valid: NDArray[np.bool_]
+    """(T, U, K)"""
+    noise: Float
+    """(T, U, K) relative deviation of the converter."""
+    truth_m: Float
+    """(T, U, N, 3) displacement; NaN in frames that no skin can give."""
+    force_n: Float
+    """(T, 3) sum of all loads; NaN as above."""
+    presses: tuple[Press, ...] = ()
+
+
+def stream(
+    skin: Skin,
+    presses: tuple[Press, ...],
+    shares: Float,
+    converter: Converter,
+    rng: np.random.Generator,
+    gain: Float | None = None,
+) -> Stream:
+    """The press taken at ``shares`` (T,) of its depth; ``gain`` (T, U, K) or broadcast to it multiplies R."""
+    truth = np.stack([skin.displacement_m(presses, share) for share in shares])
+    resistance = np.stack([skin.resistance_ohm(moved) for moved in truth])
+    if gain is not None:
+        resistance = resistance * gain
+    frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
+    force = np.array([sum((press.force_n(share) for press in presses), np.zeros(3)) for share in shares])
+    return Stream(frames, valid, noise, truth, force, presses)
+
+
+def random_press(
+    rng: np.random.Generator,
+    layout: PatchLayout,
+    depth: float,
+    *,
+    radius: tuple[float, float] = (1.5, 4.0),
+    shear: float = 0.3,
+    margin: float = 2.0,
+    where: Literal["inside", "edge", "half off"] = "inside",
+) -> Press:
+    """A sphere of ``radius`` pitches (from, to) pressed in by ``depth`` heights, friction up to ``shear``.
+
+    ``margin``: pitches between its centre and the border of the patch; on the ``edge`` the centre lies on
+    the border in x, ``half off`` half a contact radius outside.
+    """
+    pitch = layout.pitch_m
+    points = layout.upper_m[..., :2].reshape(-1, 2)
+    low, high = points.min(axis=0), points.max(axis=0)
+    inset = np.minimum(margin * pitch, 0.4 * (high - low))
+    center = rng.uniform(low + inset, high - inset)
+    sphere = rng.uniform(*radius) * pitch
+    sunk = depth * layout.height_m
+    if where != "inside":
+        right = rng.random() < 0.5
+        outside = 0.0 if where == "edge" else 0.5 * np.sqrt(sphere * sunk)
+        center[0] = high[0] + outside if right else low[0] - outside
+    angle = rng.uniform(0, 2 * np.pi)
+    friction = rng.uniform(0, shear)
+    traction = (float(friction * np.cos(angle)), float(friction * np.sin(angle)))
+    return Press((float(center[0]), float(center[1])), float(sphere), float(sunk), traction)

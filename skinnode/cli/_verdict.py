@@ -1,0 +1,165 @@
+"""Accurate, flagged or wrong: holds solved wires against the truth.
+
+A wire of a frame is
+
+flagged    its status is not CONVERGED: nothing was claimed
+accurate   CONVERGED, every coordinate within what was reported
+wrong      CONVERGED with a coordinate in error by more than it may be, or not finite under any status
+
+With noise an error may reach 5 reported deviations, and chance alone puts 6e-7 of all coordinates beyond.
+So that a long run is not condemned by chance, nor a fault excused by it, two things must hold in each row,
+both at a probability of 1e-4 for an honest Gaussian:
+
+- no coordinate beyond z(n), the deviations that one of n independent coordinates exceeds with 1e-4; no less
+  than 5. z is 5.7 for 9,000 coordinates, 6.4 for 1e6 (Bonferroni's bound: correlation only makes it safer)
+- among the seeds, which are independent whatever the coordinates are, no more with one beyond 5 than a
+  binomial allows whose probability is the expected number of such coordinates a seed (again a bound)
+
+What is wrong by the second and not by the first counts in full: then every wire beyond 5 is wrong. With
+exact data nothing is left to chance: the limit is 5 reported deviations or 1e-6 of the wire's largest
+displacement, whichever is more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float
+
+LIMIT: Final = 5.0
+"""Reported deviations an error may reach."""
+CHANCE: Final = 1e-4
+"""Probability that an honest row is called wrong: some 350 rows, one false alarm in 30 runs."""
+EXACT_SHARE: Final = 1e-6
+"""Of the wire's largest displacement: tolerance with exact data."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """What a method made of the frames it was asked for."""
+
+    displacement_m: Float
+    """(F, U, N, 3)"""
+    std_m: Float
+    """(F, U, N, 3) reported deviation; a fifth of an error estimate where that is given instead."""
+    converged: NDArray[np.bool_]
+    """(F, U)"""
+
+
+def beyond(deviations: float) -> float:
+    """Probability that a normal variable lies farther than this from its mean."""
+    return math.erfc(deviations / math.sqrt(2.0))
+
+
+def limit_of(coordinates: int) -> float:
+    """z(n) of the module's docstring."""
+    from scipy.special import ndtri
+
+    if coordinates == 0:
+        return LIMIT
+    return max(LIMIT, float(-ndtri(0.5 * CHANCE / coordinates)))
+
+
+def allowed_seeds(coordinates: int, seeds: int) -> int:
+    """Most seeds with a coordinate beyond 5 that chance explains."""
+    from scipy.stats import binom
+
+    if seeds == 0:
+        return 0
+    return int(binom.isf(CHANCE, seeds, min(1.0, coordinates / seeds * beyond(LIMIT))))
+
+
+@dataclass
+class Tally:
+    """One row: a case solved by one method over the seeds."""
+
+    exact: bool
+    seeds: int = 0
+    wires: int = 0
+    flagged: int = 0
+    time_s: float = 0.0
+    _coordinates: int = 0
+    _errors: list[float] = field(default_factory=list)
+    _reported: list[float] = field(default_factory=list)
+    _worst_error: float = math.nan
+    _deviations: list[tuple[float, int, int, int]] = field(default_factory=list)
+    """(deviations, seed, frame, wire) of every wire beyond 5; inf for one that is not finite."""
+
+    def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
+        """``truth_m``: (F, U, N, 3), of the frames that were solved; frames of NaN are not held to it."""
+        self.seeds += 1
+        kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
+        truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]
+        converged = solved.converged[kept]
+        finite = np.isfinite(moved).all(axis=(2, 3)) & ~np.isnan(std).any(axis=(2, 3))
+        self.wires += converged.size
+        self.flagged += int((~converged & finite).sum())
+        with np.errstate(all="ignore"):
+            error = np.abs(moved - truth_m)
+            floor = 0.0
+            if self.exact:
+                floor = EXACT_SHARE / LIMIT * np.abs(truth_m).max(axis=(2, 3), keepdims=True)
+            ratio = np.where(error == 0.0, 0.0, error / np.maximum(std, floor)).max(axis=(2, 3))
+        ratio = np.where(finite, np.where(converged, ratio, 0.0), np.inf)
+        self._coordinates += int((converged & finite).sum()) * truth_m[0, 0].size
+        for frame, wire in np.argwhere(ratio > LIMIT).tolist():
+            self._deviations.append((float(ratio[frame, wire]), seed, int(kept[frame]), wire))
+        self._shares(np.where((converged & finite)[..., None, None], error, np.nan), std, truth_m)
+
+    def _shares(self, error: Float, std: Float, truth: Float) -> None:
+        """Error and deviation of the converged wires as shares of the displacement, in the deepest frame;
+        the worst error of any frame, as a share of the deepest one's displacement."""
+        deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
+        used = np.isfinite(error[deepest])
+        if used.any():
+            size = float(np.linalg.norm(truth[deepest][used]))
+            if size > 0:
+                self._errors.append(float(np.linalg.norm(error[deepest][used])) / size)
+                self._reported.append(float(np.linalg.norm(std[deepest][used])) / size)
+        each = np.sqrt(np.nansum(error**2, axis=(1, 2, 3)))
+        worst = float(each.max()) / float(np.linalg.norm(truth[deepest]))
+        if np.isfinite(error).any():
+            self._worst_error = float(np.fmax(self._worst_error, worst))
+
+    def row(self) -> dict[str, Any]:
+        """The figures, with the verdict."""
+        limit = LIMIT if self.exact else limit_of(self._coordinates)
+        hit = {seed for _, seed, _, _ in self._deviations}
+        by_count = self.exact or len(hit) > allowed_seeds(self._coordinates, self.seeds)
+        wrong = [found for found in self._deviations if by_count or found[0] > limit]
+        worst = max(self._deviations, default=None)
+        return {
+            "seeds": self.seeds,
+            "wires": self.wires,
+            "median_error": float(np.median(self._errors)) if self._errors else math.nan,
+            "worst_error": self._worst_error,
+            "reported": float(np.median(self._reported)) if self._reported else math.nan,
+            "converged": 1.0 - self.flagged / self.wires if self.wires else math.nan,
+            "accurate": self.wires - self.flagged - len(wrong),
+            "flagged": self.flagged,
+            "wrong": len(wrong),
+            "wrong_seeds": len({seed for _, seed, _, _ in wrong}),
+            "beyond_5": len(self._deviations),
+            "expected_beyond_5": 0.0 if self.exact else self._coordinates * beyond(LIMIT),
+            "limit": limit,
+            "worst": None
+            if worst is None
+            else dict(zip(("deviations", "seed", "frame", "wire"), worst, strict=True)),
+            "time_s": self.time_s,
+        }
+
+
+def named(row: Mapping[str, Any]) -> str:
+    """One line on a row that is wrong: what, how much, and how to see it again."""
+    worst = row["worst"]
+    far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} deviations"
+    return (
+        f"{row['case']} by {row['method']}: {row['wrong']} of {row['wires']} wires wrong, worst {far} "
+        f"(seed {worst['seed']}, frame {worst['frame']}, wire {worst['wire']})"
+    )

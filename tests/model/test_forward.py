@@ -109,6 +109,37 @@ def test_model_is_right_in_extended_precision(patch):
     np.testing.assert_allclose(sk.resistance_ohm(layout, upper), truth.astype(float), rtol=1e-13)
 
 
+@pytest.mark.parametrize("decades", [3, 150])
+def test_compiled_distances_are_right_to_two_ulps(decades):
+    """1 / d at distances of 10^±decades, and its derivative where that is a number."""
+    rng = np.random.default_rng(decades)
+    distance = 10.0 ** rng.uniform(-decades, decades, 20_011)
+    lower = np.zeros((3, 1, distance.size))
+    lower[2, 0] = -distance
+    f, alone, jt = np.empty(distance.size), np.empty(distance.size), np.full((3, distance.size), np.nan)
+    potential_jacobian(np.zeros(3), lower, f, jt)
+    potential(np.zeros(3), lower, alone)
+    truth = (1 / distance.astype(np.longdouble)).astype(float)
+    assert (np.abs(f - truth) <= 2 * np.spacing(truth)).all()
+    np.testing.assert_array_equal(alone, f)
+    usual = (distance > 1e-75) & (distance < 1e75)
+    np.testing.assert_allclose(jt[2, usual], -(truth[usual] ** 2), rtol=4e-15)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e-300, 1e-160, 1e160, 1e300, np.inf, np.nan])
+def test_distance_out_of_range_is_no_number(distance):
+    """The steps see that r is not finite; a number that is wrong would pass for a potential."""
+    lower = np.zeros((3, 2, 9))
+    lower[1] = -1.0
+    lower[1, 1, 4] = distance
+    f, jt = np.empty(9), np.empty((3, 9))
+    potential_jacobian(np.zeros(3), lower, f, jt)
+    assert not np.isfinite(f[4])
+    assert not np.isfinite(jt[1, 4])
+    others = np.arange(9) != 4
+    np.testing.assert_array_equal(f[others], 2.0)
+
+
 def test_one_path_is_resistivity_times_distance():
     layout = sk.PatchLayout(np.array([[[3.0, 0, 4.0]]]), np.zeros((1, 1, 3)), 2.0)
     assert sk.resistance_ohm(layout, layout.upper_m) == pytest.approx(10.0)

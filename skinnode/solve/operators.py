@@ -36,6 +36,9 @@ from skinnode.model.layout import Float
 from skinnode.model.status import Status
 from skinnode.solve.linear import (
     Index,
+    bidiagonal_solve,
+    bidiagonal_solve_transposed,
+    bidiagonalise,
     damped_solve,
     dot,
     largest,
@@ -43,9 +46,11 @@ from skinnode.solve.linear import (
     lu_inverse_transposed,
     lu_solve_transposed,
     qr_factor,
+    qr_inverse,
     qr_project,
     r_solve,
-    r_solve_transposed,
+    reflect,
+    whole_lanes,
 )
 
 OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
@@ -80,7 +85,7 @@ STALL_LIMIT: Final = 30
 # Scalars of a solve, in Work.s
 LIMIT, RADIUS, LAM, NORM, LENGTH, NEWTON_LENGTH, ERROR, ANGLE, SCALARS = range(9)
 # Flags of a solve, in Work.flag
-FACTORED, SINGULAR, SIGN, HAS_QR, STALLED, FLAGS = range(6)
+FACTORED, SINGULAR, SIGN, REDUCED, STALLED, FLAGS = range(6)
 
 
 class Work(NamedTuple):
@@ -97,12 +102,16 @@ class Work(NamedTuple):
     """(n,) of R."""
     beta: Float
     """(n,) of the reflectors."""
-    qtr: Float
-    """(n,) −Qᵀ r."""
     v: Float
-    d: Float
-    damping: Float
-    sd: Float
+    bd: Float
+    """(n,) diagonal of the bidiagonal form of J D⁻¹; ``bu`` (n,) is above it."""
+    bu: Float
+    across: Float
+    down: Float
+    """(n,) β of its reflectors."""
+    inverse: Float
+    ru: Float
+    """(n,) 1 / diagonal, and above it, of the damped form."""
     r: Float
     r_trial: Float
     js: Float
@@ -115,7 +124,12 @@ class Work(NamedTuple):
     """(n, n) of Jᵀ where the system is square."""
     qr: Float
     """(m, n) of J."""
-    triangle: Float
+    right: Float
+    """(n + 3, whole lanes of m) reflectors of the bidiagonal form from the right."""
+    left: Float
+    """(n, whole lanes of n + 3) those from the left."""
+    wide: Float
+    """Scratch as long as a row of ``right``."""
     pivot: Index
     s: Float
     flag: Index
@@ -123,11 +137,14 @@ class Work(NamedTuple):
 
 def workspace(n: int, m: int) -> Work:
     """A zeroed workspace for m equations in n unknowns."""
-    v, e = np.zeros((13, n)), np.zeros((4, m))
+    v, e = np.zeros((15, n)), np.zeros((4, m))
     return Work(
         x=v[0], trial=v[1], step=v[2], newton=v[3], gradient=v[4], scale=v[5], diagonal=v[6], beta=v[7],
-        qtr=v[8], v=v[9], d=v[10], damping=v[11], sd=v[12], r=e[0], r_trial=e[1], js=e[2], e=e[3],
-        jt=np.zeros((n, m)), lu=np.zeros((n, n)), qr=np.zeros((m, n)), triangle=np.zeros((n, n)),
+        v=v[8], bd=v[9], bu=v[10], across=v[11], down=v[12], inverse=v[13], ru=v[14],
+        r=e[0], r_trial=e[1], js=e[2], e=e[3],
+        jt=np.zeros((n, m)), lu=np.zeros((n, n)), qr=np.zeros((m, n)),
+        right=np.zeros((n + 3, whole_lanes(m))), left=np.zeros((n, whole_lanes(n + 3))),
+        wide=np.zeros(whole_lanes(m)),
         pivot=np.zeros(n, np.int64), s=np.zeros(SCALARS), flag=np.zeros(FLAGS, np.int64),
     )  # fmt: skip
 
@@ -248,26 +265,38 @@ def _dogleg_step(w: Work) -> None:
 
 @njit_part
 def _marquardt_step(w: Work) -> None:
-    """The step with ‖D s‖ within a tenth of the radius, by Newton's method on lam (Moré 1978, section 5)."""
-    n, s = w.x.size, w.s
+    """The step with ‖D s‖ within a tenth of the radius, by Newton's method on lam (Moré 1978, section 5).
+
+    In the bidiagonal form of J D⁻¹, once a Jacobian, s = D⁻¹ P t and ‖D s‖ = ‖t‖: what each lam costs is
+    then of the order of n.
+    """
+    (n, m), s, t = w.jt.shape, w.s, w.step
     radius = s[RADIUS]
-    if w.flag[HAS_QR] == 0:
-        w.flag[HAS_QR] = 1
-        qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v)
-    for k in range(w.r.size):
+    if w.flag[REDUCED] == 0:
+        w.flag[REDUCED] = 1
+        for j in range(n + 3):
+            target = w.right[j]
+            for k in range(target.size):
+                target[k] = 0.0
+            if j < n:
+                source, share = w.jt[j], 1.0 / w.scale[j]
+                for k in range(m):
+                    target[k] = source[k] * share
+        bidiagonalise(w.right, w.left, w.bd, w.bu, w.across, w.down, w.wide)
+    for k in range(m):
         w.e[k] = -w.r[k]
-    qr_project(w.qr, w.beta, w.e)
-    total = 0.0
+    for k in range(n):
+        reflect(w.right, w.across, k, w.e)
+    square = 0.0
     for j in range(n):
-        w.qtr[j] = w.e[j]
-        total += (w.gradient[j] / w.scale[j]) ** 2
-    gradient = math.sqrt(total)
+        square += (w.gradient[j] / w.scale[j]) ** 2
+        t[j] = w.e[j]
+        w.inverse[j] = 1.0 / w.bd[j]
+    gradient = math.sqrt(square)
     low, high = 0.0, gradient / radius
     if w.flag[SINGULAR] == 0:
-        for j in range(n):
-            w.v[j] = w.scale[j] ** 2 * (w.newton[j] / s[NEWTON_LENGTH])
-        r_solve_transposed(w.qr, w.diagonal, w.v)
-        bound = (s[NEWTON_LENGTH] - radius) / (radius * dot(w.v, w.v))
+        bidiagonal_solve(w.inverse, w.bu, t)
+        bound = (s[NEWTON_LENGTH] - radius) / (radius * _decrease(w.inverse, w.bu, t, s[NEWTON_LENGTH], w.v))
         if bound < math.inf:
             low = bound
     lam = min(max(s[LAM], low), high)
@@ -276,24 +305,33 @@ def _marquardt_step(w: Work) -> None:
     before = 0.0
     for _ in range(10):
         lam = max(lam, 1e-3 * high if lam == 0.0 else lam)
-        root = math.sqrt(lam)
-        for j in range(n):
-            w.damping[j] = root * w.scale[j]
-        damped_solve(w.qr, w.diagonal, w.qtr, w.damping, w.triangle, w.sd, w.d, w.step)
-        length = _weighted(w.scale, w.step)
+        damped_solve(w.bd, w.bu, w.e, lam, w.inverse, w.ru, t)
+        length = math.sqrt(dot(t, t))
         excess = length - radius
         if abs(excess) <= 0.1 * radius or (low == 0.0 and excess <= before < 0.0):
             break
         before = excess
-        for j in range(n):
-            w.v[j] = w.scale[j] ** 2 * (w.step[j] / length)
-        r_solve_transposed(w.triangle, w.sd, w.v)
         if excess > 0.0:
             low = max(low, lam)
         else:
             high = min(high, lam)
-        lam = max(low, lam + excess / (radius * dot(w.v, w.v)))
+        lam = max(low, lam + excess / (radius * _decrease(w.inverse, w.ru, t, length, w.v)))
     s[LAM] = lam
+    for k in range(n - 2, -1, -1):
+        reflect(w.left, w.down, k, t)
+    for j in range(n):
+        t[j] /= w.scale[j]
+
+
+@njit_part
+def _decrease(inverse: Float, upper: Float, t: Float, length: float, v: Float) -> float:
+    """‖R⁻ᵀ t / ‖t‖‖²: the share of ‖t‖ that a unit of lam takes away, R as in :func:`bidiagonal_solve`;
+    ``v`` (n,) is scratch."""
+    share = 1.0 / length
+    for j in range(t.size):
+        v[j] = t[j] * share
+    bidiagonal_solve_transposed(inverse, upper, v)
+    return dot(v, v)
 
 
 @njit_part
@@ -313,7 +351,7 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
     square = w.r.size == n
     if flag[FACTORED] == 0:
         flag[FACTORED] = 1
-        flag[HAS_QR] = 0
+        flag[REDUCED] = 0
         if square:
             for j in range(n):
                 target, source = w.lu[j], w.jt[j]
@@ -322,7 +360,6 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
             flag[SIGN] = lu_factor(w.lu, w.pivot)
             full = flag[SIGN] != 0
         else:
-            flag[HAS_QR] = 1
             full = qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v) == 1
         if full:
             s[ERROR] = _correction(w, w.r, w.newton)
@@ -458,13 +495,7 @@ def certify(w: Work, inverse: Float) -> float:
     if m == n:
         lu_inverse_transposed(w.lu, w.pivot, inverse)
     else:
-        for k in range(m):
-            for i in range(m):
-                w.r_trial[i] = 0.0
-            w.r_trial[k] = -1.0
-            _correction(w, w.r_trial, w.v)
-            for j in range(n):
-                inverse[j, k] = w.v[j]
+        qr_inverse(w.qr, w.diagonal, w.beta, w.r_trial, inverse)
     size = _rounding(w, w.x)
     top = 0.0
     for j in range(n):

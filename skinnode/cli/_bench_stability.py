@@ -1,0 +1,79 @@
+"""Every hard case over many seeds: error, reported deviation, status and verdict of each method."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from skinnode.cli import _methods as methods
+from skinnode.cli._bench_timing import machine
+from skinnode.cli._cases import Case, all_cases
+from skinnode.cli._files import plain
+from skinnode.cli._verdict import Tally
+
+
+def run(
+    seeds: int,
+    *,
+    cases: Sequence[Case] | None = None,
+    only: Sequence[str] | None = None,
+    report: Callable[[dict[str, Any]], object] = lambda row: None,
+) -> dict[str, Any]:
+    """The figures; ``report`` gets each row when it is ready. ``only``: the methods to run."""
+    rows = []
+    for case in all_cases() if cases is None else cases:
+        chosen = [name for name in case.methods if only is None or name in only]
+        for row in _rows(case, chosen, seeds):
+            rows.append(row)
+            report(row)
+    return {
+        "benchmark": "stability",
+        "machine": machine(),
+        "seeds": seeds,
+        "rows": plain(rows),
+        "wrong": sum(row["wrong"] for row in rows),
+    }
+
+
+def _rows(case: Case, chosen: Sequence[str], seeds: int) -> list[dict[str, Any]]:
+    """One row a method; all of them get the same streams."""
+    solvers = {name: methods.of(case, name) for name in chosen}
+    tallies = {name: Tally(case.exact) for name in chosen}
+    name_code = zlib.crc32(case.name.encode())  # a case added or moved leaves the streams of the others
+    for seed in range(seeds):
+        stream = case.make(np.random.default_rng([seed, name_code]))
+        for name, solve in solvers.items():
+            start = time.perf_counter()
+            solved = solve(stream)
+            tallies[name].time_s += time.perf_counter() - start
+            truth = stream.truth_m[-1:] if methods.last_only(name) else stream.truth_m
+            tallies[name].add(seed, solved, truth)
+    head = {"number": case.number, "case": case.name}
+    return [head | {"method": name} | tally.row() for name, tally in tallies.items()]
+
+
+HEAD = (
+    f"{'':49}{'':22}{'error, share of the displacement':>32}{'wires':>18}\n"
+    f" # {'case':46}{'method':22}{'median':>11}{'worst':>10}{'reported':>11}{'conv.':>8}"
+    f"{'accurate':>9}{'flagged':>9}{'wrong':>7}"
+)
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table."""
+    return (
+        f"{row['number']:2} {row['case']:46}{row['method']:22}{share(row['median_error']):>11}"
+        f"{share(row['worst_error']):>10}{share(row['reported']):>11}{row['converged']:8.1%}"
+        f"{row['accurate']:9}{row['flagged']:9}{row['wrong']:7}"
+    )
+
+
+def share(value: float) -> str:
+    """As a percentage where that can be read, else by its power of ten; a dash where there is none."""
+    if not np.isfinite(value):
+        return "-" if np.isnan(value) else "inf"
+    return f"{value:.2%}" if 1e-4 <= value < 10 else f"{value:.0e}"

@@ -13,10 +13,12 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from skinnode.host import Host
     from skinnode.model.forward import jacobian, resistance_ohm
-    from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, SolveStats
+    from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
     from skinnode.model.layout import PatchLayout
     from skinnode.model.status import Status
-    from skinnode.solve.homotopy import Uniform, solve_path
+    from skinnode.solve.homotopy import solve_path
+    from skinnode.solve.schedule import Adaptive, Periodic, Uniform
+    from skinnode.solve.posterior import Posterior
     from skinnode.solve.system import solve_system
     from skinnode.solve.tracker import Tracker
 
@@ -25,21 +27,29 @@ _HOME = {
     "PatchLayout": "skinnode.model.layout",
     "resistance_ohm": "skinnode.model.forward",
     "jacobian": "skinnode.model.forward",
+    "Contact": "skinnode.model.frames",
     "FieldFrame": "skinnode.model.frames",
     "ResistanceFrame": "skinnode.model.frames",
     "ScanStamp": "skinnode.model.frames",
     "SolveStats": "skinnode.model.frames",
     "Status": "skinnode.model.status",
-    "Uniform": "skinnode.solve.homotopy",
+    "Adaptive": "skinnode.solve.schedule",
+    "Periodic": "skinnode.solve.schedule",
+    "Uniform": "skinnode.solve.schedule",
     "solve_path": "skinnode.solve.homotopy",
+    "Posterior": "skinnode.solve.posterior",
     "solve_system": "skinnode.solve.system",
     "Tracker": "skinnode.solve.tracker",
 }
 
 __all__ = [
+    "Contact",
+    "Adaptive",
     "FieldFrame",
     "Host",
     "PatchLayout",
+    "Posterior",
+    "Periodic",
     "ResistanceFrame",
     "ScanStamp",
     "SolveStats",

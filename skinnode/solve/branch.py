@@ -1,0 +1,102 @@
+"""Which root of F = b the rubber is at. Zero residuals are no proof: F = b has several roots.
+
+Rubber is smooth, so the displacement of a wire has a Gaussian covariance, C_ij = s² exp(−d_ij² / 2ℓ²) of
+each coordinate with d the distance of two electrodes at rest. That is weaker than the elasticity of a patch,
+needs no constant of the material and serves two ends:
+
+guided_start   the smooth displacement that explains the resistances: the maximum a posteriori estimate,
+               followed from much noise to none (data-space Gauss-Newton, Tarantola 2005, section 3.4)
+near_twin      where J is close to singular a second root lies close by, on the other side of the fold. To
+               second order along the direction v that J maps onto the least, σ α + ½ α² wᵀF″[v, v] = 0 has
+               the twin at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer 1985, chapter I.3)
+roughness      √(uᵀ C⁻¹ u): of two roots the smoother one is the more likely by far
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.kernels import potential_jacobian
+from skinnode.model.layout import Float
+from skinnode.solve.problem import PatchProblem
+
+CORRELATION_PITCHES: Final = 1.0
+"""ℓ. From rest and one frame of a random press on staggered, h = 0.5 and 1, to 50 %: with 1.0 the guided
+start finds 1386 of 1391 wires on the branch of the rest position; 0.7 and 1.5 lose more."""
+ROUGH_SHARE: Final = 1e-3
+"""Share of C that is not smooth, so that C⁻¹ exists in floating point."""
+NOISE_LEVELS: Final = tuple(10.0 ** (-0.5 * np.arange(2, 16)))
+"""Standard deviations of r the guided start goes through, 0.1 to 3e-8, one step each. Whole decades lose one
+wire in a hundred more at h = 1 and 50 %."""
+POWER_STEPS: Final = 8
+"""Of the inverse iteration: singular values next to the least one are some 3 times larger."""
+DIFFERENCE: Final = 1e-4
+"""Pitches, of the second derivative: about eps^(1/3) and far below any clearance."""
+
+
+class Smoothness:
+    """C of every upper wire of a patch, pitches²."""
+
+    def __init__(self, problem: PatchProblem) -> None:
+        self._problem = problem
+        electrodes: Float = problem.layout.upper_m / problem.layout.pitch_m
+        gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]
+        smooth = np.exp(-(gaps**2).sum(axis=-1) / (2.0 * CORRELATION_PITCHES**2))
+        smooth += ROUGH_SHARE * np.eye(electrodes.shape[1])
+        each = np.eye(3)
+        scale = problem.step_limit**2  # of a displacement; its size hardly matters, tenfold either way
+        self.covariance: Float = scale * np.einsum("uij,cd->uicjd", smooth, each).reshape(
+            len(electrodes), problem.rest.shape[1], -1
+        )
+        """(U, n, n)"""
+        self._whitening = np.linalg.inv(np.linalg.cholesky(smooth)) / problem.step_limit
+
+    def roughness(self, x: Float) -> Float:
+        """(U,) √(uᵀ C⁻¹ u) of x (U, n), in standard deviations."""
+        displacement = (x - self._problem.rest).reshape(self._problem.layout.upper_m.shape)
+        return np.asarray(np.sqrt(((self._whitening @ displacement) ** 2).sum(axis=(1, 2))))
+
+
+def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
+    """(n,) pitches, near the root of a F = 1 that is likeliest under ``covariance`` (n, n); evaluations.
+
+    ``a`` (K,). Any covariance will do; that of elastic rubber would know the neighbouring wires as well. The
+    rest position where it runs into an electrode.
+    """
+    rest = problem.rest[wire]
+    x = rest.copy()
+    f, jt = np.empty(a.size), np.empty((rest.size, a.size))
+    for count, noise in enumerate(NOISE_LEVELS):
+        potential_jacobian(x, problem.lower, f, jt)
+        jt *= a
+        spread = covariance @ jt
+        inner = jt.T @ spread
+        inner[np.diag_indices_from(inner)] += noise * noise
+        x = rest + spread @ np.linalg.solve(inner, (x - rest) @ jt - (a * f - 1.0))
+        if not np.isfinite(x).all():
+            return rest.copy(), count + 1
+    return x, len(NOISE_LEVELS)
+
+
+def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
+    """(n,) estimate of the root on the other side of the nearest fold; x, a and ``inverse`` ∂x/∂r of a wire.
+
+    Costs two Jacobians. Not finite where there is no fold to second order.
+    """
+    w = np.ones(a.size)
+    for _ in range(POWER_STEPS):
+        w = (inverse @ w) @ inverse
+        w /= np.linalg.norm(w)
+    v = inverse @ w
+    least = 1.0 / np.linalg.norm(v)
+    v *= least
+    f, jt = np.empty(a.size), np.empty((x.size, a.size))
+    slopes = []
+    for side in (DIFFERENCE, -DIFFERENCE):
+        potential_jacobian(x + side * v, problem.lower, f, jt)
+        slopes.append(v @ (jt * a))
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        curvature = w @ (slopes[0] - slopes[1]) / (2.0 * DIFFERENCE)
+        return np.asarray(x - 2.0 * least / curvature * v)

@@ -1,0 +1,267 @@
+"""A press being followed through its samples: where every wire is, and what it cost to get there."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float
+from skinnode.solve import operators as op
+from skinnode.solve import wires
+from skinnode.solve.branch import Smoothness, guided_start, near_twin
+from skinnode.solve.linear import Index
+from skinnode.solve.problem import PatchProblem
+
+Mask = NDArray[np.bool_]
+
+TINY: Final = 1e-300
+REST: Final = -1.0
+"""Position of the rest on a path; the samples are at 0, 1, 2, …"""
+TWIN_REACH: Final = 2.0
+"""Largest distance of a twin worth solving for, in largest displacements of its wire: farther ones were at
+least 1.3 times as rough on staggered, h = 0.3 … 1."""
+TWIN_ROUGHNESS: Final = 1.05
+"""Of two roots at a fold the smoother is taken for true where the other is rougher by this factor. Over 80
+random presses of 50 % on staggered, h = 1 (800 wires), the twins of wrong roots were at most 1.044 times as
+rough; 3 in 100 right roots have a twin as smooth, and lose their CONVERGED."""
+ROUGH: Final = 1.0
+"""√(uᵀ C⁻¹ u) of a press is 0.7 of its size, to 1.7 where it moves one electrode; of wrong roots 1 to 2.
+Above, the smoothest displacement is looked for."""
+TWIN_TOLERANCE: Final = 1e-9
+TWIN_STEPS: Final = 30
+
+
+class Walk:
+    """The path of one patch through the ``a`` = R · gain (T, U, K) of its samples. One owner.
+
+    Positions count samples, with the rest at −1; between two samples ``a`` is interpolated on a straight
+    line. (1/a and log a do neither better nor worse: 0.3 to 1 pitch high, to 70 %, the counts of lost wires
+    differ by their scatter.)
+    """
+
+    def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
+        self.problem = problem
+        self.solver = wires.Solver(problem, operator)
+        self.wires = len(problem.rest)
+        self.samples = len(a)
+        self.cycle: int | None = None
+        """Samples between two solves, where a schedule found or was given a cycle."""
+        self.searched = 0
+        """Leading rows of the log that looked for the cycle."""
+        self.status = np.full(self.wires, op.MAX_STEPS, np.int64)
+        """(U,) of the last sample, after :meth:`finish`; with the next three."""
+        self.residual = np.full(self.wires, math.inf)
+        self.error_estimate = np.full(self.wires, math.inf)
+        """(U,) pitches."""
+        self._inverse = np.zeros_like(self.solver.inverse)
+        self._knots = np.concatenate([problem.a_rest[None], a])
+        self._weight = np.ones_like(problem.a_rest)
+        self._smoothness: Smoothness | None = None
+        self._log: list[tuple[Float, Index, Index, Float]] = []
+        self._rest_branch = self.solver.solve_rest()
+        self._rest = self.solver.inverse.copy(), self.solver.a_solved.copy()
+        self.restart()
+
+    @property
+    def smoothness(self) -> Smoothness:
+        """Made on first use: most paths need none."""
+        if self._smoothness is None:
+            self._smoothness = Smoothness(self.problem)
+        return self._smoothness
+
+    def restart(self) -> None:
+        """Back to the rest position."""
+        self.solver.x[:] = self.problem.rest
+        self.solver.inverse[:], self.solver.a_solved[:] = self._rest
+        self._branch = self._rest_branch.copy()
+        self._crossed = np.zeros(self.wires, bool)
+        self._stumbled = np.zeros(self.wires, bool)
+        self._points = [(self.problem.rest.copy(), self.problem.a_rest)] * 2
+
+    # -- sample by sample, as the paper does -----------------------------------------------------------
+
+    def extrapolate(self, sample: int) -> None:
+        """Move every wire on towards a sample, on the secant through the last two points solved: as far as
+        the change of R is a multiple of the last change, and no farther than the trust radius."""
+        (x_before, a_before), (x, a) = self._points
+        old, new = a / a_before - 1.0, self._knots[sample + 1] / a - 1.0
+        square = (old * old).sum(axis=1)
+        share = (new * old).sum(axis=1) / np.maximum(square, TINY)
+        move = share[:, None] * (x - x_before)
+        longest = np.abs(move).max(axis=1, keepdims=True)
+        reach = self.problem.step_limit
+        self.solver.x[:] = x + move * reach / np.maximum(longest, reach)
+
+    def solve(self, sample: int, tolerance: float, most_steps: int) -> Index:
+        """Solve a sample from where the wires are; (U,) steps, 0 where the first-order optimality was below
+        the tolerance already."""
+        everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
+        self._call(everywhere, np.full(self.wires, float(sample)), wires.SKIP, tolerance, most_steps)
+        self._points = [self._points[1], (self.solver.x.copy(), self._knots[sample + 1])]
+        known = self.solver.report[:, wires.BRANCH]
+        self._crossed |= known * self._branch < 0
+        self._branch = np.where(known != 0, known, self._branch)
+        return np.asarray(self.solver.report[:, wires.STEPS].copy())
+
+    def finish(self, tolerance: float, most_steps: int, todo: Mask | None = None) -> None:
+        """Solve the last sample for good, on the wires in ``todo`` (U,) or all."""
+        todo = np.ones(self.wires, bool) if todo is None else todo
+        self._take(todo, tolerance, most_steps, None)
+        self._crossed |= todo & (self.solver.report[:, wires.BRANCH] * self._branch < 0)
+        self.status[(self.status == op.CONVERGED) & self._crossed] = op.ILL_CONDITIONED
+
+    # -- wire by wire ----------------------------------------------------------------------------------
+
+    def predict(self, position: Float) -> Float:
+        """(U, n) Euler's prediction of x at ``position`` (U,), from the last converged solve of each wire."""
+        change = self._a(position) / self.solver.a_solved - 1.0
+        return np.asarray(self.solver.x - np.einsum("ujk,uk->uj", self.solver.inverse, change))
+
+    def step(self, todo: Mask, position: Float, tolerance: float, most_steps: int) -> Mask:
+        """Predict and correct the wires in ``todo`` to their ``position``; (U,) which came to a root on the
+        branch they were on. The others stay where they are."""
+        solver = self.solver
+        before = solver.x.copy(), solver.inverse.copy(), solver.a_solved.copy()
+        tasks = wires.COVARIANCE
+        self._call(
+            np.where(todo, wires.PREDICT, wires.LEAVE).astype(np.uint8),
+            position,
+            tasks,
+            tolerance,
+            most_steps,
+        )
+        arrived = todo & self._on_branch()
+        lost = todo & ~arrived
+        self._stumbled |= lost
+        for now, then in zip((solver.x, solver.inverse, solver.a_solved), before, strict=True):
+            now[lost] = then[lost]
+        return arrived
+
+    def guide(self, todo: Mask, tolerance: float, most_steps: int) -> None:
+        """Solve the last sample from the smoothest displacement that explains it, and keep the smoother root.
+
+        A root of a wire in ``todo`` that this finds no root to compare with is not CONVERGED."""
+        if not todo.any():
+            return
+        solver = self.solver
+        x, inverse = solver.x.copy(), self._inverse.copy()
+        kept = self.status.copy(), self.residual.copy(), self.error_estimate.copy()
+        evaluations = np.zeros(self.wires, np.int64)
+        for u in np.flatnonzero(todo).tolist():
+            covariance = self.smoothness.covariance[u]
+            solver.x[u], evaluations[u] = guided_start(self.problem, u, self._knots[-1, u], covariance)
+        at = np.where(todo, self.samples - 1.0, math.nan)
+        self._log.append((at, evaluations, evaluations, np.full(self.wires, math.nan)))
+        self._take(todo, tolerance, most_steps, op.LEVENBERG_MARQUARDT)
+        with np.errstate(over="ignore", invalid="ignore"):
+            smoother = self.smoothness.roughness(solver.x) < self.smoothness.roughness(x)
+        was, came = kept[0] == op.CONVERGED, self.status == op.CONVERGED
+        back = todo & was & ~(came & smoother)
+        solver.x[back], self._inverse[back] = x[back], inverse[back]
+        for now, then in zip((self.status, self.residual, self.error_estimate), kept, strict=True):
+            now[back] = then[back]
+        self.status[back & ~came] = op.ILL_CONDITIONED
+
+    def doubtful(self) -> Mask:
+        """(U,) wires that came to no root, or to one too rough for a press, or had to take a step back."""
+        moved = np.sqrt(((self.solver.x - self.problem.rest) ** 2).sum(axis=1)) / self.problem.step_limit
+        rough = self.smoothness.roughness(self.solver.x) > ROUGH * moved
+        return np.asarray((self.status != op.CONVERGED) | rough | self._stumbled)
+
+    def doubt_twins(self) -> None:
+        """Take CONVERGED from a root with a twin as smooth on the other side of a fold."""
+        if self.problem.layout.shape[1] != self.problem.layout.unknowns:
+            return  # more equations than unknowns: a fold leaves no second root
+        solver = self.solver
+        root, a = solver.x.copy(), self._knots[-1]
+        todo = np.zeros(self.wires, bool)
+        for u in np.flatnonzero(self.status == op.CONVERGED).tolist():
+            twin = near_twin(self.problem, root[u], a[u], self._inverse[u])
+            size = np.abs(root[u] - self.problem.rest[u]).max()
+            if np.abs(twin - root[u]).max() < TWIN_REACH * size:
+                solver.x[u], todo[u] = twin, True
+        if todo.any():
+            call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
+            last = np.full(self.wires, self.samples - 1.0)
+            self._call(call, last, 0, TWIN_TOLERANCE, TWIN_STEPS, op.LEVENBERG_MARQUARDT)
+            other = solver.report[:, wires.BRANCH] * self._rest_branch < 0
+            other &= todo & ~self.problem.out_of_reach(solver.x)
+            twins = self.smoothness.roughness(solver.x) < TWIN_ROUGHNESS * self.smoothness.roughness(root)
+            self.status[other & twins] = op.ILL_CONDITIONED
+        solver.x[:] = root
+
+    # -- the log ---------------------------------------------------------------------------------------
+
+    @property
+    def log(self) -> tuple[Float, Index, Index, Float]:
+        """(S, U) position, steps, evaluations and first-order optimality of every call; position and
+        optimality are NaN where a wire was left alone."""
+        position, steps, evaluations, optimality = zip(*self._log, strict=True)
+        return np.array(position), np.array(steps), np.array(evaluations), np.array(optimality)
+
+    @property
+    def rows(self) -> int:
+        """Length of the log."""
+        return len(self._log)
+
+    # -- inside ----------------------------------------------------------------------------------------
+
+    def _take(self, todo: Mask, tolerance: float, most_steps: int, operator: int | None) -> None:
+        """Solve the last sample for the wires in ``todo`` and keep what came of it."""
+        call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
+        last = np.full(self.wires, self.samples - 1.0)
+        self._call(call, last, wires.COVARIANCE, tolerance, most_steps, operator)
+        solver = self.solver
+        self.status[todo] = solver.report[todo, wires.STATUS]
+        self.status[todo & (self.status == op.CONVERGED) & ~self._on_branch()] = op.ILL_CONDITIONED
+        self.residual[todo] = solver.measure[todo, wires.RESIDUAL]
+        self.error_estimate[todo] = solver.measure[todo, wires.ERROR_ESTIMATE]
+        self._inverse[todo] = solver.inverse[todo]
+
+    def _call(
+        self,
+        todo: NDArray[np.uint8],
+        position: Float,
+        tasks: int,
+        tolerance: float,
+        most_steps: int,
+        operator: int | None = None,
+    ) -> None:
+        solver = self.solver
+        solver.solve(
+            todo,
+            self._a(position),
+            self._weight.copy(),
+            tasks,
+            tolerance,
+            tolerance,
+            most_steps,
+            operator=operator,
+        )
+        asked = todo != wires.LEAVE
+        self._log.append(
+            (
+                np.where(asked, position, math.nan),
+                np.where(asked, solver.report[:, wires.STEPS], 0),
+                np.where(asked, solver.report[:, wires.EVALUATIONS], 0),
+                np.where(asked, solver.measure[:, wires.OPTIMALITY], math.nan),
+            )
+        )
+
+    def _on_branch(self) -> Mask:
+        """(U,) wires whose last solve came to a root on the branch of the rest position."""
+        report = self.solver.report
+        kept = report[:, wires.BRANCH] * self._rest_branch >= 0
+        reached = (report[:, wires.STATUS] == op.CONVERGED) & kept
+        return np.asarray(reached & ~self.problem.out_of_reach(self.solver.x))
+
+    def _a(self, position: Float) -> Float:
+        """(U, K) ``a`` of every wire at its position (U,)."""
+        before = np.clip(np.floor(position).astype(np.int64), -1, self.samples - 2)
+        share = (position - before)[:, None]
+        every = np.arange(self.wires)
+        first, second = self._knots[before + 1, every], self._knots[before + 2, every]
+        return np.where(share == 1.0, second, first + share * (second - first))

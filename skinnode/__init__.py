@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from skinnode.model.layout import PatchLayout
     from skinnode.model.status import Status
     from skinnode.solve.homotopy import solve_path
-    from skinnode.solve.schedule import Adaptive, Periodic, Uniform
     from skinnode.solve.posterior import Posterior
+    from skinnode.solve.schedule import Adaptive, Periodic, Uniform
     from skinnode.solve.system import solve_system
     from skinnode.solve.tracker import Tracker
 
@@ -43,13 +43,13 @@ _HOME = {
 }
 
 __all__ = [
-    "Contact",
     "Adaptive",
+    "Contact",
     "FieldFrame",
     "Host",
     "PatchLayout",
-    "Posterior",
     "Periodic",
+    "Posterior",
     "ResistanceFrame",
     "ScanStamp",
     "SolveStats",

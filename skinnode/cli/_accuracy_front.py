@@ -24,8 +24,11 @@ from skinnode.model.status import Status
 from skinnode.solve.homotopy import solve_path
 from skinnode.solve.operators import OPERATORS
 from skinnode.solve.problem import PatchProblem
-from skinnode.solve.schedule import Schedule, Uniform
+from skinnode.solve.schedule import Adaptive, Periodic, Schedule, Uniform
 
+SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
+"""Preset, height in pitches, depth in heights: one that all solve from rest, one that needs the samples, and
+the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
@@ -125,11 +128,8 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 def run() -> list[dict[str, Any]]:
     """A scatter for each scene: rows with time, error, and whether they are on the front."""
     panels = []
-    for scene in (
-        scene_of("staggered", 0.5, 0.3),
-        scene_of("staggered", 1.0, 0.3),
-        scene_of("aligned", 0.5, 0.1),
-    ):
+    for setting in SCENES:
+        scene = scene_of(*setting)
         rows = _rows(scene)
         front = pareto(rows)
         for index, row in enumerate(rows):
@@ -158,5 +158,12 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
 
 def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
     """By name: the schedule, and the number of samples it gets."""
-    uniform = Uniform(intermediate_tolerance=max(tolerance, LOOSE), final_tolerance=tolerance)
-    return {f"Uniform, {count} sample{'s' * (count > 1)}": (uniform, count) for count in SAMPLES}
+    loose = max(tolerance, LOOSE)
+    uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
+    found: dict[str, tuple[Schedule, int]] = {
+        f"Uniform, {count} sample{'s' * (count > 1)}": (uniform, count) for count in SAMPLES
+    }
+    most = max(SAMPLES)
+    found[f"Periodic, {most} samples"] = Periodic(final_tolerance=tolerance), most
+    found["Adaptive, 1 sample"] = Adaptive(final_tolerance=tolerance), 1
+    return found

@@ -99,7 +99,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
             error = f"{row['error']:10.0e}" if solved else "fails".rjust(10)
             flagged = "  flagged" if row.get("converged") is False else ""
             echo(
-                f"  {'*' if row['front'] else ' '} {row['who']:30}{row['how']:22}{row['tolerance']:10.0e}"
+                f"  {'*' if row['front'] else ' '} {row['who']:32}{row['how']:20}{row['tolerance']:10.0e}"
                 f"{row['us']:11.0f}{error}{flagged}"
             )
 

@@ -17,6 +17,7 @@ from skinnode.model.layout import Float
 from skinnode.model.status import Status
 from skinnode.solve.homotopy import solve_path
 from skinnode.solve.posterior import Posterior
+from skinnode.solve.schedule import Adaptive, Uniform
 from skinnode.solve.tracker import Tracker
 
 Method = Callable[[Stream], Solved]
@@ -37,8 +38,16 @@ def last_only(name: str) -> bool:
     return name.startswith("path ")
 
 
-def _path(case: Case, operator: str, stream: Stream) -> Solved:
-    path = solve_path(case.skin.layout, stream.frames_ohm, operator=operator, baseline_ohm=case.skin.rest_ohm)
+def _path(case: Case, how: str, stream: Stream) -> Solved:
+    """``how``: an operator along all samples, or ``adaptive``."""
+    adaptive = how == "adaptive"
+    path = solve_path(
+        case.skin.layout,
+        stream.frames_ohm,
+        operator="dogleg" if adaptive else how,
+        schedule=Adaptive() if adaptive else Uniform(),
+        baseline_ohm=case.skin.rest_ohm,
+    )
     # 5 deviations are what an error may reach; the estimate is just that
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])

@@ -28,10 +28,12 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     figure = Figure(figsize=(17, 14), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(3, 3)
-    for axes, panel in zip(grid[0], figures["front"], strict=True):
+    for axes in grid[0, len(figures["front"]) :]:
+        axes.axis("off")
+    for axes, panel in zip(grid[0], figures["front"], strict=False):
         _front(axes, panel)
     grid[0, 0].set_ylabel("error, share of the displacement")
-    grid[0, -1].legend(loc="upper right", fontsize=8, frameon=False)
+    grid[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
     _noise(grid[1, 0], figures["noise"], "exact")
     _noise(grid[1, 1], figures["noise"], "posterior")
     _codes(grid[1, 2], figures["codes"])
@@ -124,22 +126,22 @@ def _honesty(
     for shift, (method, colour) in enumerate((("exact", "0.6"), ("posterior", "tab:orange"))):
         values = [np.nan if row[key] is None else row[key] for row in rows if row["method"] == method]
         axes.bar(np.arange(len(labels)) + 0.4 * shift - 0.2, values, 0.38, color=colour, label=method)
-    axes.axhspan(*limits, color="tab:green", alpha=0.15, lw=0, label="wanted of the posterior")
+    axes.axhspan(*limits, color="tab:green", alpha=0.15, lw=0, zorder=0, label="wanted of the posterior")
     axes.set_xticks(range(len(labels)), labels, fontsize=8)
-    axes.set_ylim((0.8, 1.0) if key == "coverage" else (0.0, 1.6))
+    axes.set_ylim((0.8, 1.05) if key == "coverage" else (0.0, 1.7))
     axes.set_title(f"random scenes: {title}", fontsize=10)
-    axes.legend(fontsize=8, frameon=False, loc="lower right")
+    axes.legend(fontsize=8, frameon=False, loc="upper center", ncols=3)
 
 
 def _time(axes: Any, rows: list[dict[str, Any]]) -> None:
     place = np.arange(len(rows))
     axes.barh(place, [row["us"] for row in rows], 0.5, color="tab:blue", label="measured")
     limits = [row["limit_us"] for row in rows]
-    axes.plot(limits, place, "|", ms=34, mew=2, color="tab:red", ls="none", label="limit")
+    axes.plot(limits, place, "|", ms=30, mew=2, color="tab:red", ls="none", label="limit")
     axes.set_yticks(place, [row["what"].replace(", ", ",\n") for row in rows])
     axes.set_xscale("log")
     axes.set_xlim(50, 1e4)
     axes.invert_yaxis()
     axes.set_xlabel("µs a frame")
     axes.set_title("time of a tracked frame, staggered h=0.5", fontsize=10)
-    axes.legend(fontsize=8, frameon=False)
+    axes.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.2), markerscale=0.4)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
+from click.testing import Result
 from scipy import stats
+from typer.testing import CliRunner
 
-from skinnode.cli._cases import DRIFT, all_cases
-from skinnode.cli._truth import Converter, Press, Skin, random_press, stream
+from skinnode.cli import _bench_stability
+from skinnode.cli._cases import DRIFT, Case, all_cases
+from skinnode.cli._truth import Converter, Press, Skin, Stream, random_press, stream
 from skinnode.cli._verdict import CHANCE, Solved, Tally, allowed_seeds, beyond, limit_of, named
+from skinnode.cli.bench import app
 from skinnode.model.elastic import HertzContact
 from skinnode.model.layout import PatchLayout
 
@@ -205,9 +212,9 @@ def test_a_detour_ends_at_the_resistances_of_rest(name: str) -> None:
     case = CASES[name]
     taken = case.make(np.random.default_rng(2))
     odd = np.flatnonzero(np.isnan(taken.truth_m[:, 0, 0, 0]))
-    assert odd.tolist() == list(range(1, 12))
-    assert taken.frames_ohm[12] == pytest.approx(case.skin.rest_ohm, rel=1e-4)
-    assert np.abs(taken.frames_ohm[6] / case.skin.rest_ohm - 1).max() > 0.01
+    assert odd.tolist() == list(range(1, 8))
+    assert taken.frames_ohm[8] == pytest.approx(case.skin.rest_ohm, rel=1e-4)
+    assert np.abs(taken.frames_ohm[4] / case.skin.rest_ohm - 1).max() > 0.01
 
 
 def test_drift_is_what_its_name_says() -> None:
@@ -221,6 +228,64 @@ def test_the_fingertip_is_the_flat_patch_bent() -> None:
     skin = CASES["fingertip, 30%"].skin
     assert skin.layout.pitch_m == pytest.approx(4e-3, rel=0.02)
     taken = CASES["fingertip, 30%"].make(np.random.default_rng(1))
-    deepest = np.unravel_index(np.linalg.norm(taken.truth_m[4], axis=-1).argmax(), (10, 10))
+    deepest = np.unravel_index(np.linalg.norm(taken.truth_m[3], axis=-1).argmax(), (10, 10))
     out = skin.axes[deepest][2]
-    assert taken.truth_m[4][deepest] @ out < -0.8 * np.linalg.norm(taken.truth_m[4][deepest])
+    assert taken.truth_m[3][deepest] @ out < -0.8 * np.linalg.norm(taken.truth_m[3][deepest])
+
+
+# --- command
+
+
+def small_case(off_m: float) -> Case:
+    """Wires of one electrode, solved at once; the truth is off by ``off_m`` from what the frames say."""
+    skin = Skin(PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=6))
+    press = Press((0.0, 16e-3), 8e-3, 2e-4)
+
+    def make(rng: np.random.Generator) -> Stream:
+        taken = stream(skin, (press,), np.array([0.0, 0.5, 1.0]), Converter(sigma=1e-5), rng)
+        return dataclasses.replace(taken, truth_m=taken.truth_m + off_m)
+
+    return Case(12, f"off by {off_m:g}", skin, make, ("exact",))
+
+
+def stability(monkeypatch, tmp_path, cases: list[Case], *options: str) -> tuple[Result, dict]:
+    monkeypatch.setattr(_bench_stability, "all_cases", lambda: cases)
+    file = tmp_path / "figures.json"
+    result = CliRunner().invoke(app, ["stability", "--seeds", "2", "--json", str(file), *options])
+    return result, json.loads(file.read_text(encoding="utf-8"))
+
+
+def test_a_wrong_case_is_named_and_ends_with_status_1(monkeypatch, tmp_path) -> None:
+    result, figures = stability(monkeypatch, tmp_path, [small_case(0.0), small_case(1e-4)])
+    assert result.exit_code == 1, result.output
+    good, bad = figures["rows"]
+    assert (good["wrong"], bad["wrong"]) == (0, 60)  # 2 seeds of 3 frames of 10 wires
+    assert figures["wrong"] == 60
+    assert "1 converged and wrong" in result.output
+    assert "off by 0.0001 by exact: 60 of 60 wires wrong" in result.output
+
+
+def test_honest_cases_end_with_status_0_and_every_figure(monkeypatch, tmp_path) -> None:
+    picture = tmp_path / "picture.png"
+    result, figures = stability(monkeypatch, tmp_path, [small_case(0.0)], "--plot", str(picture))
+    assert result.exit_code == 0, result.output
+    assert figures["benchmark"] == "stability"
+    assert figures["seeds"] == 2
+    (row,) = figures["rows"]
+    assert {"number", "case", "method", "median_error", "worst_error", "reported", "limit"} <= set(row)
+    assert (row["wires"], row["accurate"], row["flagged"], row["converged"]) == (60, 60, 0, 1.0)
+    assert 0 < row["median_error"] < 5 * row["reported"] < 0.5
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "options", [("--seeds", "0"), ("--plot", "picture.nonsense"), ("--json", "no/such/folder/file")]
+)
+def test_bad_options_are_refused_before_the_work(monkeypatch, options: tuple[str, str]) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("ran")
+
+    monkeypatch.setattr(_bench_stability, "run", never)
+    result = CliRunner().invoke(app, ["stability", *options])
+    assert result.exit_code != 0
+    assert not isinstance(result.exception, AssertionError)

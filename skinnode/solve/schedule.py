@@ -73,11 +73,7 @@ class Uniform:
             if not self.plain:
                 walk.extrapolate(sample)
             walk.solve(sample, self.intermediate_tolerance, self.intermediate_steps)
-        if not self.plain:
-            walk.extrapolate(walk.samples - 1)
-        walk.finish(self.final_tolerance, self.final_steps)
-        if not self.plain:
-            walk.guide(walk.doubtful(), self.final_tolerance, self.final_steps)
+        _finish(walk, self)
 
 
 @dataclass(frozen=True)
@@ -128,11 +124,7 @@ class Periodic:
             if not self.plain:
                 walk.extrapolate(sample)
             walk.solve(sample, tolerance, self.intermediate_steps)
-        if not self.plain:
-            walk.extrapolate(walk.samples - 1)
-        walk.finish(self.final_tolerance, self.final_steps)
-        if not self.plain:
-            walk.guide(walk.doubtful(), self.final_tolerance, self.final_steps)
+        _finish(walk, self)
 
     def _search(self, walk: Walk) -> tuple[int | None, float]:
         """The cycle and the tolerance that shows it."""
@@ -211,6 +203,17 @@ class Adaptive:
             position = np.where(arrived, target, position)
         walk.finish(self.final_tolerance, self.final_steps, position == end)
         walk.guide(walk.doubtful(), self.final_tolerance, self.final_steps)
+
+
+def _finish(walk: Walk, how: Uniform | Periodic) -> None:
+    """The last sample, and a look at what does not seem to be the root."""
+    if not how.plain:
+        walk.extrapolate(walk.samples - 1)
+    walk.finish(how.final_tolerance, how.final_steps)
+    if how.plain:
+        walk.doubt_rough(how.final_tolerance, how.final_steps)
+    else:
+        walk.guide(walk.doubtful(), how.final_tolerance, how.final_steps)
 
 
 def _require_count(name: str, value: int) -> None:

@@ -30,6 +30,8 @@ rough; 3 in 100 right roots have a twin as smooth, and lose their CONVERGED."""
 ROUGH: Final = 1.0
 """√(uᵀ C⁻¹ u) of a press is 0.7 of its size, to 1.7 where it moves one electrode; of wrong roots 1 to 2.
 Above, the smoothest displacement is looked for."""
+SAME: Final = 1e-3
+"""Two solutions closer than that share of the displacement are one root."""
 TWIN_TOLERANCE: Final = 1e-9
 TWIN_STEPS: Final = 30
 
@@ -143,7 +145,7 @@ class Walk:
     def guide(self, todo: Mask, tolerance: float, most_steps: int) -> None:
         """Solve the last sample from the smoothest displacement that explains it, and keep the smoother root.
 
-        A root of a wire in ``todo`` that this finds no root to compare with is not CONVERGED."""
+        A root is not CONVERGED where this comes to none, or, if it is rough, to another one."""
         if not todo.any():
             return
         solver = self.solver
@@ -159,17 +161,30 @@ class Walk:
         with np.errstate(over="ignore", invalid="ignore"):
             smoother = self.smoothness.roughness(solver.x) < self.smoothness.roughness(x)
         was, came = kept[0] == op.CONVERGED, self.status == op.CONVERGED
+        confirmed = came & (
+            np.abs(solver.x - x).max(axis=1) <= SAME * np.abs(x - self.problem.rest).max(axis=1)
+        )
         back = todo & was & ~(came & smoother)
         solver.x[back], self._inverse[back] = x[back], inverse[back]
         for now, then in zip((self.status, self.residual, self.error_estimate), kept, strict=True):
             now[back] = then[back]
-        self.status[back & ~came] = op.ILL_CONDITIONED
+        self.status[(back & ~came) | (todo & was & ~confirmed & self._rough())] = op.ILL_CONDITIONED
 
     def doubtful(self) -> Mask:
         """(U,) wires that came to no root, or to one too rough for a press, or had to take a step back."""
-        moved = np.sqrt(((self.solver.x - self.problem.rest) ** 2).sum(axis=1)) / self.problem.step_limit
-        rough = self.smoothness.roughness(self.solver.x) > ROUGH * moved
-        return np.asarray((self.status != op.CONVERGED) | rough | self._stumbled)
+        return np.asarray((self.status != op.CONVERGED) | self._rough() | self._stumbled)
+
+    def doubt_rough(self, tolerance: float, most_steps: int) -> None:
+        """Take CONVERGED from a rough root that is not the smoothest to be found, and move no wire."""
+        todo = self._rough() & (self.status == op.CONVERGED)
+        x, inverse, status = self.solver.x.copy(), self._inverse.copy(), self.status.copy()
+        residual, error_estimate = self.residual, self.error_estimate
+        self.residual, self.error_estimate = residual.copy(), error_estimate.copy()
+        self.guide(todo, tolerance, most_steps)
+        apart = np.abs(self.solver.x - x).max(axis=1) > SAME * np.abs(x - self.problem.rest).max(axis=1)
+        status[todo & (apart | (self.status != op.CONVERGED))] = op.ILL_CONDITIONED
+        self.solver.x[:], self._inverse[:], self.status[:] = x, inverse, status
+        self.residual, self.error_estimate = residual, error_estimate
 
     def doubt_twins(self) -> None:
         """Take CONVERGED from a root with a twin as smooth on the other side of a fold."""
@@ -250,6 +265,12 @@ class Walk:
                 np.where(asked, solver.measure[:, wires.OPTIMALITY], math.nan),
             )
         )
+
+    def _rough(self) -> Mask:
+        """(U,) wires whose displacement is too rough for a press."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = np.sqrt(((self.solver.x - self.problem.rest) ** 2).sum(axis=1)) / self.problem.step_limit
+            return np.asarray(self.smoothness.roughness(self.solver.x) > ROUGH * moved)
 
     def _on_branch(self) -> Mask:
         """(U,) wires whose last solve came to a root on the branch of the rest position."""

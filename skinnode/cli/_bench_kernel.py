@@ -1,4 +1,5 @@
-"""F + J, and one step of each operator, of one wire of the reference patch: compiled against NumPy."""
+"""The compiled kernels against NumPy and LAPACK: F + J and one step of each operator, of one wire of the
+reference patch, and the dense kernels at the size of its posterior."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from skinnode.cli import _bench_dense
 from skinnode.cli._bench_timing import machine, take_turns
 from skinnode.jit import njit, njit_part
 from skinnode.model.forward import resistance_ohm
@@ -133,7 +135,7 @@ def compiled_steps(operator: int, start: Float, lower: Float, a: Float, w: Work,
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """The figures of the benchmark, µs a wire and ratios to NumPy."""
+    """The figures of the benchmark, µs a wire (dense kernels: a call) and ratios to ours."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)
@@ -170,12 +172,12 @@ def run(rounds: int) -> dict[str, Any]:
         pairs[f"step of {operator}"] = {"compiled": compiled, "NumPy, preallocated": plain}
     rows = []
     for what, candidates in pairs.items():
-        wires_a_call = 1 if what == "F + J" else 10
+        wires_a_call = 10 if what.startswith("step") else 1
         for name, timing in take_turns(candidates, rounds=rounds).items():
             rows.append(
                 {"what": what, "who": name, "us": timing.call_us / wires_a_call, "ratio": timing.ratio}
             )
-    return {"benchmark": "kernel", "machine": machine(), "rows": rows}
+    return {"benchmark": "kernel", "machine": machine(), "rows": rows + _bench_dense.measure(rounds)}
 
 
 def potential_of(x: Float, lower: Float) -> Float:

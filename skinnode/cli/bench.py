@@ -12,32 +12,40 @@ app = typer.Typer(help="Measure the solver against its peers on this machine.", 
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to FILE as well.")
 ]
+PlotFile = Annotated[
+    Path | None, typer.Option("--plot", metavar="FILE", help="Draw the figures to FILE (needs matplotlib).")
+]
 Rounds = Annotated[int, typer.Option(min=1, help="How often each candidate has its turn.")]
 
 
 @app.command()
-def kernel(json: JsonFile = None, rounds: Rounds = 31) -> None:
-    """F + J and one step of each operator: compiled against NumPy."""
+def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
+    """F + J and one step of each operator against NumPy; the dense kernels against LAPACK."""
     from skinnode.cli import _bench_kernel
 
-    _prepare(json)
+    _prepare(json, plot)
     figures = _bench_kernel.run(rounds)
     _print_machine(figures)
-    typer.echo(f"{'':28}{'':22}{'µs a wire':>10}{'ratio':>8}")
+    typer.echo(f"{'':28}{'':22}{'µs':>10}{'ratio':>8}")
     for row in figures["rows"]:
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
-        "A step has its evaluations in it; the trust radius is held short, so that it has to be searched."
+        "F + J and steps: a wire. A step has its evaluations in it; the trust radius is held short, so that\n"
+        "it has to be searched. LAPACK and BLAS have one thread, as ours have."
     )
     _write(json, figures)
+    if plot is not None:
+        from skinnode.cli._plot_ratios import draw_kernel
+
+        draw_kernel(plot, figures)
 
 
 @app.command()
-def solve(json: JsonFile = None, rounds: Rounds = 31) -> None:
+def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
     """One wire to 1e-9 from a near start: ours, SciPy's and Ceres' solvers on the same compiled F and J."""
     from skinnode.cli import _bench_solve
 
-    _prepare(json)
+    _prepare(json, plot)
     figures = _bench_solve.run(rounds)
     _print_machine(figures)
     typer.echo(f"{'':42}{'µs a wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
@@ -48,15 +56,71 @@ def solve(json: JsonFile = None, rounds: Rounds = 31) -> None:
     if not any("pyceres" in row["who"] for row in figures["rows"]):
         typer.echo("Ceres is not installed: with pip install pyceres it is measured too.")
     _write(json, figures)
+    if plot is not None:
+        from skinnode.cli._plot_ratios import draw_solve
+
+        draw_solve(plot, figures)
 
 
-def _prepare(json: Path | None) -> None:
+@app.command()
+def stability(
+    json: JsonFile = None,
+    plot: PlotFile = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Streams of each hard case.")] = 50,
+) -> None:
+    """Every hard case over many seeds: error, deviation, status, verdict. Exit 1 if any ends CONVERGED and
+    wrong."""
+    from skinnode.cli import _bench_stability as bench
+    from skinnode.cli._verdict import named
+
+    _prepare(json, plot)
+    typer.echo(bench.HEAD)
+    figures = bench.run(seeds, report=lambda row: typer.echo(bench.line(row)))
+    wrong = [row for row in figures["rows"] if row["wrong"]]
+    typer.echo(f"\n{len(figures['rows'])} rows, {seeds} seeds each: {len(wrong)} converged and wrong")
+    for row in wrong:
+        typer.echo(f"  {named(row)}")
+    _write(json, figures)
+    if plot is not None:
+        from skinnode.cli._plot_stability import draw
+
+        draw(plot, figures)
+    if wrong:
+        raise typer.Exit(1)
+
+
+@app.command()
+def accuracy(
+    json: JsonFile = None,
+    plot: PlotFile = None,
+    scenes: Annotated[int, typer.Option(min=1, help="Random scenes for each line of the coverage.")] = 200,
+    rounds: Rounds = 31,
+) -> None:
+    """Error against time, noise and code width; coverage of the intervals; time a frame."""
+    from skinnode.cli import _bench_accuracy as bench
+
+    _prepare(json, plot)
+    figures = bench.run(scenes, rounds)
+    _print_machine(figures)
+    bench.print_all(figures, typer.echo)
+    _write(json, figures)
+    if plot is not None:
+        from skinnode.cli._plot_accuracy import draw
+
+        draw(plot, figures)
+
+
+def _prepare(json: Path | None, plot: Path | None = None) -> None:
     """Refuse what could not be written, before the work; say why the first run takes longer."""
     from skinnode.cli._files import require_writable
+    from skinnode.cli._plot import require_matplotlib
     from skinnode.jit import is_cold
 
     if json is not None:
         require_writable("--json", json)
+    if plot is not None:
+        require_matplotlib(plot)
+        require_writable("--plot", plot)
 
     if is_cold():
         typer.echo("Compiling the kernels; the next start finds them ready.", err=True)

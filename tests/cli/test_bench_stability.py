@@ -17,6 +17,7 @@ from skinnode.cli._truth import Converter, Press, Skin, Stream, random_press, st
 from skinnode.cli._verdict import CHANCE, Solved, Tally, allowed_seeds, beyond, limit_of, named
 from skinnode.cli.bench import app
 from skinnode.model.elastic import HertzContact
+from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 
 SHAPE = (6, 10, 10, 3)
@@ -130,6 +131,13 @@ def test_strain_and_series_resistance_of_one_pair() -> None:
     assert strained == pytest.approx(1e7 * 1.5e-3 * (1 - 0.05 * 0.25))
     assert pair(series=0.01).resistance_ohm(down)[0, 0] == pytest.approx(1e7 * (1.5e-3 + 2e-5))
     assert pair(height=1.05).rest_ohm[0, 0] == pytest.approx(1e7 * 2.1e-3)
+
+
+def test_plain_skin_is_the_reference_model() -> None:
+    layout = PatchLayout.preset("aligned", lower_wires=7, upper_electrodes=4)
+    moved = 1e-4 * np.random.default_rng(0).standard_normal(layout.upper_m.shape)
+    expected = resistance_ohm(layout, layout.upper_m + moved)
+    np.testing.assert_allclose(Skin(layout).resistance_ohm(moved), expected, rtol=1e-14)
 
 
 def test_a_finite_electrode_is_the_mean_over_two_discs_rims() -> None:

@@ -52,6 +52,26 @@ class SolveStats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Contact:
+    """Something that presses on the skin. Each number with its standard deviation."""
+
+    centroid_m: Float
+    """(3,) centre of the normal load on the skin at rest, in the frame of the layout."""
+    centroid_std_m: Float
+    """(3,)"""
+    area_m2: float
+    """Area of a contact with the found first two moments of the load, if the load is that of a smooth body."""
+    area_std_m2: float
+    normal_force_n: float
+    """Positive when pressing."""
+    normal_force_std_n: float
+    shear_force_n: Float
+    """(2,) along the wires and across them."""
+    shear_force_std_n: Float
+    """(2,)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FieldFrame:
     """The displacement field of a patch with its uncertainty, one status a wire."""
 
@@ -65,8 +85,19 @@ class FieldFrame:
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) by the paper's law k Δs, where a stiffness was given."""
+    """(U, N, 3) loads on the skin: those of the posterior, or by the paper's law k Δs where a stiffness was
+    given."""
     stamp: ScanStamp | None = None
+    method: str = "exact"
+    """``exact``: each wire's resistances inverted; ``posterior``: the patch estimated with its elastic prior."""
+    contacts: tuple[Contact, ...] = ()
+    """Found by the posterior, the strongest first."""
+    gain: Float | None = None
+    """(U,) estimated gain error of the resistances of each wire, where a drift is estimated."""
+    noise_factor: float = 1.0
+    """Estimated noise over the noise given, where it is estimated."""
+    held: NDArray[np.bool_] | None = None
+    """(U,) wires not solved, since the frame says within its noise that they have not moved."""
 
     @property
     def trusted(self) -> bool:

@@ -1,24 +1,41 @@
 """The path of the paper run for ever: a live stream of frames, each solved from the one before.
 
+rest       a wire whose resistances have not changed beyond their noise keeps its position (see ``wires``)
 predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway
 correct    the operator, to a tolerance far below any noise
 bridge     a wire that fails: its R interpolated from the last trusted frame to the new one
 restart    the same from the rest position
-hold       a wire that still fails keeps its last trusted position, with an infinite deviation and a status
+give up    a wire that still fails keeps its last trusted position, with an infinite deviation and a status
 
 A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and
-no electrode moves farther than its clearance from the lower layer.
+no electrode moves farther than its clearance from the lower layer. A system with more equations than unknowns
+has no determinant; there χ² of the residual must be one that noise can cause.
+
+Two switches leave unknowns out. ``normal_only``: x and y of every electrode stay at rest. ``active_only``:
+the electrodes that no contact moves stay at rest. A wire starts with none that moves; when χ² says that this
+does not explain the frame, the electrode that explains most of the residual joins with its neighbours, until
+χ² is content, or more than half have joined and the rest follow. All are at rest again when that explains
+the frame. The deviation of a coordinate so left out is the move at which χ² would have noticed its electrode,
+were it the only one, in first order at rest: √(quantile − degrees of freedom) σ / ‖its column of J outside
+the range of the unknowns and of the electrode's other columns‖.
+
+Both are claims about the skin, and the deviations of the unknowns are those given the claim. Of active_only
+χ² sees to it. Of normal_only it sees less: a smooth shear looks like a slope of z. On staggered h = 0.5,
+noise 1e-5, a Hertzian press with a shear of 0.3 of its depth is refused where it is strong; where not, z is
+off by up to 16 of its small deviations, 0.2 % of h. To allow for it would cost more than to solve for it.
 """
 
 from __future__ import annotations
 
 import math
-import time
+from dataclasses import dataclass
+from time import perf_counter
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skinnode.model.forward import jacobian
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
@@ -27,6 +44,7 @@ from skinnode.solve import wires
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.system import operator_code
 
+DEADLINE: Final = int(Status.DEADLINE)
 TOLERANCE: Final = 1e-9
 """Of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from 1e-5."""
 BRIDGE_TOLERANCE: Final = 1e-6
@@ -42,6 +60,31 @@ BRIDGE_STEPS: Final = 20
 RECOVERY_STEPS: Final = 300
 """Most steps all bridges of a frame may take together, about 15 ms: a broken frame must
 not stop the stream."""
+Z_WIDEN: Final = 3.719
+"""Normal deviate of the quantile, 1 − 1e-4, of χ² at which electrodes join: a long press at 100 frames/s
+gains one by chance in 100 s."""
+STALE: Final = 2.0
+"""The J⁺ of a tall system is used again while no equation's share of the weights has changed by more."""
+TINY: Final = 1e-200
+"""Far below any square of a slope, and nothing overflows that is divided by it."""
+NOISE_MAX: Final = 1e12
+"""A relative deviation above is no knowledge, and its square must not overflow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """A frame in the units of the problem, and until when it may be solved (s, inf for ever)."""
+
+    a: Float
+    weight: Float
+    used: Float
+    """The weight, 0 also where ``a`` is no resistance."""
+    sigma: float
+    until: float
+
+    @property
+    def expired(self) -> bool:
+        return self.until < math.inf and perf_counter() >= self.until
 
 
 class ExactTracker:
@@ -50,11 +93,16 @@ class ExactTracker:
     One owner; the compiled part holds no GIL.
 
     Args:
-        layout: the patch, K ≥ 3N.
+        layout: the patch, K ≥ 3N, or K ≥ N where ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
         relative_noise: standard deviation of R relative to R, a number or (U, K).
         baseline_ohm: (U, K) resistances measured at rest; the resistivity and the gain then cancel.
         stiffness_n_per_m: k of the paper's law F = k Δs; forces are given where it is.
+        hold: leave a wire alone whose resistances have not changed beyond their noise.
+        deadline_us: an update returns after this time and at most one more solve of a wire. A wire that had
+            no turn is DEADLINE with an infinite deviation; it is first in the next frame.
+        normal_only: only z is unknown.
+        active_only: only the electrodes that contacts move are unknown.
 
     Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
     """
@@ -67,34 +115,59 @@ class ExactTracker:
         relative_noise: ArrayLike = 1e-5,
         baseline_ohm: ArrayLike | None = None,
         stiffness_n_per_m: float | None = None,
+        hold: bool = True,
+        deadline_us: float | None = None,
+        normal_only: bool = False,
+        active_only: bool = False,
     ) -> None:
-        if stiffness_n_per_m is not None and not (math.isfinite(stiffness_n_per_m) and stiffness_n_per_m > 0):
-            raise ValueError(f"stiffness_n_per_m: got {stiffness_n_per_m}, must be positive and finite")
-        if layout.shape[1] < layout.unknowns:
+        for name, value in (("stiffness_n_per_m", stiffness_n_per_m), ("deadline_us", deadline_us)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name}: got {value}, must be positive and finite")
+        unknowns = layout.unknowns // 3 if normal_only else layout.unknowns
+        if layout.shape[1] < unknowns:
             raise ValueError(
-                f"layout: got {layout.shape[1]} lower wires for {layout.unknowns} unknowns an upper wire, "
+                f"layout: got {layout.shape[1]} lower wires for {unknowns} unknowns an upper wire, "
                 "must be at least as many"
             )
         self.layout = layout
         self._problem = PatchProblem.of(layout, baseline_ohm)
         self._stiffness = stiffness_n_per_m
         self._noise, self._sigma = self._checked_noise(relative_noise)
-        self._tall = layout.shape[1] > layout.unknowns
+        self._hold = hold
+        self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
+        self._active_only = active_only
         self._evaluations = self._steps = 0  # of the frame at hand
-        self._solver = wires.Solver(self._problem, operator_code(operator))
+        self._solver = wires.Solver(self._problem, operator_code(operator), normal_only)
         self._rest_branch = self._solver.solve_rest()
         self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
         self._rest_inverse = self._solver.inverse.copy()
+        # ∂r/∂x at rest of every coordinate, (U, 3N, K), and what an unknown left out may move by unnoticed
+        slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
+        self._slopes = np.ascontiguousarray((slopes * self._problem.a_rest[:, :, None]).transpose(0, 2, 1))
+        self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
+        # limits of χ² by degrees of freedom
+        self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
+            np.array([wires.chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
+            for z in (wires.Z_HOLD, Z_WIDEN, wires.Z_REFUSE)
+        )
         self.reset()
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
+        wires_all = range(self.layout.shape[0])
         self._x = self._problem.rest.copy()  # last trusted position of each wire, and its a
         self._a = self._problem.a_rest.copy()
         self._solver.inverse[:] = self._rest_inverse
         self._solver.a_solved[:] = self._a
-        self._weight = np.ones(self.layout.shape)
+        self._solver.noise[:] = 0.0
+        self._weight = np.ones(self.layout.shape)  # at which the inverse of each wire was made
+        self._unnoticed_weight = np.zeros(self.layout.shape)  # for which self._unnoticed was made
         self._predictable = self._rest_known.copy()  # wires whose inverse in the solver belongs to their x
+        self._order = list(wires_all)  # whose turn it is, where there is a deadline
+        if self._active_only:
+            for u in wires_all:
+                self._set_electrodes(u, np.arange(0))
+            self._predictable[:] = True
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -104,57 +177,104 @@ class ExactTracker:
         Args:
             frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
             valid: (U, K) bool, False where a chunk or wire is missing; default all.
-            relative_noise: as in the constructor, of this frame only.
+            relative_noise: as in the constructor, of this frame only; what is not positive and finite makes
+                its resistance unused.
 
         Never raises for numbers. A wire with fewer usable resistances than unknowns is ILL_CONDITIONED, or
         NON_FINITE where resistances not marked as missing were unusable. Such a wire, and one that no solve
-        brings to a root, holds its last trusted position with an infinite deviation. Raises ValueError for
-        wrong shapes.
+        brings to a root, holds its last trusted position with an infinite deviation; its residual is taken
+        there, and inf where the deadline left no time to. Raises ValueError for wrong shapes.
         """
-        start = time.perf_counter()
-        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        noise, sigma = (
-            (self._noise, self._sigma) if relative_noise is None else self._checked_noise(relative_noise)
-        )
-        weight = sigma / noise
-        if valid is not None:
-            weight *= self._checked_mask(valid)
-        with np.errstate(over="ignore", invalid="ignore"):
-            a = frame * self._problem.gain
+        start = perf_counter()
+        frame = self._checked_frame(frame_ohm, valid, relative_noise, start)
         solver = self._solver
         solver.x[:] = self._x
-        todo = np.where(self._predictable, wires.PREDICT, wires.SOLVE).astype(np.uint8)
-        if self._tall and not np.array_equal(weight, self._weight):
-            todo[:] = wires.SOLVE  # J⁺ was made for other weights: what it trusted may be noise by now
-        self._weight = weight.copy()
-        solver.solve(todo, a, weight, wires.COVARIANCE, TOLERANCE, TOLERANCE, FRAME_STEPS, sigma)
-        self._evaluations, self._steps = solver.cost
-        status = solver.report[:, wires.STATUS].copy()
+        solver.report[:] = 0
+        solver.report[:, wires.STATUS] = DEADLINE  # of all that get no turn
+        solver.measure[:] = np.inf
+        solver.std[:] = np.inf
+        self._evaluations = self._steps = 0
+        self._leave_out(frame)
+        todo = np.where(self._predictable, wires.HOLD if self._hold else wires.PREDICT, wires.SOLVE)
+        if self.layout.shape[1] > self._unknowns.min():
+            tall = (self._unknowns > 0) & (self._unknowns < self.layout.shape[1])
+            # J⁺ was made for other weights: what it trusted may be noise by now
+            todo[tall & _changed(frame.used, self._weight)] = wires.SOLVE
+        turns = self._solve(todo.astype(np.uint8), frame)
+        exhausted = np.zeros_like(turns)  # whatever could be tried has been
+        if self._active_only:
+            for u in np.flatnonzero(turns & ~self._explained()).tolist():
+                self._widen(u, frame)
+                exhausted[u] = True
         good = self._reached()
+        held = solver.report[:, wires.HELD] == 1
+        status = solver.report[:, wires.STATUS].copy()
         if not good.all():
             status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
-            solvable = np.count_nonzero(weight, axis=1) >= self.layout.unknowns
-            for u in np.flatnonzero(~good & solvable).tolist():
-                good[u] = self._recover(u, a, weight, sigma)
+            lost = ~good & (status != DEADLINE) & self._solvable(frame)
+            for u in [u for u in self._order if lost[u] and not exhausted[u]]:
+                if frame.expired:
+                    turns[u], status[u] = False, DEADLINE
+                    continue
+                good[u] = self._recover(u, frame)
                 ended = int(solver.report[u, wires.STATUS])
                 status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
             solver.std[~good] = np.inf
-            self._predictable &= ~solvable  # what was not tried keeps its inverse
+            self._predictable &= ~lost  # what was not tried keeps its inverse
         residual = solver.measure[:, wires.RESIDUAL].copy()
         for u in np.flatnonzero(~good).tolist():
-            residual[u] = self._held_residual(u, a, weight)
-        self._x[good] = solver.x[good]
-        self._a[good] = solver.a_solved[good]
+            known = status[u] != DEADLINE and not frame.expired
+            residual[u] = self._held_residual(u, frame) if known else math.inf
+        solved = good & ~held
+        self._x[solved] = solver.x[solved]
+        self._a[solved] = solver.a_solved[solved]
+        self._weight[solved] = frame.used[solved]
         self._predictable |= good
+        self._order.sort(key=lambda u: bool(turns[u]))  # who waits comes first, in the order of waiting
+        if turns.all():
+            self._order.sort()
         displacement = self._problem.displacement_m(self._x)
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=(solver.std * self.layout.pitch_m).reshape(displacement.shape),
             status=tuple(map(Status, status.tolist())),
             residual=residual,
-            stats=SolveStats(self._evaluations, self._evaluations, self._steps, time.perf_counter() - start),
+            stats=SolveStats(self._evaluations, self._evaluations, self._steps, perf_counter() - start),
             force_n=None if self._stiffness is None else self._stiffness * displacement,
+            held=held,
         )
+
+    def _solve(self, todo: NDArray[np.uint8], frame: _Frame) -> NDArray[np.bool_]:
+        """Solve the wires in ``todo`` for the frame, in turn where there is a deadline; (U,) who had one."""
+        if frame.until == math.inf:
+            self._call(todo, frame)
+            return np.ones(len(todo), bool)
+        turns = np.zeros(len(todo), bool)
+        for u in self._order:
+            if turns.any() and frame.expired:  # one at least, lest the stream stand still
+                break
+            turns[u] = True
+            self._call(self._only(u, int(todo[u])), frame)
+        return turns
+
+    def _call(
+        self, todo: NDArray[np.uint8], frame: _Frame, a: Float | None = None, last: bool = True,
+        most: int = FRAME_STEPS, method: int | None = None,
+    ) -> None:  # fmt: skip
+        """One call of the solver; other ``a`` and not ``last`` for the substeps of a bridge."""
+        solver = self._solver
+        tolerance = TOLERANCE if last else BRIDGE_TOLERANCE
+        tasks = wires.COVARIANCE if last else 0
+        values = frame.a if a is None else a
+        solver.solve(todo, values, frame.weight, tasks, tolerance, tolerance, most, frame.sigma, method)
+        called = todo != wires.LEAVE
+        self._evaluations += int(solver.report[called, wires.EVALUATIONS].sum())
+        self._steps += int(solver.report[called, wires.STEPS].sum())
+
+    def _only(self, u: int, task: int) -> NDArray[np.uint8]:
+        todo = np.full(self.layout.shape[0], wires.LEAVE, np.uint8)
+        todo[u] = task
+        return todo
 
     def _reached(self) -> NDArray[np.bool_]:
         """(U,) wires the solver brought to a root on the branch of the rest position."""
@@ -163,7 +283,113 @@ class ExactTracker:
         reached = (report[:, wires.STATUS] == op.CONVERGED) & on_branch
         return np.asarray(reached & ~self._problem.out_of_reach(self._solver.x))
 
-    def _recover(self, u: int, a: Float, weight: Float, sigma: float) -> bool:
+    @property
+    def _unknowns(self) -> NDArray[np.int64]:
+        """(U,) unknowns of each wire."""
+        return np.asarray(self._solver.each * self._solver.free)
+
+    def _solvable(self, frame: _Frame) -> NDArray[np.bool_]:
+        """(U,) wires with enough usable resistances for their unknowns."""
+        count = np.count_nonzero(frame.used, axis=1)
+        return np.asarray((count > 0) & (count >= self._unknowns))
+
+    def _leave_out(self, frame: _Frame) -> None:
+        """Put wires to rest where that explains the frame; what χ² may miss of all that is no unknown."""
+        solver, layout = self._solver, self.layout
+        if self._active_only:
+            usable = np.where(frame.used > 0, frame.a, 1.0)
+            square = (frame.used * (usable / self._problem.a_rest - 1.0)) ** 2
+            chi2 = square.sum(axis=1) / (frame.sigma**2 + TOLERANCE**2)
+            count = np.count_nonzero(frame.used, axis=1)
+            known = (chi2 <= self._chi2_hold[count]) & (count >= solver.each * layout.unknowns // 3)
+            for u in np.flatnonzero(known & (solver.free > 0)).tolist():
+                self._set_electrodes(u, np.arange(0))
+                self._unnoticed_weight[u] = 0.0  # to be measured below
+        if solver.each * solver.free.min() < layout.unknowns:
+            for u in np.flatnonzero(_changed(frame.used, self._unnoticed_weight)).tolist():
+                self._measure_unnoticed(u, frame.used[u])
+            solver.still_std[:] = frame.sigma * self._unnoticed
+
+    def _set_electrodes(self, u: int, electrodes: NDArray[np.int64]) -> None:
+        """Give unknowns to these electrodes of wire u only."""
+        solver = self._solver
+        solver.set_electrodes(u, electrodes)
+        self._predictable[u] = len(electrodes) == 0
+        if self._predictable[u]:  # then rest is known to be the solution, without noise
+            self._x[u], self._a[u] = self._problem.rest[u], self._problem.a_rest[u]
+            solver.a_solved[u], solver.noise[u] = self._a[u], 0.0
+
+    def _measure_unnoticed(self, u: int, weight: Float) -> None:
+        """How far each coordinate that is no unknown moves before χ² notices, pitches a unit of σ."""
+        solver, (_, lower) = self._solver, self.layout.shape
+        self._unnoticed_weight[u] = weight
+        unnoticed = self._unnoticed[u].reshape(-1, 3)
+        unnoticed[:] = 0.0
+        moving = solver.electrodes(u)
+        resting = np.ones(len(unnoticed), bool)
+        resting[moving] = False
+        slopes = (self._slopes[u] * weight).reshape(-1, 3, lower)
+        unknown = slopes[moving, 3 - solver.each :].reshape(-1, lower)
+        spare = np.count_nonzero(weight) - len(unknown)
+        limit = self._chi2_refuse
+        if resting.any():
+            limit = self._chi2_widen if len(moving) else self._chi2_hold
+        least = math.inf if spare <= 0 else math.sqrt(limit[spare] - spare)
+        for group, most in ((moving, 3 - solver.each), (resting, 3)):
+            if most:
+                seen = _outside(slopes[group, :most].reshape(-1, lower), unknown).reshape(-1, most, lower)
+                power, direction = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
+                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # rounding is no knowledge
+                unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
+
+    def _explained(self) -> NDArray[np.bool_]:
+        """(U,) wires at a root or minimum whose χ² noise can cause, and those with no electrode to add."""
+        solver = self._solver
+        spare = solver.report[:, wires.SPARE]
+        limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
+        content = (solver.report[:, wires.HELD] == 1) | (solver.measure[:, wires.CHI2] <= limit)
+        whole = 3 * solver.free == self.layout.unknowns
+        return np.asarray(whole | (self._reached() & content))
+
+    def _widen(self, u: int, frame: _Frame) -> None:
+        """Let electrodes of wire u join until they explain the frame; undone where not even all do."""
+        solver, most = self._solver, self.layout.unknowns // 3
+        before = solver.electrodes(u).copy()
+        while self._solvable(frame)[u] and not self._explained()[u]:
+            if frame.expired:
+                solver.report[u, wires.STATUS] = DEADLINE
+                break
+            electrodes = np.arange(most)
+            near = not self._problem.out_of_reach(solver.x)[u]
+            if near and solver.measure[u, wires.CHI2] < np.inf:  # a minimum, if not low enough
+                joined = np.union1d(solver.electrodes(u), self._suspects(u, frame))
+                electrodes = electrodes if 2 * len(joined) > most else joined
+            self._set_electrodes(u, electrodes)
+            solver.x[u] = self._x[u]
+            self._call(self._only(u, wires.SOLVE), frame)
+            if len(electrodes) == most and not self._reached()[u] and self._solvable(frame)[u]:
+                self._recover(u, frame)
+        if len(solver.electrodes(u)) > len(before) and not self._reached()[u]:
+            self._set_electrodes(u, before)
+        if len(solver.electrodes(u)) > len(before):
+            self._measure_unnoticed(u, frame.used[u])
+            left_out = self._unnoticed[u] > 0
+            solver.std[u, left_out] = frame.sigma * self._unnoticed[u, left_out]
+
+    def _suspects(self, u: int, frame: _Frame) -> NDArray[np.int64]:
+        """The electrode at rest that explains most of the residual of wire u, and its neighbours."""
+        each, (_, lower), most = self._solver.each, self.layout.shape, self.layout.unknowns // 3
+        slopes = (self._slopes[u] * frame.used[u]).reshape(most, 3, lower)[:, 3 - each :]
+        moving = self._solver.electrodes(u)
+        rest = np.setdiff1d(np.arange(most), moving)
+        outside = _outside(slopes[rest].reshape(-1, lower), slopes[moving].reshape(each * len(moving), lower))
+        directions = np.linalg.qr(outside.reshape(-1, each, lower).transpose(0, 2, 1))[0]
+        residual = frame.used[u] * self._relative_residual(self._solver.x[u], frame.a[u])
+        explained = ((directions * residual[:, None]).sum(axis=1) ** 2).sum(axis=1)
+        best = int(rest[np.argmax(explained)])
+        return np.arange(max(best - 1, 0), min(best + 2, most))
+
+    def _recover(self, u: int, frame: _Frame) -> bool:
         """Bridge wire u from its last trusted position, then from rest; whether that brought it to a root."""
         starts = [(self._x[u].copy(), self._a[u].copy())]
         rest = self._problem.rest[u], self._problem.a_rest[u]
@@ -173,50 +399,71 @@ class ExactTracker:
             for x_from, a_from in starts:
                 if self._steps >= RECOVERY_STEPS:
                     return False
-                self._bridge(u, x_from, a_from, a, weight, sigma, substeps)
+                if not self._bridge(u, x_from, a_from, frame, substeps):
+                    self._solver.report[u, wires.STATUS] = DEADLINE
+                    return False
                 if self._reached()[u]:
                     return True
         return False
 
-    def _bridge(
-        self, u: int, x_from: Float, a_from: Float, a: Float, weight: Float, sigma: float, substeps: int
-    ) -> None:
-        """Solve wire u along the straight line of its resistances from ``a_from`` to ``a``.
+    def _bridge(self, u: int, x_from: Float, a_from: Float, frame: _Frame, substeps: int) -> bool:
+        """Solve wire u along the straight line of its resistances from ``a_from`` to those of the frame.
 
         Only the last point counts: the line is no deformation of rubber, so the points between may lie on any
-        branch. The outcome is the solver's report of the wire.
+        branch. The outcome is the solver's report of the wire. False where the deadline cut it short.
         """
-        solver = self._solver
-        todo = np.zeros(self.layout.shape[0], np.uint8)
-        todo[u] = wires.SOLVE
-        between = a.copy()
-        solver.x[u] = x_from
+        todo = self._only(u, wires.SOLVE)
+        between = frame.a.copy()
+        self._solver.x[u] = x_from
         for part in range(1, substeps + 1):
+            if frame.expired:
+                return False
             last = part == substeps
-            between[u] = a[u] if last else a_from + part / substeps * (a[u] - a_from)
-            tolerance = TOLERANCE if last else BRIDGE_TOLERANCE
-            tasks = wires.COVARIANCE if last else 0
-            method = op.LEVENBERG_MARQUARDT  # the sturdiest across a gap, whatever follows the stream
-            solver.solve(todo, between, weight, tasks, tolerance, tolerance, BRIDGE_STEPS, sigma, method)
-            self._evaluations += int(solver.report[u, wires.EVALUATIONS])
-            self._steps += int(solver.report[u, wires.STEPS])
+            between[u] = frame.a[u] if last else a_from + part / substeps * (frame.a[u] - a_from)
+            # the sturdiest across a gap, whatever follows the stream
+            self._call(todo, frame, between, last, BRIDGE_STEPS, op.LEVENBERG_MARQUARDT)
+        return True
 
-    def _held_residual(self, u: int, a: Float, weight: Float) -> float:
+    def _relative_residual(self, x: Float, a: Float) -> Float:
+        """(K,) a F − 1 of a wire at ``x``."""
+        gaps = x.reshape(-1, 1, 3, 1) - self._problem.lower.transpose(1, 0, 2)[None]
+        return np.asarray(a * (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1)) - 1.0)
+
+    def _held_residual(self, u: int, frame: _Frame) -> float:
         """RMS of F/b − 1 of wire u at its held position over the usable resistances; inf if there is none."""
-        used = weight[u] > 0
+        used = frame.used[u] > 0
         if not used.any():
             return math.inf
-        gaps = self._x[u].reshape(-1, 1, 3, 1) - self._problem.lower.transpose(1, 0, 2)[None]
-        potential = (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))
-        return float(np.sqrt(np.mean((a[u, used] * potential[used] - 1.0) ** 2)))
+        return float(np.sqrt(np.mean(self._relative_residual(self._x[u], frame.a[u])[used] ** 2)))
 
-    def _checked_noise(self, relative_noise: ArrayLike) -> tuple[Float, float]:
-        """(U, K) deviations and the smallest of them."""
+    def _checked_frame(
+        self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None, start: float
+    ) -> _Frame:
+        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        noise, sigma = self._noise, self._sigma
+        if relative_noise is not None:
+            noise = self._broadcast_noise(relative_noise)
+            known = (noise > 0) & (noise < NOISE_MAX)
+            noise = np.where(known, noise, np.inf)
+            sigma = float(noise.min()) if known.any() else self._sigma
+        weight = sigma / noise
+        if valid is not None:
+            weight *= self._checked_mask(valid)
+        with np.errstate(over="ignore", invalid="ignore"):
+            a = frame * self._problem.gain
+            used = np.where((a > wires.A_MIN) & (a < wires.A_MAX), weight, 0.0)
+        return _Frame(a, weight, used, sigma, start + self._seconds)
+
+    def _broadcast_noise(self, relative_noise: ArrayLike) -> Float:
         try:
-            noise = np.broadcast_to(np.asarray(relative_noise, np.float64), self.layout.shape)
+            return np.broadcast_to(np.asarray(relative_noise, np.float64), self.layout.shape)
         except (TypeError, ValueError) as error:
             got = f"got shape {np.shape(relative_noise)}" if np.ndim(relative_noise) else f"{error}"
             raise ValueError(f"relative_noise: {got}, must be a number or {self.layout.shape}") from None
+
+    def _checked_noise(self, relative_noise: ArrayLike) -> tuple[Float, float]:
+        """(U, K) deviations and the smallest of them."""
+        noise = self._broadcast_noise(relative_noise)
         if not ((noise > 0) & (noise < np.inf)).all():
             worst = noise[~((noise > 0) & (noise < np.inf))][0]
             raise ValueError(f"relative_noise: got {worst}, must be positive and finite everywhere")
@@ -228,3 +475,14 @@ class ExactTracker:
             got = f"{mask.dtype} of shape {mask.shape}"
             raise ValueError(f"valid: got {got}, must be bool of shape {self.layout.shape}")
         return mask
+
+
+def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
+    """(U,) wires with an equation that counts for over ``STALE`` times as much, or as little, as before."""
+    return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
+
+
+def _outside(rows: Float, others: Float) -> Float:
+    """``rows`` (n, K) less what the rows ``others`` (m, K) span."""
+    q = np.linalg.qr(others.T)[0]
+    return np.asarray(rows - (rows @ q) @ q.T)

@@ -37,6 +37,8 @@ class PatchProblem:
     """(U, K) 1 / (R₀ F₀): a = R · gain."""
     a_rest: Float
     """(U, K) a at rest, 1 / F."""
+    share_at_rest: Float
+    """(U, N, K) what each electrode at rest contributes to F."""
     clearance: Float
     """(U, N) distance of each electrode at rest from the nearest lower one, pitches."""
 
@@ -54,8 +56,12 @@ class PatchProblem:
                 raise ValueError(f"baseline_ohm: got {baseline[where]} at {list(where)}, must be positive")
             gain = 1.0 / (baseline * potential)
         gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)
-        clearance = np.sqrt((gaps**2).sum(axis=-1)).min(axis=-1) / pitch
-        return cls(layout, rest, lower_rows(layout.lower_m / pitch), gain, 1.0 / potential, clearance)
+        distance = np.sqrt((gaps**2).sum(axis=-1)) / pitch
+        share = (1.0 / distance.reshape(*rest.shape[:1], -1, *layout.lower_m.shape[:2])).sum(axis=-1)
+        return cls(
+            layout, rest, lower_rows(layout.lower_m / pitch), gain, 1.0 / potential, share,
+            distance.min(axis=-1),
+        )  # fmt: skip
 
     @property
     def step_limit(self) -> float:

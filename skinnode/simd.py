@@ -178,6 +178,16 @@ def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
+def drop(_typing: Any, value: Any, count: Any) -> Any:
+    """``value`` with zeros in its first ``count`` lanes."""
+
+    def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
+        return builder.select(_first(builder, arguments[1]), ir.Constant(_VECTOR, None), arguments[0])
+
+    return signature(_LANES_TYPE, value, types.int64), generate
+
+
+@extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
     """Sum of the lanes, halves first."""
 

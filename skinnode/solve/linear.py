@@ -17,9 +17,17 @@ from numpy.typing import NDArray
 
 from skinnode.jit import njit_part
 from skinnode.model.layout import Float
-from skinnode.simd import LANES, fma, load, splat, store, total
+from skinnode.simd import LANES, drop, fma, load, splat, store, total
 
 Index = NDArray[np.int64]
+
+
+def padded(rows: int, size: int) -> Float:
+    """(rows, ≥ size) zeros, a row of whole vectors at whole cache lines."""
+    size = -(-size // LANES) * LANES
+    room = np.zeros(rows * size + 8)
+    first = (-room.ctypes.data // room.itemsize) % 8
+    return room[first : first + rows * size].reshape(rows, size)
 
 
 @njit_part
@@ -50,18 +58,18 @@ def largest(a: Float) -> float:
 
 @njit_part
 def lu_factor(a: Float, pivot: Index) -> int:
-    """LU of ``a`` (n, n) in place with row exchanges in ``pivot``; sign of det ``a``, 0 where it is
-    singular."""
-    n = a.shape[0]
-    sign = 1
+    """LU of A (n, n) in place with row exchanges in ``pivot`` (n,); sign of det A, 0 where it is singular.
+
+    ``a`` (n + 3, whole lanes of n) is A with zeros around it: four rows share the loads of the pivot row, and
+    whole vectors need no special cases at the ends.
+    """
+    n, end = pivot.size, a.shape[1]
+    sign, top, p = 1, 0.0, 0
+    for i in range(n):
+        size = abs(a[i, 0])
+        if size > top:
+            top, p = size, i
     for j in range(n):
-        p = j
-        top = abs(a[j, j])
-        for i in range(j + 1, n):
-            size = abs(a[i, j])
-            if size > top:
-                top = size
-                p = i
         pivot[j] = p
         if not (top > 0.0 and top < math.inf):
             return 0
@@ -69,30 +77,38 @@ def lu_factor(a: Float, pivot: Index) -> int:
         if p != j:
             sign = -sign
             other = a[p]
-            for k in range(n):
-                row[k], other[k] = other[k], row[k]
+            for k in range(0, end, LANES):
+                part = load(row, k, LANES)
+                store(row, k, LANES, load(other, k, LANES))
+                store(other, k, LANES, part)
         if row[j] < 0.0:
             sign = -sign
         inverse = 1.0 / row[j]
-        i = j + 1
-        while i + 4 <= n:  # four rows share the loads of the pivot row: a third faster than one by one
-            t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
+        top, p = 0.0, j + 1
+        first, ahead = (j + 1) - (j + 1) % LANES, row[min(j + 1, n - 1)]
+        for i in range(j + 1, n, 4):
+            i1, i2, i3 = i + 1, i + 2, i + 3
+            t0, t1, t2, t3 = a[i], a[i1], a[i2], a[i3]
             f0, f1, f2, f3 = t0[j] * inverse, t1[j] * inverse, t2[j] * inverse, t3[j] * inverse
+            s0, s1 = abs(t0[j + 1] - f0 * ahead), abs(t1[j + 1] - f1 * ahead)
+            s2, s3 = abs(t2[j + 1] - f2 * ahead), abs(t3[j + 1] - f3 * ahead)
+            for k in range(first, end, LANES):
+                part = drop(load(row, k, LANES), j + 1 - k)
+                p0, p1 = fma(-f0, part, load(t0, k, LANES)), fma(-f1, part, load(t1, k, LANES))
+                p2, p3 = fma(-f2, part, load(t2, k, LANES)), fma(-f3, part, load(t3, k, LANES))
+                store(t0, k, LANES, p0)
+                store(t1, k, LANES, p1)
+                store(t2, k, LANES, p2)
+                store(t3, k, LANES, p3)
             t0[j], t1[j], t2[j], t3[j] = f0, f1, f2, f3
-            for k in range(j + 1, n):
-                value = row[k]
-                t0[k] -= f0 * value
-                t1[k] -= f1 * value
-                t2[k] -= f2 * value
-                t3[k] -= f3 * value
-            i += 4
-        while i < n:
-            target = a[i]
-            factor = target[j] * inverse
-            target[j] = factor
-            for k in range(j + 1, n):
-                target[k] -= factor * row[k]
-            i += 1
+            if s0 > top:
+                top, p = s0, i
+            if s1 > top:
+                top, p = s1, i1
+            if s2 > top:
+                top, p = s2, i2
+            if s3 > top:
+                top, p = s3, i3
     return sign
 
 
@@ -119,38 +135,32 @@ def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
 
 @njit_part
 def lu_inverse_transposed(lu: Float, pivot: Index, inverse: Float) -> None:
-    """(aᵀ)⁻¹ of the ``a`` of :func:`lu_factor` into ``inverse`` (n, n)."""
-    n = lu.shape[0]
+    """(Aᵀ)⁻¹ of the A of :func:`lu_factor` into ``inverse`` (n, n)."""
+    n = pivot.size
     for i in range(n):
         row = inverse[i]
         for c in range(n):
             row[c] = 0.0
         row[i] = 1.0
-        k = 0
-        while k + 2 <= i:
-            f0, f1, r0, r1 = lu[k, i], lu[k + 1, i], inverse[k], inverse[k + 1]
-            for c in range(k + 2):
-                row[c] -= f0 * r0[c] + f1 * r1[c]
-            k += 2
-        if k < i:
-            f0, r0 = lu[k, i], inverse[k]
-            for c in range(k + 1):
-                row[c] -= f0 * r0[c]
-        scale = 1.0 / lu[i, i]
-        for c in range(i + 1):
-            row[c] *= scale
-    for i in range(n - 2, -1, -1):
-        row = inverse[i]
-        k = i + 1
-        while k + 2 <= n:
-            f0, f1, r0, r1 = lu[k, i], lu[k + 1, i], inverse[k], inverse[k + 1]
-            for c in range(n):
-                row[c] -= f0 * r0[c] + f1 * r1[c]
-            k += 2
-        if k < n:
-            f0, r0 = lu[k, i], inverse[k]
-            for c in range(n):
-                row[c] -= f0 * r0[c]
+    for c0 in range(0, n, 4 * LANES):  # the sums of four vectors stay in registers
+        c1, c2, c3 = c0 + LANES, c0 + 2 * LANES, c0 + 3 * LANES
+        n0, n1, n2, n3 = n - c0, n - c1, n - c2, n - c3
+        for sweep in range(2):
+            for step in range(n):
+                i = step if sweep == 0 else n - 1 - step
+                low, high = (0, i) if sweep == 0 else (i + 1, n)
+                row = inverse[i]
+                s0, s1 = load(row, c0, n0), load(row, c1, n1)
+                s2, s3 = load(row, c2, n2), load(row, c3, n3)
+                for k in range(low, high):
+                    other, factor = inverse[k], -lu[k, i]
+                    s0, s1 = fma(factor, load(other, c0, n0), s0), fma(factor, load(other, c1, n1), s1)
+                    s2, s3 = fma(factor, load(other, c2, n2), s2), fma(factor, load(other, c3, n3), s3)
+                scale = 1.0 / lu[i, i] if sweep == 0 else 1.0
+                store(row, c0, n0, s0 * scale)
+                store(row, c1, n1, s1 * scale)
+                store(row, c2, n2, s2 * scale)
+                store(row, c3, n3, s3 * scale)
     for i in range(n - 1, -1, -1):
         p = pivot[i]
         if p != i:
@@ -220,11 +230,6 @@ def r_solve(a: Float, diagonal: Float, b: Float) -> None:
         for j in range(i + 1, diagonal.size):
             total -= row[j] * b[j]
         b[i] = total / diagonal[i]
-
-
-def whole_lanes(size: int) -> int:
-    """``size`` rounded up to whole vectors."""
-    return -(-size // LANES) * LANES
 
 
 @njit_part

@@ -45,12 +45,12 @@ from skinnode.solve.linear import (
     lu_factor,
     lu_inverse_transposed,
     lu_solve_transposed,
+    padded,
     qr_factor,
     qr_inverse,
     qr_project,
     r_solve,
     reflect,
-    whole_lanes,
 )
 
 OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
@@ -121,7 +121,7 @@ class Work(NamedTuple):
     jt: Float
     """(n, m) Jᵀ at x."""
     lu: Float
-    """(n, n) of Jᵀ where the system is square."""
+    """(n + 3, whole lanes of n) of Jᵀ where the system is square."""
     qr: Float
     """(m, n) of J."""
     right: Float
@@ -142,9 +142,8 @@ def workspace(n: int, m: int) -> Work:
         x=v[0], trial=v[1], step=v[2], newton=v[3], gradient=v[4], scale=v[5], diagonal=v[6], beta=v[7],
         v=v[8], bd=v[9], bu=v[10], across=v[11], down=v[12], inverse=v[13], ru=v[14],
         r=e[0], r_trial=e[1], js=e[2], e=e[3],
-        jt=np.zeros((n, m)), lu=np.zeros((n, n)), qr=np.zeros((m, n)),
-        right=np.zeros((n + 3, whole_lanes(m))), left=np.zeros((n, whole_lanes(n + 3))),
-        wide=np.zeros(whole_lanes(m)),
+        jt=np.zeros((n, m)), lu=padded(n + 3, n), qr=np.zeros((m, n)),
+        right=padded(n + 3, m), left=padded(n, n + 3), wide=padded(1, m)[0],
         pivot=np.zeros(n, np.int64), s=np.zeros(SCALARS), flag=np.zeros(FLAGS, np.int64),
     )  # fmt: skip
 

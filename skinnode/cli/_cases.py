@@ -131,7 +131,7 @@ def _deep() -> Iterator[Case]:
         for depth in (0.3, 0.5, 0.7):
             layout, name = preset(kind, height), f"{kind} h={height:g}, {depth:.0%}"
             yield _exact(3, f"{name}, exact data", layout, depth, 20)
-            yield _noisy(3, name, layout, depth, round(10 * depth) + 1)
+            yield _noisy(3, name, layout, depth, round(5 * depth) + 3)
 
 
 def _sudden_and_close() -> Iterator[Case]:
@@ -320,7 +320,7 @@ def _after_detour(
 
     def make(rng: np.random.Generator) -> Stream:
         seed = rng.integers(2**32)
-        turns = np.linspace(0.0, 1.0, 9)
+        turns = np.linspace(0.0, 1.0, 7)
         odd = np.stack([detour(np.random.default_rng(seed), skin.layout, turn) for turn in turns])
         resistance = np.stack([skin.resistance_ohm(moved) for moved in odd])
         frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
@@ -382,7 +382,7 @@ def _many_times(skin: Skin) -> Callable[[np.random.Generator], Stream]:
             stream(
                 skin,
                 (random_press(rng, skin.layout, float(rng.uniform(0.1, 0.4))),),
-                np.array([0.5, 1.0, 0.5, 0.0]),
+                np.array([0.5, 1.0, 0.0]),
                 FINE,
                 rng,
             )

@@ -203,7 +203,9 @@ class ExactTracker:
         turns = self._solve(todo.astype(np.uint8), frame)
         exhausted = np.zeros_like(turns)  # whatever could be tried has been
         if self._active_only:
-            for u in np.flatnonzero(turns & ~self._explained()).tolist():
+            unexplained = turns & ~self._explained()
+            for u in [u for u in self._order if unexplained[u]]:
+                turns[u] = not frame.expired
                 self._widen(u, frame)
                 exhausted[u] = True
         good = self._reached()
@@ -228,6 +230,11 @@ class ExactTracker:
         solved = good & ~held
         self._x[solved] = solver.x[solved]
         self._a[solved] = solver.a_solved[solved]
+        for u in np.flatnonzero(solved & (frame.used == 0).any(axis=1)).tolist():
+            missing = frame.used[u] == 0  # what they would have been
+            self._a[u, missing] = 1.0 / (
+                1.0 + self._relative_residual(self._x[u], np.ones(len(missing)))[missing]
+            )
         self._weight[solved] = frame.used[solved]
         self._predictable |= good
         self._order.sort(key=lambda u: bool(turns[u]))  # who waits comes first, in the order of waiting

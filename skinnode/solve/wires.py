@@ -225,9 +225,9 @@ def solve_wires(
     unknowns are those of ``electrodes`` (U, N), as many of a row as ``point`` (3 E,) holds, three or one
     (z) each as ``w`` has; ``still`` (U, K) is the potential of the others and ``still_std`` (U, 3N)
     what is not known of all that is no unknown, pitches. ``inverse`` (U, n, K), ``a_solved`` and ``noise``
-    (U, K) keep ∂x/∂r, 1/F and the variance of a of the last converged solve of each wire for the prediction;
-    ``std`` (U, 3N) is inf where not known. A wire with fewer equations than unknowns keeps its x and is
-    ILL_CONDITIONED, or NON_FINITE where an ``a`` lost its weight.
+    (U, K) keep ∂x/∂r, 1/F and the variance of a of the last converged solve of each wire for the next
+    frame, 1 and inf where it had no equation; ``std`` (U, 3N) is inf where not known. A wire with fewer
+    equations than unknowns keeps its x and is ILL_CONDITIONED, or NON_FINITE where an ``a`` lost its weight.
     """
     unknowns = w.x.size
     equations = a.shape[1]
@@ -339,11 +339,6 @@ def solve_wires(
                             if w_u[k] > 0.0:
                                 a_solved[u, k] = a_u[k] / (1.0 + w.r[k] / w_u[k]) if tall else a_u[k]
                                 noise[u, k] = (sigma / w_u[k]) ** 2
-                        if count < equations:  # what the missing ones would have been
-                            _evaluate(w.x, point, still[u], lower, a_solved[u], a_solved[u], w.r_trial, raw)
-                            for k in range(equations):
-                                if w_u[k] == 0.0:
-                                    a_solved[u, k] = 1.0 / (1.0 + w.r_trial[k])
                         spare = count - unknowns
                         scale = sigma
                         if spare > 0 and sigma > 0.0:

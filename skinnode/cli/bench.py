@@ -110,6 +110,27 @@ def accuracy(
         draw(plot, figures)
 
 
+@app.command()
+def path(
+    json: JsonFile = None,
+    plot: PlotFile = None,
+    experiments: Annotated[int, typer.Option(min=1, help="Random presses for each setting.")] = 10,
+) -> None:
+    """The paper's tables 2, 3 and 4 and figures 8 to 13, beside its printed values."""
+    from skinnode.cli import _bench_path as bench
+    from skinnode.cli._files import plain
+
+    _prepare(json, plot)
+    figures = bench.run(experiments)
+    _print_machine(figures)
+    bench.print_all(figures, typer.echo)
+    _write(json, plain(figures))
+    if plot is not None:
+        from skinnode.cli._plot_path import draw
+
+        draw(plot, figures)
+
+
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
     """Refuse what could not be written, before the work; say why the first run takes longer."""
     from skinnode.cli._files import require_writable

@@ -14,6 +14,7 @@ roughness      √(uᵀ C⁻¹ u): of two roots the smoother one is the more lik
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -88,9 +89,9 @@ def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Floa
     w = np.ones(a.size)
     for _ in range(POWER_STEPS):
         w = (inverse @ w) @ inverse
-        w /= np.linalg.norm(w)
+        w /= math.sqrt(w @ w)
     v = inverse @ w
-    least = 1.0 / np.linalg.norm(v)
+    least = 1.0 / math.sqrt(v @ v)
     v *= least
     f, jt = np.empty(a.size), np.empty((x.size, a.size))
     slopes = []

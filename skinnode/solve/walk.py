@@ -61,6 +61,7 @@ class Walk:
         self._inverse = np.zeros_like(self.solver.inverse)
         self._knots = np.concatenate([problem.a_rest[None], a])
         self._weight = np.ones_like(problem.a_rest)
+        self._everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
         self._smoothness: Smoothness | None = None
         self._log: list[tuple[Float, Index, Index, Float]] = []
         self._rest_branch = self.solver.solve_rest()
@@ -100,8 +101,7 @@ class Walk:
     def solve(self, sample: int, tolerance: float, most_steps: int) -> Index:
         """Solve a sample from where the wires are; (U,) steps, 0 where the first-order optimality was below
         the tolerance already."""
-        everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
-        self._call(everywhere, np.full(self.wires, float(sample)), wires.SKIP, tolerance, most_steps)
+        self._call(self._everywhere, float(sample), wires.SKIP, tolerance, most_steps)
         self._points = [self._points[1], (self.solver.x.copy(), self._knots[sample + 1])]
         known = self.solver.report[:, wires.BRANCH]
         self._crossed |= known * self._branch < 0
@@ -200,8 +200,7 @@ class Walk:
                 solver.x[u], todo[u] = twin, True
         if todo.any():
             call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
-            last = np.full(self.wires, self.samples - 1.0)
-            self._call(call, last, 0, TWIN_TOLERANCE, TWIN_STEPS, op.LEVENBERG_MARQUARDT)
+            self._call(call, self.samples - 1.0, 0, TWIN_TOLERANCE, TWIN_STEPS, op.LEVENBERG_MARQUARDT)
             other = solver.report[:, wires.BRANCH] * self._rest_branch < 0
             other &= todo & ~self.problem.out_of_reach(solver.x)
             twins = self.smoothness.roughness(solver.x) < TWIN_ROUGHNESS * self.smoothness.roughness(root)
@@ -227,8 +226,7 @@ class Walk:
     def _take(self, todo: Mask, tolerance: float, most_steps: int, operator: int | None) -> None:
         """Solve the last sample for the wires in ``todo`` and keep what came of it."""
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
-        last = np.full(self.wires, self.samples - 1.0)
-        self._call(call, last, wires.COVARIANCE, tolerance, most_steps, operator)
+        self._call(call, self.samples - 1.0, wires.COVARIANCE, tolerance, most_steps, operator)
         solver = self.solver
         self.status[todo] = solver.report[todo, wires.STATUS]
         self.status[todo & (self.status == op.CONVERGED) & ~self._on_branch()] = op.ILL_CONDITIONED
@@ -239,7 +237,7 @@ class Walk:
     def _call(
         self,
         todo: NDArray[np.uint8],
-        position: Float,
+        position: Float | float,
         tasks: int,
         tolerance: float,
         most_steps: int,
@@ -256,13 +254,20 @@ class Walk:
             most_steps,
             operator=operator,
         )
+        steps, evaluations = solver.report[:, wires.STEPS], solver.report[:, wires.EVALUATIONS]
+        optimality = solver.measure[:, wires.OPTIMALITY]
+        if isinstance(position, float):
+            position = np.full(self.wires, position)
+        if todo is self._everywhere:
+            self._log.append((position, steps.copy(), evaluations.copy(), optimality.copy()))
+            return
         asked = todo != wires.LEAVE
         self._log.append(
             (
                 np.where(asked, position, math.nan),
-                np.where(asked, solver.report[:, wires.STEPS], 0),
-                np.where(asked, solver.report[:, wires.EVALUATIONS], 0),
-                np.where(asked, solver.measure[:, wires.OPTIMALITY], math.nan),
+                np.where(asked, steps, 0),
+                np.where(asked, evaluations, 0),
+                np.where(asked, optimality, math.nan),
             )
         )
 
@@ -279,8 +284,10 @@ class Walk:
         reached = (report[:, wires.STATUS] == op.CONVERGED) & kept
         return np.asarray(reached & ~self.problem.out_of_reach(self.solver.x))
 
-    def _a(self, position: Float) -> Float:
-        """(U, K) ``a`` of every wire at its position (U,)."""
+    def _a(self, position: Float | float) -> Float:
+        """(U, K) ``a`` of every wire at its position (U,), or of all at a sample."""
+        if isinstance(position, float):
+            return np.asarray(self._knots[int(position) + 1].copy())
         before = np.clip(np.floor(position).astype(np.int64), -1, self.samples - 2)
         share = (position - before)[:, None]
         every = np.arange(self.wires)

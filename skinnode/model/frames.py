@@ -60,7 +60,7 @@ class Contact:
     centroid_std_m: Float
     """(3,)"""
     area_m2: float
-    """Area of a contact with the found first two moments of the load, if the load is that of a smooth body."""
+    """Area of the contact, if a smooth body presses (Hertz); 0 where it is too small to tell."""
     area_std_m2: float
     normal_force_n: float
     """Positive when pressing."""
@@ -89,7 +89,7 @@ class FieldFrame:
     given."""
     stamp: ScanStamp | None = None
     method: str = "exact"
-    """``exact``: each wire's resistances inverted; ``posterior``: the patch estimated with its elastic prior."""
+    """``exact``: each wire inverted; ``posterior``: the patch estimated with its elastic prior."""
     contacts: tuple[Contact, ...] = ()
     """Found by the posterior, the strongest first."""
     gain: Float | None = None

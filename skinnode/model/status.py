@@ -16,3 +16,5 @@ class Status(enum.IntEnum):
     ILL_CONDITIONED = 5
     NON_FINITE = 6
     INVALID_START = 7
+    INCONSISTENT = 8
+    """No deformation explains the resistances: χ² far above what their noise allows."""

@@ -1,0 +1,300 @@
+"""The linear algebra of one posterior step, in the space of the data.
+
+The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
+g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, its model
+
+    r(x) − H g = noise of deviation 1,      H: what a unit of each nuisance does to r
+
+With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
+
+    x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
+
+and the covariance there s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
+2005, 3.4). No eigenvalue of S is below 1, so that rounding costs ε ‖S‖ of a standard deviation: a thousandth
+at signals of 10⁶ σ, whatever the condition of J.
+
+A step with the factors of an older J still leads to the same place. At the maximum of the posterior
+e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish, and with the old J, H, S
+
+    δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
+
+is Newton's correction, a chord step, at the cost of two triangular solves.
+
+A wire with more equations than unknowns is first reduced to as many by a QR of [J H], which loses nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from skinnode.jit import njit, njit_part
+from skinnode.model.kernels import potential, potential_jacobian
+from skinnode.model.layout import Float
+from skinnode.solve.dense import multiply, solve_lower_transposed_vector, solve_lower_vector
+from skinnode.solve.linear import Index, dot, qr_factor, qr_project
+
+
+class Buffers(NamedTuple):
+    """What the step of a patch writes to: U wires, K equations and f free coordinates each, p nuisances,
+    R = min(K, f + p) rows a wire after reduction."""
+
+    r: Float
+    """(U, K) residuals."""
+    jt: Float
+    """(U, 3N, K) transposed Jacobians."""
+    free_jt: Float
+    """(f + p, K) the rows of one wire's Jᵀ that are free, then its Hᵀ."""
+    jacobian: Float
+    """(U R, f) J of the wires in the step, one below the other."""
+    nuisance: Float
+    """(U R, p) H of them."""
+    y: Float
+    """(U R,)"""
+    gain: Float
+    """(U R, U f) s² J C."""
+    innovation: Float
+    """(U R, U R) S, then its factor L."""
+    whitened: Float
+    """(U R, U f) V."""
+    work: Float
+    """(U R, U R) scratch."""
+    gradient: Float
+    """(U f,) Jᵀ (r − H g)."""
+    v: Float
+    """(U R,) scratch."""
+    block: Float
+    """(f, K) Jᵀ of one wire in one piece."""
+    qr: Float
+    """(K, f + p)"""
+    diagonal: Float
+    beta: Float
+    scratch: Float
+    e: Float
+    """(K,) scratch."""
+
+
+def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: int) -> Buffers:
+    """Zeroed buffers."""
+    columns = free + nuisances
+    rows = min(equations, columns)
+    m, n = wires * rows, wires * free
+    return Buffers(
+        r=np.zeros((wires, equations)), jt=np.zeros((wires, coordinates, equations)),
+        free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
+        nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
+        gain=np.zeros((m, n)), innovation=np.zeros((m, m)), whitened=np.zeros((m, n)),
+        work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m), block=np.zeros((free, rows)),
+        qr=np.zeros((equations, columns)), diagonal=np.zeros(columns), beta=np.zeros(columns),
+        scratch=np.zeros(columns), e=np.zeros(equations),
+    )  # fmt: skip
+
+
+@njit
+def linearise(x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
+    """r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for every wire."""
+    for u in range(x.shape[0]):
+        r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
+        potential_jacobian(x[u], lower, r_u, jt_u)
+        for k in range(r_u.size):
+            r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+        for j in range(jt_u.shape[0]):
+            row = jt_u[j]
+            for k in range(r_u.size):
+                row[k] *= w_u[k] * a_u[k]
+
+
+@njit
+def residuals(x: Float, lower: Float, a: Float, weight: Float, r: Float) -> None:
+    """r = w (a F − 1) alone."""
+    for u in range(x.shape[0]):
+        r_u, a_u, w_u = r[u], a[u], weight[u]
+        potential(x[u], lower, r_u)
+        for k in range(r_u.size):
+            r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+
+
+@njit
+def sharpest(free: Index, jt: Float, r: Float, top: Float) -> None:
+    """The largest |Jᵢᵀ r| / ‖Jᵢ‖ of each wire into ``top`` (U,): by how many deviations a coordinate is off."""
+    for u in range(jt.shape[0]):
+        top[u] = 0.0
+        for i in range(free.size):
+            row = jt[u, free[i]]
+            norm = dot(row, row)
+            if norm > 0.0:
+                top[u] = max(top[u], abs(dot(row, r[u])) / math.sqrt(norm))
+
+
+@njit_part
+def _reduce(u: int, top: int, free: Index, h: Float, x: Float, b: Buffers) -> None:
+    """J, H and y of wire ``u`` into the rows from ``top`` on, reduced to as many as there are columns."""
+    f, p = free.size, h.shape[2]
+    equations = h.shape[1]
+    y = b.e
+    for k in range(equations):
+        y[k] = -b.r[u, k]
+    for i in range(f):
+        row, source, value = b.free_jt[i], b.jt[u, free[i]], x[u, free[i]]
+        for k in range(equations):
+            row[k] = source[k]
+            y[k] += source[k] * value
+    for q in range(p):
+        row = b.free_jt[f + q]
+        for k in range(equations):
+            row[k] = h[u, k, q]
+    if equations <= f + p:
+        for k in range(equations):
+            b.y[top + k] = y[k]
+            row = b.jacobian[top + k]
+            for i in range(f):
+                row[i] = b.free_jt[i, k]
+            for q in range(p):
+                b.nuisance[top + k, q] = h[u, k, q]
+        return
+    qr_factor(b.free_jt, b.qr, b.diagonal, b.beta, b.scratch)
+    qr_project(b.qr, b.beta, y)
+    for k in range(f + p):
+        b.y[top + k] = y[k]
+        row, source = b.jacobian[top + k], b.qr[k]
+        for i in range(f):
+            row[i] = source[i] if i > k else (b.diagonal[k] if i == k else 0.0)
+        for q in range(p):
+            j = f + q
+            b.nuisance[top + k, q] = source[j] if j > k else (b.diagonal[k] if j == k else 0.0)
+
+
+@njit
+def assemble(
+    members: Index, free: Index, c: Float, s2: float, h: Float, d: Float, x: Float, b: Buffers
+) -> float:
+    """J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``; trace of s² J C Jᵀ.
+
+    ``free`` (f,) coordinates of a wire that move; ``c`` (U f, U f) their prior; ``h`` (U, K, p), ``d`` (p,).
+    Of S the upper triangle is written.
+    """
+    f, p = free.size, h.shape[2]
+    rows = b.jacobian.shape[0] // x.shape[0]
+    trace = 0.0
+    for i in range(members.size):
+        u, top = members[i], i * rows
+        _reduce(u, top, free, h, x, b)
+        multiply(b.jacobian[top : top + rows], c[u * f : (u + 1) * f], b.gain[top : top + rows])
+        for k in range(top, top + rows):
+            row = b.gain[k]
+            for j in range(row.size):
+                row[j] *= s2
+    for i in range(members.size):
+        u, left = members[i], i * rows
+        for k in range(rows):
+            source = b.jacobian[left + k]
+            for j in range(f):
+                b.block[j, k] = source[j]
+        for q in range(i + 1):
+            top = q * rows
+            multiply(
+                b.gain[top : top + rows, u * f : (u + 1) * f],
+                b.block,
+                b.innovation[top : top + rows, left : left + rows],
+            )
+        for k in range(left, left + rows):
+            trace += b.innovation[k, k]
+            for q in range(p):
+                value = d[q] * b.nuisance[k, q]
+                if value != 0.0:
+                    for t in range(k + 1):
+                        b.innovation[t, k] += value * b.nuisance[t, q]
+            b.innovation[k, k] += 1.0
+    return trace
+
+
+@njit
+def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers) -> float:
+    """The Gauss-Newton step into ``x`` and ``g``, with L in place of S; yᵀ S⁻¹ y."""
+    f = free.size
+    rows = b.jacobian.shape[0] // x.shape[0]
+    m = members.size * rows
+    for k in range(m):
+        b.v[k] = b.y[k]
+    solve_lower_vector(b.innovation, b.v, m)
+    square = dot(b.v[:m], b.v[:m])
+    solve_lower_transposed_vector(b.innovation, b.v, m)
+    for j in range(b.gradient.size):
+        b.gradient[j] = 0.0
+    for k in range(m):
+        value, row = b.v[k], b.gain[k]
+        for j in range(row.size):
+            b.gradient[j] += value * row[j]
+    for u in range(x.shape[0]):
+        for i in range(f):
+            x[u, free[i]] = b.gradient[u * f + i]
+    for q in range(g.size):
+        total = 0.0
+        for k in range(m):
+            total += b.nuisance[k, q] * b.v[k]
+        g[q] = -d[q] * total
+    return square
+
+
+@njit
+def chord_step(
+    members: Index,
+    free: Index,
+    c: Float,
+    s2: float,
+    h: Float,
+    d: Float,
+    x: Float,
+    g: Float,
+    step: Float,
+    b: Buffers,
+) -> None:
+    """The chord step with the factors at hand: from r and Jᵀ at ``x`` in ``b`` to ``step`` (U f + p,)."""
+    f, p = free.size, g.size
+    equations = b.r.shape[1]
+    rows = b.jacobian.shape[0] // x.shape[0]
+    m, n = members.size * rows, b.gradient.size
+    for j in range(n):
+        b.gradient[j] = 0.0
+    for q in range(p):
+        step[n + q] = -g[q]
+    for i in range(members.size):
+        u = members[i]
+        for k in range(equations):
+            value = b.r[u, k]
+            for q in range(p):
+                value -= h[u, k, q] * g[q]
+            b.e[k] = value
+            for q in range(p):
+                step[n + q] += d[q] * h[u, k, q] * value
+        for j in range(f):
+            b.gradient[u * f + j] = dot(b.jt[u, free[j]], b.e)
+    for u in range(x.shape[0]):
+        for i in range(f):
+            step[u * f + i] = -x[u, free[i]]
+    for i in range(members.size):
+        u = members[i]
+        for j in range(u * f, (u + 1) * f):
+            value, row = s2 * b.gradient[j], c[j]
+            for t in range(n):
+                step[t] -= value * row[t]
+    for i in range(members.size):
+        u, top = members[i], i * rows
+        for k in range(top, top + rows):
+            value = dot(b.jacobian[k], step[u * f : (u + 1) * f])
+            for q in range(p):
+                value -= b.nuisance[k, q] * step[n + q]
+            b.v[k] = value
+    solve_lower_vector(b.innovation, b.v, m)
+    solve_lower_transposed_vector(b.innovation, b.v, m)
+    for k in range(m):
+        value, row = b.v[k], b.gain[k]
+        for j in range(n):
+            step[j] -= value * row[j]
+    for q in range(p):
+        total = 0.0
+        for k in range(m):
+            total += b.nuisance[k, q] * b.v[k]
+        step[n + q] += d[q] * total

@@ -1,0 +1,396 @@
+"""The whole patch as one maximum a posteriori estimate, followed through a stream of frames.
+
+touched   the wires whose resistances differ from those at rest by more than noise give the equations
+hold      where all of them are explained by the last field within noise, nothing is solved
+track     chord or Gauss-Newton steps from the last field; a jump is annealed from rest (solve/estimate.py)
+scale     the prior's scale s, and if wanted the noise, follow the evidence (MacKay)
+judge     a wire whose residual no deformation explains is left out, named, and the rest solved again
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skinnode.model.elastic import Rubber
+from skinnode.model.frames import Contact, FieldFrame, SolveStats
+from skinnode.model.layout import Float, PatchLayout, require_array
+from skinnode.model.status import Status
+from skinnode.solve.contacts import ContactFinder
+from skinnode.solve.estimate import Data, Estimator, Index
+from skinnode.solve.prior import ElasticPrior
+from skinnode.solve.problem import PatchProblem
+from skinnode.solve.wires import A_MAX, A_MIN
+
+perf_counter = time.perf_counter
+
+DRIFTS: Final = ("none", "patch", "wire")
+
+QUIET_CHANCE: Final = 0.005
+"""A wire at rest, or unmoved, is taken for moved with this chance a frame: χ² test."""
+QUIET_DEVIATIONS: Final = 4.0
+"""Or where a single coordinate would have to move by more than this: one in 50 unmoved frames of 300
+coordinates."""
+IMPOSSIBLE_CHANCE: Final = 1e-9
+"""A wire that obeys the model is called INCONSISTENT with at most this chance a frame."""
+LEFT_OUT: Final = 3
+"""Most wires left out one after the other before the whole frame is called INCONSISTENT."""
+
+SCALE_WORTH: Final = 2.0
+"""The prior of s² counts as much as 2 of a hundred or two directions that the data determine."""
+SCALE_REST: Final = 0.005
+"""Scale, in clearances, that this prior expects: where presses of a tenth of the layer come out."""
+SCALE_MOST: Final = 1.0
+"""Greatest scale, in clearances: beyond, the surface would lie below the lower layer."""
+SCALE_STEP: Final = math.log(1.25)
+"""The scale is set anew when the evidence moves it by a quarter: the deviations change by less than that."""
+SCALE_LEAST: Final = 1.0
+"""Smallest scale: a field of it moves the resistances by their noise on the average. Less would go unnoticed,
+and must not be denied by the deviations of an untouched patch."""
+ADAPTIONS: Final = 5
+"""Most times a frame sets the prior or the noise anew."""
+REFINEMENTS: Final = 3
+"""Most times a frame refines where loads are expected; each costs as much as two solves."""
+KEPT: Final = 50
+"""Frames for which a wire that moved against what the others said has its equations used."""
+NOISE_WORTH: Final = 20.0
+"""The noise given counts as much as 20 resistances when it is estimated."""
+NOISE_STEP: Final = math.log(1.1)
+
+
+class Posterior:
+    """Estimates one patch, frame by frame. One owner; the compiled parts hold no GIL.
+
+    Args:
+        layout: the patch; any number of lower wires.
+        relative_noise: standard deviation of R relative to R, a number or (U, K).
+        baseline_ohm: (U, K) resistances measured at rest; the resistivity and the gain then cancel.
+        rubber: of the skin. Displacement does not depend on its modulus, forces are proportional to it.
+        scale_m: RMS normal displacement that the prior expects; by default it is set from the data.
+        estimate_noise: set a factor on ``relative_noise`` from the data as well.
+        drift: ``patch``: all resistances may be off by one common gain, ``wire``: by one an upper wire, with
+            a prior deviation of ``drift_std``; ``none``.
+        model_error: share of the change of each resistance that the forward model may get wrong (thickness,
+            size of the electrodes, conductivity under strain): half of its variance in common, half singly.
+        normal_only: electrodes move along z only, which asks a third of the unknowns.
+        hold: solve only wires that were touched, and nothing where nothing moved.
+
+    Compiles its kernels on the first frame. Raises ValueError for arguments of the wrong shape or range.
+    """
+
+    def __init__(
+        self,
+        layout: PatchLayout,
+        *,
+        relative_noise: ArrayLike = 1e-5,
+        baseline_ohm: ArrayLike | None = None,
+        rubber: Rubber | None = None,
+        scale_m: float | None = None,
+        estimate_noise: bool = False,
+        drift: str = "none",
+        drift_std: float = 0.02,
+        model_error: float = 0.0,
+        normal_only: bool = False,
+        hold: bool = True,
+        prior: ElasticPrior | None = None,
+    ) -> None:
+        if drift not in DRIFTS:
+            raise ValueError(f"drift: got {drift!r}, must be one of {', '.join(DRIFTS)}")
+        if not (math.isfinite(drift_std) and drift_std > 0):
+            raise ValueError(f"drift_std: got {drift_std}, must be positive and finite")
+        if not (math.isfinite(model_error) and model_error >= 0):
+            raise ValueError(f"model_error: got {model_error}, must be finite and at least 0")
+        if scale_m is not None and not (math.isfinite(scale_m) and scale_m > 0):
+            raise ValueError(f"scale_m: got {scale_m}, must be positive and finite")
+        self.layout = layout
+        self._problem = PatchProblem.of(layout, baseline_ohm)
+        self._noise = checked_noise(relative_noise, layout)
+        self._fixed_scale = None if scale_m is None else (scale_m / layout.pitch_m) ** 2
+        self._estimate_noise, self._drift, self._model_error = estimate_noise, drift, model_error
+        self._hold = hold
+        wires, electrodes = layout.upper_m.shape[:2]
+        self._free = np.arange(2, 3 * electrodes, 3) if normal_only else np.arange(3 * electrodes)
+        self._prior = ElasticPrior.of(layout, rubber) if prior is None else prior
+        self._gains = {"none": 0, "patch": 1, "wire": wires}[drift]
+        self._d = np.full(self._gains + (model_error > 0), drift_std**2)
+        if model_error > 0:
+            self._d[-1] = 0.5 * model_error**2
+        self._estimator = Estimator(self._problem, self._prior, self._free, self._d.size)
+        self._contacts = ContactFinder(self._prior, layout)
+        height = float(np.median(self._problem.clearance))
+        self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
+        at_rest = Data(
+            self._problem.a_rest, 1.0 / self._noise, np.zeros((*layout.shape, self._d.size)), self._d
+        )
+        self._scale_least = (
+            SCALE_LEAST**2 * layout.shape[0] * layout.shape[1] / self._estimator.signal(at_rest)
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream: the next frame is solved from the rest position."""
+        wires = self.layout.shape[0]
+        self._estimator.reset(self._fixed_scale or self._scale_rest)
+        self._factor = 1.0  # estimated noise over the noise given
+        self._members: Index = np.arange(0)
+        self._kept = np.zeros(wires, np.int64)
+        self._trusted = np.zeros_like(self._estimator.moved)  # last field that passed, its nuisances
+        self._trusted_g = np.zeros_like(self._estimator.g)
+        self._contacts_found: tuple[Contact, ...] = ()
+        self._force = np.zeros((*self.layout.upper_m.shape,))
+        self._known = False  # whether the estimator's factors belong to the trusted field
+        self._wires = np.arange(wires)
+
+    def update(
+        self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
+    ) -> FieldFrame:
+        """The displacement field of one frame, its loads and contacts.
+
+        Args:
+            frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
+            valid: (U, K) bool, False where a chunk or wire is missing; default all.
+            relative_noise: as in the constructor, of this frame only.
+
+        Never raises for numbers. A wire without usable resistances is estimated from its neighbours, and its
+        deviation says so. A wire that no deformation explains is INCONSISTENT and left out of the estimate.
+        Where the whole frame cannot be solved, the last trusted field is held with an infinite deviation.
+        Raises ValueError for wrong shapes.
+        """
+        start = perf_counter()
+        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        noise = self._noise if relative_noise is None else checked_noise(relative_noise, self.layout)
+        with np.errstate(over="ignore", invalid="ignore"):
+            a = frame * self._problem.gain
+        usable = (a > A_MIN) & (a < A_MAX)
+        if valid is not None:
+            usable &= checked_mask(valid, self.layout)
+        a = np.where(usable, a, self._problem.a_rest)
+        estimator = self._estimator
+        estimator.evaluations = estimator.factorisations = 0
+        estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
+        data = self._data(a, noise, usable)
+        if self._is_quiet(data):
+            held = np.ones(len(a), bool)
+            status = np.full(len(a), Status.CONVERGED)
+        else:
+            status, held = self._solve(data, a, noise, usable)
+            data = self._data(a, noise, usable)
+        return self._field(data, status, held, noise, start)
+
+    def covariance_m2(self) -> Float:
+        """(3UN, 3UN) covariance of the displacement of the last solved frame; 0 for coordinates that are not
+        free."""
+        wires, coordinates = self._estimator.moved.shape
+        every = (self._wires[:, None] * coordinates + self._free).ravel()
+        full = np.zeros((wires * coordinates, wires * coordinates))
+        full[np.ix_(every, every)] = self._estimator.covariance() * self.layout.pitch_m**2
+        return full
+
+    def _data(self, a: Float, noise: Float, usable: NDArray[np.bool_]) -> Data:
+        change = a / self._problem.a_rest - 1.0
+        variance = (self._factor * noise) ** 2 + 0.5 * (self._model_error * change) ** 2
+        weight = np.where(usable, 1.0 / np.sqrt(variance), 0.0)
+        h = np.zeros((*a.shape, self._d.size))
+        if self._drift == "patch":
+            h[..., 0] = weight
+        elif self._drift == "wire":
+            h[self._wires, :, self._wires] = weight
+        if self._model_error > 0:
+            h[..., -1] = weight * change
+        return Data(a, weight, h, self._d)
+
+    def _is_quiet(self, data: Data) -> bool:
+        """Whether the last field explains the frame within noise. A member's residual is the difference of
+        two noises, its own and the one that was solved into the field."""
+        if not (self._hold and self._known):
+            return False
+        noises = np.ones(len(self._wires))
+        noises[self._members] = 2.0
+        return not self._stirred(data, self._trusted, noises).any()
+
+    def _stirred(self, data: Data, moved: Float, noises: float | Float = 1.0) -> NDArray[np.bool_]:
+        """(U,) wires whose residuals are beyond noise of variance ``noises``."""
+        total, sharpest = self._estimator.surprise(data, moved)
+        limit = chi_square(np.count_nonzero(data.weight, axis=1).astype(float), QUIET_CHANCE)
+        return np.asarray((total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises)))
+
+    def _squares(self, data: Data, moved: Float) -> tuple[Float, Float]:
+        """(U,) Σ (residual/σ)² and number of equations."""
+        r = self._estimator.residuals(data, moved)
+        return (r**2).sum(axis=1), np.count_nonzero(data.weight, axis=1).astype(float)
+
+    def _touched(self, data: Data) -> Index:
+        """Wires whose resistances are not those at rest; one in the last solve stays a little longer."""
+        at_rest = np.zeros_like(self._trusted)
+        touched = self._stirred(data, at_rest)
+        total, count = self._squares(data, at_rest)
+        stay = np.zeros(len(total), bool)
+        stay[self._members] = True
+        touched |= stay & (total > count)
+        if touched.any():
+            touched |= self._kept > 0
+        return np.flatnonzero(touched)
+
+    def _solve(
+        self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """(U,) statuses and wires not solved. Moves the estimator, and on success the trusted field."""
+        estimator = self._estimator
+        status = np.full(len(a), int(Status.CONVERGED))
+        self._kept -= self._kept > 0
+        touched = self._touched(data)
+        # it takes all wires to say that nothing is there
+        wanted = touched if self._hold and touched.size else self._wires
+        usable = usable.copy()
+        for _ in range(LEFT_OUT + 3):
+            members = wanted[np.count_nonzero(data.weight[wanted], axis=1) > 0]
+            if not self._converge(data, members):
+                return self._give_up(Status.MAX_STEPS)
+            data = self._adapt(data, a, noise, usable, members, local=touched.size > 0)
+            if not np.isfinite(estimator.moved).all():
+                return self._give_up(Status.NON_FINITE)
+            total, count = self._squares(data, estimator.moved)
+            left = np.setdiff1d(self._wires, wanted)
+            surprised = left[self._stirred(data, estimator.moved)[left]] if left.size else left
+            if surprised.size:  # moved, and not as the others say, or stayed where they say it moved
+                self._kept[surprised] = KEPT
+                wanted = np.union1d(wanted, surprised)
+                continue
+            excess = total / np.maximum(chi_square(count, IMPOSSIBLE_CHANCE), 1e-300)
+            if (excess <= 1.0).all():
+                break
+            worst = int(np.argmax(excess))
+            status[worst] = Status.INCONSISTENT
+            usable[worst] = False
+            data = self._data(a, noise, usable)
+        else:
+            return self._give_up(Status.INCONSISTENT)
+        if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
+            return self._give_up(Status.ILL_CONDITIONED)
+        self._trusted[:] = estimator.moved
+        self._trusted_g[:] = estimator.g
+        self._members, self._known = members, True
+        held = np.ones(len(a), bool)
+        held[members] = False
+        return status, held
+
+    def _converge(self, data: Data, members: Index) -> bool:
+        """From the last trusted field, else from rest by annealing."""
+        estimator = self._estimator
+        estimator.moved[:] = self._trusted
+        estimator.g[:] = self._trusted_g
+        if self._known and estimator.track(data, members):
+            return True
+        estimator.spread(self._fixed_scale or self._scale_rest)
+        if self._fixed_scale is None:
+            estimator.scale2 = self._bounded(estimator.guess_scale(data, members))
+        return estimator.anneal(data, members)
+
+    def _bounded(self, scale2: float) -> float:
+        return min(max(scale2, self._scale_least), self._scale_most)
+
+    def _adapt(
+        self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_], members: Index, *, local: bool
+    ) -> Data:
+        """The field at the noise, the scale and, if ``local``, the places of the loads that it speaks for."""
+        estimator = self._estimator
+        if not local and self._fixed_scale is None and (estimator.share != 1.0).any():
+            estimator.spread(self._scale_rest)
+            estimator.track(data, members)
+        refinements = REFINEMENTS if local else 0
+        for _ in range(ADAPTIONS):
+            changed = False
+            if self._fixed_scale is None:
+                if local:
+                    variance = np.minimum(estimator.expected(self._scale_least), self._scale_most)
+                    wanted = self._bounded(float(variance.mean()))
+                    changed = refinements > 0 and estimator.localise(variance)
+                    refinements -= 1
+                else:
+                    wanted = self._bounded(estimator.evidence_scale(SCALE_WORTH, self._scale_rest))
+                if not changed and abs(math.log(wanted / estimator.scale2)) > 2.0 * SCALE_STEP:
+                    estimator.scale2 = wanted
+                    changed = True
+            if self._estimate_noise:
+                factor = self._noise_factor(data, members)
+                if abs(math.log(factor / self._factor)) > NOISE_STEP:
+                    self._factor = factor
+                    data = self._data(a, noise, usable)
+                    changed = True
+            if not changed or not (estimator.track(data, members) or estimator.anneal(data, members)):
+                break
+        return data
+
+    def _noise_factor(self, data: Data, members: Index) -> float:
+        """The factor on the noise at which the residuals are what they should be (MacKay)."""
+        squares = self._squares(data, self._estimator.moved)
+        total, count = (float(values[members].sum()) for values in squares)
+        left = max(count - self._estimator.gamma, 0.0)
+        return math.sqrt((self._factor**2 * total + NOISE_WORTH) / (left + NOISE_WORTH))
+
+    def _give_up(self, status: Status) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        self._known = False
+        self._estimator.std[:] = np.inf
+        return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
+
+    def _field(
+        self, data: Data, status: NDArray[np.int64], held: NDArray[np.bool_], noise: Float, start: float
+    ) -> FieldFrame:
+        estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
+        displacement = problem.displacement_m(problem.rest + self._trusted)
+        std = np.zeros_like(self._trusted)
+        std[:, self._free] = estimator.std
+        if self._known and not held.all():
+            self._force, self._contacts_found = self._contacts.find(estimator)
+        r = estimator.residuals(data, self._trusted) * self._factor * noise
+        used = data.weight > 0
+        rms = np.sqrt((np.where(used, r, 0.0) ** 2).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
+        gains = self._trusted_g[: self._gains]
+        return FieldFrame(
+            displacement_m=displacement,
+            displacement_std_m=(std * pitch).reshape(displacement.shape),
+            status=tuple(map(Status, status.tolist())),
+            residual=np.where(used.any(axis=1), rms, np.inf),
+            stats=SolveStats(
+                estimator.evaluations, estimator.evaluations, estimator.factorisations, perf_counter() - start
+            ),
+            force_n=self._force,
+            held=held,
+            method="posterior",
+            contacts=self._contacts_found if self._known else (),
+            gain=np.broadcast_to(gains, len(held)).copy() if self._gains else None,
+            noise_factor=self._factor,
+        )
+
+
+def chi_square(count: Float, chance: float) -> Float:
+    """χ² of ``count`` degrees of freedom that is exceeded with ``chance``; 0 for none."""
+    from scipy.special import chdtri
+
+    return np.asarray(chdtri(np.maximum(count, 1e-9), chance))
+
+
+def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
+    """(U, K) deviations. ValueError unless they are positive and finite and of that shape or a number."""
+    try:
+        noise = np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape)
+    except (TypeError, ValueError) as error:
+        got = f"got shape {np.shape(relative_noise)}" if np.ndim(relative_noise) else f"{error}"
+        raise ValueError(f"relative_noise: {got}, must be a number or {layout.shape}") from None
+    if not ((noise > 0) & (noise < np.inf)).all():
+        worst = noise[~((noise > 0) & (noise < np.inf))][0]
+        raise ValueError(f"relative_noise: got {worst}, must be positive and finite everywhere")
+    return np.asarray(noise)
+
+
+def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
+    """``valid`` as an array. ValueError unless it is bool and has the shape of a frame."""
+    mask = np.asarray(valid)
+    if mask.dtype != np.bool_ or mask.shape != layout.shape:
+        got = f"{mask.dtype} of shape {mask.shape}"
+        raise ValueError(f"valid: got {got}, must be bool of shape {layout.shape}")
+    return mask

@@ -87,4 +87,6 @@ def share(value: float) -> str:
     """As a percentage where that can be read, else by its power of ten; a dash where there is none."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "inf"
-    return f"{value:.2%}" if 1e-4 <= value < 10 else f"{value:.0e}"
+    if 1e-4 <= value < 1:
+        return f"{value:.2%}"
+    return f"{value:.0%}" if 1 <= value < 100 else f"{value:.0e}"

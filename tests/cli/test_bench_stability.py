@@ -286,6 +286,27 @@ def test_honest_cases_end_with_status_0_and_every_figure(monkeypatch, tmp_path) 
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize(("different_at", "calls"), [(None, 2), (1, 5)])
+def test_auto_is_not_run_twice_where_it_is_what_it_chose(monkeypatch, different_at, calls) -> None:
+    seen = dict.fromkeys(("exact", "posterior", "auto"), 0)
+
+    def of(case: Case, name: str):
+        def solve(taken: Stream) -> Solved:
+            odd = name == "exact" or (name == "auto" and seen[name] == different_at)
+            seen[name] += 1
+            moved = taken.truth_m + (1e-7 if odd else 2e-7)
+            return Solved(moved, np.full(moved.shape, 1e-6), np.ones(moved.shape[:2], bool))
+
+        return solve
+
+    monkeypatch.setattr(_bench_stability.methods, "of", of)
+    case = dataclasses.replace(small_case(0.0), methods=("exact", "posterior", "auto"))
+    rows = {row["method"]: row for row in _bench_stability.run(5, cases=[case])["rows"]}
+    assert seen == {"exact": 5, "posterior": 5, "auto": calls}
+    assert rows["auto"]["same_as"] == (None if different_at else "posterior")
+    assert rows["auto"]["wires"] == rows["posterior"]["wires"] == 150
+
+
 @pytest.mark.parametrize(
     "options", [("--seeds", "0"), ("--plot", "picture.nonsense"), ("--json", "no/such/folder/file")]
 )

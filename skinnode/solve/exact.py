@@ -222,7 +222,7 @@ class ExactTracker:
                 ended = int(solver.report[u, wires.STATUS])
                 status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
             solver.std[~good] = np.inf
-            self._predictable &= ~lost  # what was not tried keeps its inverse
+            self._predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
         residual = solver.measure[:, wires.RESIDUAL].copy()
         for u in np.flatnonzero(~good).tolist():
             known = status[u] != DEADLINE and not frame.expired

@@ -512,6 +512,26 @@ class TestDeadline:
         assert field.trusted
         np.testing.assert_allclose(field.displacement_m, moved, atol=1e-9 * staggered.height_m)
 
+    @pytest.mark.parametrize("deadline_us", [95.0, 105.0, 115.0])
+    def test_joining_electrodes_obey(self, staggered, monkeypatch, deadline_us):
+        """Wires cut short before, or between, their sets of electrodes: the next frame does without."""
+        options = {"active_only": True, "relative_noise": 1e-8}
+        tracker = ExactTracker(staggered, deadline_us=deadline_us, **options)
+        clock = Clock(monkeypatch, 0.0)
+        cut = 0
+        for n, depth in enumerate(0.2 * np.sin(np.linspace(0, np.pi, 30)) ** 2):
+            moved = dent(staggered, depth, centre=(4.0, 2 + n / 6))
+            clock.call_s = 10e-6 if n % 2 else 0.0
+            begin = clock.now
+            field = tracker.update(frame_ohm(staggered, moved))
+            assert clock.now - begin <= deadline_us * 1e-6 + 10e-6
+            assert np.isfinite(field.displacement_m).all()
+            cut += sk.Status.DEADLINE in field.status
+            if clock.call_s == 0.0:
+                assert field.trusted
+                assert np.abs(field.displacement_m - moved).max() < 1e-4 * staggered.height_m
+        assert cut > 0
+
     def test_an_impossible_deadline_still_serves_a_wire_a_frame(self, staggered, stream, monkeypatch):
         tracker = ExactTracker(staggered, deadline_us=1e-3)
         Clock(monkeypatch, 20e-6)

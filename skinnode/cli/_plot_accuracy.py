@@ -68,6 +68,7 @@ def _front(axes: Any, panel: dict[str, Any]) -> None:
         axes.step(us, error, where="post", color="0.2", lw=1.0, label="Pareto front")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.set_xlim(15, 2e4)
     axes.set_title(f"four wires, no noise, {panel['scene']}", fontsize=10)
     axes.set_xlabel("µs a wire")
     axes.grid(color="0.9", lw=0.5)
@@ -144,4 +145,4 @@ def _time(axes: Any, rows: list[dict[str, Any]]) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("µs a frame")
     axes.set_title("time of a tracked frame, staggered h=0.5", fontsize=10)
-    axes.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.2), markerscale=0.4)
+    axes.legend(fontsize=8, frameon=False, loc="upper right", markerscale=0.4)

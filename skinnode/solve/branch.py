@@ -75,7 +75,10 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         spread = covariance @ jt
         inner = jt.T @ spread
         inner[np.diag_indices_from(inner)] += noise * noise
-        x = rest + spread @ np.linalg.solve(inner, (x - rest) @ jt - (a * f - 1.0))
+        try:
+            x = rest + spread @ np.linalg.solve(inner, (x - rest) @ jt - (a * f - 1.0))
+        except np.linalg.LinAlgError:
+            x = np.full_like(rest, np.nan)
         if not np.isfinite(x).all():
             return rest.copy(), count + 1
     return x, len(NOISE_LEVELS)
@@ -98,6 +101,5 @@ def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Floa
     for side in (DIFFERENCE, -DIFFERENCE):
         potential_jacobian(x + side * v, problem.lower, f, jt)
         slopes.append(v @ (jt * a))
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        curvature = w @ (slopes[0] - slopes[1]) / (2.0 * DIFFERENCE)
-        return np.asarray(x - 2.0 * least / curvature * v)
+    curvature = w @ (slopes[0] - slopes[1]) / (2.0 * DIFFERENCE)
+    return np.asarray(x - 2.0 * least / curvature * v)

@@ -87,9 +87,10 @@ def solve_path(
         raise ValueError(f"samples_ohm: got {samples[where]} at {list(where)}, must be positive")
     problem = PatchProblem.of(layout, baseline_ohm)
     start = time.perf_counter()
-    walk = Walk(problem, samples * problem.gain, code)
-    (Uniform() if schedule is None else schedule).follow(walk)
-    walk.doubt_twins()
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a diverged wire, told by its status
+        walk = Walk(problem, samples * problem.gain, code)
+        (Uniform() if schedule is None else schedule).follow(walk)
+        walk.doubt_twins()
     displacement = problem.displacement_m(walk.solver.x)
     position, steps, evaluations, optimality = walk.log
     total = int(evaluations.sum())

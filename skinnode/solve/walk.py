@@ -30,6 +30,8 @@ rough; 3 in 100 right roots have a twin as smooth, and lose their CONVERGED."""
 ROUGH: Final = 1.0
 """√(uᵀ C⁻¹ u) of a press is 0.7 of its size, to 1.7 where it moves one electrode; of wrong roots 1 to 2.
 Above, the smoothest displacement is looked for."""
+GUIDED_STEPS: Final = 100
+"""A guided start is next to its root or next to none: 1 to 20 steps."""
 SAME: Final = 1e-3
 """Two solutions closer than that share of the displacement are one root."""
 TWIN_TOLERANCE: Final = 1e-9
@@ -96,7 +98,8 @@ class Walk:
         move = share[:, None] * (x - x_before)
         longest = np.abs(move).max(axis=1, keepdims=True)
         reach = self.problem.step_limit
-        self.solver.x[:] = x + move * reach / np.maximum(longest, reach)
+        move *= reach / np.maximum(longest, reach)
+        self.solver.x[:] = x + np.where(np.isfinite(move), move, 0.0)
 
     def solve(self, sample: int, tolerance: float, most_steps: int) -> Index:
         """Solve a sample from where the wires are; (U,) steps, 0 where the first-order optimality was below
@@ -157,9 +160,8 @@ class Walk:
             solver.x[u], evaluations[u] = guided_start(self.problem, u, self._knots[-1, u], covariance)
         at = np.where(todo, self.samples - 1.0, math.nan)
         self._log.append((at, evaluations, evaluations, np.full(self.wires, math.nan)))
-        self._take(todo, tolerance, most_steps, op.LEVENBERG_MARQUARDT)
-        with np.errstate(over="ignore", invalid="ignore"):
-            smoother = self.smoothness.roughness(solver.x) < self.smoothness.roughness(x)
+        self._take(todo, tolerance, min(most_steps, GUIDED_STEPS), op.LEVENBERG_MARQUARDT)
+        smoother = self.smoothness.roughness(solver.x) < self.smoothness.roughness(x)
         was, came = kept[0] == op.CONVERGED, self.status == op.CONVERGED
         confirmed = came & (
             np.abs(solver.x - x).max(axis=1) <= SAME * np.abs(x - self.problem.rest).max(axis=1)
@@ -273,9 +275,8 @@ class Walk:
 
     def _rough(self) -> Mask:
         """(U,) wires whose displacement is too rough for a press."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            moved = np.sqrt(((self.solver.x - self.problem.rest) ** 2).sum(axis=1)) / self.problem.step_limit
-            return np.asarray(self.smoothness.roughness(self.solver.x) > ROUGH * moved)
+        moved = np.sqrt(((self.solver.x - self.problem.rest) ** 2).sum(axis=1)) / self.problem.step_limit
+        return np.asarray(self.smoothness.roughness(self.solver.x) > ROUGH * moved)
 
     def _on_branch(self) -> Mask:
         """(U,) wires whose last solve came to a root on the branch of the rest position."""

@@ -3,7 +3,8 @@
 A wire is solved for all coordinates of its electrodes, or for fewer: some electrodes only, the others at
 rest (``Solver.electrodes``), and z only (``normal_only``). Fewer unknowns than equations make a tall system,
 whose χ² = Σ (ρ_k/σ_k)² at the minimum is a test: above its 1 − 1e-9 quantile no position explains the
-frame, and the wire is ILL_CONDITIONED. This stands for the sign of det J, which only a square system has.
+frame, and the wire is ILL_CONDITIONED; from the 95 % quantile on the deviations grow by √(χ²/dof) (Birge,
+Phys. Rev. 40, 207, 1932). This stands for the sign of det J, which only a square system has.
 
 Before that a wire can be held: ρ_k = a_k F_k(x) − 1 at its last position is known without evaluating F,
 which the last solve did, and within noise when Σ (ρ_k/σ_k)² is below its 99 % quantile. In ρ the noise of the

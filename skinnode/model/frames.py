@@ -90,6 +90,9 @@ class FieldFrame:
     stamp: ScanStamp | None = None
     method: str = "exact"
     """``exact``: each wire inverted; ``posterior``: the patch estimated with its elastic prior."""
+    by_prior: NDArray[np.bool_] | None = None
+    """(U,) wires of an exact field that were estimated with the prior, since their own equations did not
+    do."""
     contacts: tuple[Contact, ...] = ()
     """Found by the posterior, the strongest first."""
     gain: Float | None = None

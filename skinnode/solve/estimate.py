@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -118,6 +119,8 @@ class Estimator:
         self._factored: tuple[Float, float] | None = None
         self._stiffness: Float | None = None  # (3Q,) k of each load by the factors at hand
         self.evaluations = self.factorisations = 0
+        self.until = math.inf
+        """Time of :func:`time.perf_counter` after which a solve is broken off with a TimeoutError."""
         self.reset(1.0)
 
     def reset(self, scale2: float) -> None:
@@ -170,8 +173,8 @@ class Estimator:
         """(Q,) squares of the loads found, freed from what the prior took of them: the largest of the three
         components.
 
-        A load whose own prior is taken away has the estimate q / s² k and the variance 1/k − s², k being what a
-        unit of it adds to χ² (Tipping and Faul, Fast marginal likelihood maximisation for sparse Bayesian
+        A load whose own prior is taken away has the estimate q / s² k and the variance 1/k − s², k being what
+        a unit of it adds to χ² (Tipping and Faul, Fast marginal likelihood maximisation for sparse Bayesian
         models, 2003).
         """
         own = np.repeat(self.scale2 * self.share, 3)
@@ -298,6 +301,8 @@ class Estimator:
         return bool(np.array_equal(new > 0, old > 0) and (np.abs(new - old) <= 0.1 * old).all())
 
     def _linearise(self, data: Data, moved: Float) -> None:
+        if self.until < math.inf and perf_counter() > self.until:
+            raise TimeoutError
         b = self._b
         kernels.linearise(self._problem.rest + moved, self._problem.lower, data.a, data.weight, b.r, b.jt)
         self.evaluations += len(moved)

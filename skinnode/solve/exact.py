@@ -131,7 +131,7 @@ class ExactTracker:
             )
         self.layout = layout
         self._problem = PatchProblem.of(layout, baseline_ohm)
-        self._stiffness = stiffness_n_per_m
+        self.stiffness_n_per_m = stiffness_n_per_m
         self._noise, self._sigma = self._checked_noise(relative_noise)
         self._hold = hold
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
@@ -247,9 +247,17 @@ class ExactTracker:
             status=tuple(map(Status, status.tolist())),
             residual=residual,
             stats=SolveStats(self._evaluations, self._evaluations, self._steps, perf_counter() - start),
-            force_n=None if self._stiffness is None else self._stiffness * displacement,
+            force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
             held=held,
         )
+
+    def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
+        """Go on from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
+        moved = (displacement_m / self.layout.pitch_m).reshape(self._x.shape)
+        for u in np.flatnonzero(wires_).tolist():
+            self._x[u] = self._problem.rest[u] + moved[u]
+            self._a[u] = 1.0 / (1.0 + self._relative_residual(self._x[u], np.ones(self.layout.shape[1])))
+            self._predictable[u] = False
 
     def _solve(self, todo: NDArray[np.uint8], frame: _Frame) -> NDArray[np.bool_]:
         """Solve the wires in ``todo`` for the frame, in turn where there is a deadline; (U,) who had one."""

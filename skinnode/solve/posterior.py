@@ -10,8 +10,8 @@ judge     a wire whose residual no deformation explains is left out, named, and 
 from __future__ import annotations
 
 import math
-import time
-from typing import Any, Final
+from time import perf_counter
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,11 +22,10 @@ from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
 from skinnode.solve.contacts import ContactFinder
 from skinnode.solve.estimate import Data, Estimator, Index
+from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.prior import ElasticPrior
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.wires import A_MAX, A_MIN
-
-perf_counter = time.perf_counter
 
 DRIFTS: Final = ("none", "patch", "wire")
 
@@ -78,6 +77,8 @@ class Posterior:
             size of the electrodes, conductivity under strain): half of its variance in common, half singly.
         normal_only: electrodes move along z only, which asks a third of the unknowns.
         hold: solve only wires that were touched, and nothing where nothing moved.
+        deadline_us: an update returns after this time and at most one more factorisation; what could not be
+            solved by then is DEADLINE.
 
     Compiles its kernels on the first frame. Raises ValueError for arguments of the wrong shape or range.
     """
@@ -96,7 +97,7 @@ class Posterior:
         model_error: float = 0.0,
         normal_only: bool = False,
         hold: bool = True,
-        prior: ElasticPrior | None = None,
+        deadline_us: float | None = None,
     ) -> None:
         if drift not in DRIFTS:
             raise ValueError(f"drift: got {drift!r}, must be one of {', '.join(DRIFTS)}")
@@ -104,6 +105,8 @@ class Posterior:
             raise ValueError(f"drift_std: got {drift_std}, must be positive and finite")
         if not (math.isfinite(model_error) and model_error >= 0):
             raise ValueError(f"model_error: got {model_error}, must be finite and at least 0")
+        if deadline_us is not None and not (math.isfinite(deadline_us) and deadline_us > 0):
+            raise ValueError(f"deadline_us: got {deadline_us}, must be positive and finite")
         if scale_m is not None and not (math.isfinite(scale_m) and scale_m > 0):
             raise ValueError(f"scale_m: got {scale_m}, must be positive and finite")
         self.layout = layout
@@ -114,7 +117,8 @@ class Posterior:
         self._hold = hold
         wires, electrodes = layout.upper_m.shape[:2]
         self._free = np.arange(2, 3 * electrodes, 3) if normal_only else np.arange(3 * electrodes)
-        self._prior = ElasticPrior.of(layout, rubber) if prior is None else prior
+        self._prior = ElasticPrior.of(layout, rubber)
+        self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
         self._gains = {"none": 0, "patch": 1, "wire": wires}[drift]
         self._d = np.full(self._gains + (model_error > 0), drift_std**2)
         if model_error > 0:
@@ -153,7 +157,8 @@ class Posterior:
         Args:
             frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
             valid: (U, K) bool, False where a chunk or wire is missing; default all.
-            relative_noise: as in the constructor, of this frame only.
+            relative_noise: as in the constructor, of this frame only; what is not positive and finite makes
+                its resistance unused.
 
         Never raises for numbers. A wire without usable resistances is estimated from its neighbours, and its
         deviation says so. A wire that no deformation explains is INCONSISTENT and left out of the estimate.
@@ -162,22 +167,28 @@ class Posterior:
         """
         start = perf_counter()
         frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        noise = self._noise if relative_noise is None else checked_noise(relative_noise, self.layout)
+        noise = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
         with np.errstate(over="ignore", invalid="ignore"):
             a = frame * self._problem.gain
-        usable = (a > A_MIN) & (a < A_MAX)
+        known = (noise > 0) & (noise < NOISE_MAX)
+        noise = np.where(known, noise, 1.0)
+        usable = known & (a > A_MIN) & (a < A_MAX)
         if valid is not None:
             usable &= checked_mask(valid, self.layout)
         a = np.where(usable, a, self._problem.a_rest)
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
+        estimator.until = start + self._seconds
         estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
         data = self._data(a, noise, usable)
         if self._is_quiet(data):
             held = np.ones(len(a), bool)
             status = np.full(len(a), Status.CONVERGED)
         else:
-            status, held = self._solve(data, a, noise, usable)
+            try:
+                status, held = self._solve(data, a, noise, usable)
+            except TimeoutError:
+                status, held = self._give_up(Status.DEADLINE)
             data = self._data(a, noise, usable)
         return self._field(data, status, held, noise, start)
 
@@ -372,25 +383,3 @@ def chi_square(count: Float, chance: float) -> Float:
     from scipy.special import chdtri
 
     return np.asarray(chdtri(np.maximum(count, 1e-9), chance))
-
-
-def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
-    """(U, K) deviations. ValueError unless they are positive and finite and of that shape or a number."""
-    try:
-        noise = np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape)
-    except (TypeError, ValueError) as error:
-        got = f"got shape {np.shape(relative_noise)}" if np.ndim(relative_noise) else f"{error}"
-        raise ValueError(f"relative_noise: {got}, must be a number or {layout.shape}") from None
-    if not ((noise > 0) & (noise < np.inf)).all():
-        worst = noise[~((noise > 0) & (noise < np.inf))][0]
-        raise ValueError(f"relative_noise: got {worst}, must be positive and finite everywhere")
-    return np.asarray(noise)
-
-
-def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
-    """``valid`` as an array. ValueError unless it is bool and has the shape of a frame."""
-    mask = np.asarray(valid)
-    if mask.dtype != np.bool_ or mask.shape != layout.shape:
-        got = f"{mask.dtype} of shape {mask.shape}"
-        raise ValueError(f"valid: got {got}, must be bool of shape {layout.shape}")
-    return mask

@@ -1,21 +1,57 @@
-"""The tracker of a live stream: one frame in, one field out."""
+"""The tracker of a live stream: one frame in, one field out, by the method that suits the patch.
+
+``exact`` inverts each wire on its own, as the paper does; ``posterior`` estimates the whole patch with its
+elastic prior. ``auto`` takes the exact inverse where the converter's noise leaves it accurate.
+
+What the exact inverse cannot solve (too few resistances, a root on another branch, a jump too far), and a
+large displacement too rough for a press, is put to the posterior, which knows the neighbouring wires.
+"""
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
+import dataclasses
+import math
+from typing import Final
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skinnode.model.elastic import Rubber
+from skinnode.model.forward import jacobian
 from skinnode.model.frames import FieldFrame
-from skinnode.model.layout import PatchLayout
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.status import Status
+from skinnode.solve.branch import Smoothness
 from skinnode.solve.exact import ExactTracker
+from skinnode.solve.posterior import Posterior
+from skinnode.solve.problem import PatchProblem
+
+METHODS: Final = ("auto", "exact", "posterior")
+EXACT_SHARE: Final = 0.0025
+"""Deviation of the exact inverse at rest, in clearances, up to which ``auto`` takes it: 2.5 % of a press of a
+tenth of the layer. 16-bit codes leave 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
+LARGE: Final = 0.1
+"""Displacement, in clearances, from which on its roughness is looked at: folds lie at larger ones still."""
+ROUGH: Final = 1.2
+"""Roughness of a displacement over its size, in the units of :class:`Smoothness`, above which it is put to
+the posterior. Presses have 0.5 to 1 and up to 1.7 where they move one electrode, wrong roots 1 to 2."""
+AGREE: Final = 6.0
+"""Deviations of both estimates within which the posterior confirms a root."""
 
 
 class Tracker:
     """Follows one patch, frame by frame. One owner; the compiled part holds no GIL.
 
     Args:
-        layout: the patch, K ≥ 3N.
-        method: ``exact``, the inverse of each wire.
-        operator, relative_noise, baseline_ohm, stiffness_n_per_m: see :class:`ExactTracker`.
+        layout: the patch.
+        method: ``exact``, ``posterior`` or ``auto``; :attr:`method` and :attr:`reason` say what came of it.
+        operator, stiffness_n_per_m, active_only: see :class:`ExactTracker`; of no use to the posterior, whose
+            forces come from ``rubber``.
+        relative_noise, baseline_ohm, hold, normal_only: see either.
+        deadline_us: an update returns after this time and at most one more step. What got no turn is
+            DEADLINE, holds its last trusted position and has an infinite deviation.
+        rubber, estimate_noise, drift, drift_std, model_error: see :class:`Posterior`. ``auto`` takes it where
+            one of the last four asks for what only the posterior can give.
 
     Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
     """
@@ -24,29 +60,181 @@ class Tracker:
         self,
         layout: PatchLayout,
         *,
-        method: str = "exact",
+        method: str = "auto",
         operator: str = "levenberg_marquardt",
         relative_noise: ArrayLike = 1e-5,
         baseline_ohm: ArrayLike | None = None,
         stiffness_n_per_m: float | None = None,
+        hold: bool = True,
+        deadline_us: float | None = None,
+        normal_only: bool = False,
+        active_only: bool = False,
+        rubber: Rubber | None = None,
+        estimate_noise: bool = False,
+        drift: str = "none",
+        drift_std: float = 0.02,
+        model_error: float = 0.0,
     ) -> None:
-        if method != "exact":
-            raise ValueError(f"method: got {method!r}, must be exact")
+        if method not in METHODS:
+            raise ValueError(f"method: got {method!r}, must be one of {', '.join(METHODS)}")
         self.layout = layout
+        self._posterior = Posterior(
+            layout,
+            relative_noise=relative_noise,
+            baseline_ohm=baseline_ohm,
+            rubber=rubber,
+            estimate_noise=estimate_noise,
+            drift=drift,
+            drift_std=drift_std,
+            model_error=model_error,
+            normal_only=normal_only,
+            hold=hold,
+            deadline_us=deadline_us,
+        )
+        nuisances = [name for name, asked in (("drift", drift != "none"), ("model_error", model_error > 0),
+                                              ("estimate_noise", estimate_noise)) if asked]  # fmt: skip
+        self.method, self.reason = _choose(layout, method, relative_noise, normal_only, nuisances)
+        if self.method == "posterior":
+            self._exact = None
+            return
         self._exact = ExactTracker(
             layout,
             operator=operator,
             relative_noise=relative_noise,
             baseline_ohm=baseline_ohm,
             stiffness_n_per_m=stiffness_n_per_m,
+            hold=hold,
+            deadline_us=deadline_us,
+            normal_only=normal_only,
+            active_only=active_only,
         )
+        problem = PatchProblem.of(layout, baseline_ohm)
+        self._smoothness, self._rest = Smoothness(problem), problem.rest
+        self._step_limit = problem.step_limit
+        self._large_m = LARGE * float(problem.clearance.min()) * layout.pitch_m
+        self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
-        self._exact.reset()
+        self._posterior.reset()
+        if self._exact is not None:
+            self._exact.reset()
+            self._confirmed = None
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
     ) -> FieldFrame:
-        """The displacement field of one frame, see :meth:`ExactTracker.update`."""
-        return self._exact.update(frame_ohm, valid, relative_noise)
+        """The displacement field of one frame.
+
+        Args:
+            frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
+            valid: (U, K) bool, False where a chunk or wire is missing; default all.
+            relative_noise: as in the constructor, of this frame only; what is not positive and finite makes
+                its resistance unused.
+
+        Never raises for numbers: what could not be solved holds its last trusted position, with an infinite
+        deviation and a status. Raises ValueError for wrong shapes.
+        """
+        if self._exact is None:
+            return self._posterior.update(frame_ohm, valid, relative_noise)
+        field = self._exact.update(frame_ohm, valid, relative_noise)
+        doubtful = self._doubtful(field)
+        if not doubtful.any():
+            return field
+        return self._refer(field, doubtful, self._posterior.update(frame_ohm, valid, relative_noise))
+
+    def _doubtful(self, field: FieldFrame) -> NDArray[np.bool_]:
+        """(U,) wires to put to the posterior: those without a root, and the rough ones."""
+        status = np.array(field.status)
+        lost = (status != Status.CONVERGED) & (status != Status.DEADLINE)
+        moved = field.displacement_m
+        large = np.abs(moved).max(axis=(1, 2)) > self._large_m
+        if large.any():
+            pitches = (moved / self.layout.pitch_m).reshape(len(moved), -1)
+            size = np.sqrt((pitches**2).sum(axis=1)) / self._step_limit
+            rough = large & (self._smoothness.roughness(self._rest + pitches) > ROUGH * size)
+            if self._confirmed is not None:  # what was confirmed a moment ago is not asked again
+                change = np.abs(moved - self._confirmed).max(axis=(1, 2))
+                rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
+            lost |= rough & (status == Status.CONVERGED)
+        return np.asarray(lost)
+
+    def _refer(self, field: FieldFrame, doubtful: NDArray[np.bool_], guide: FieldFrame) -> FieldFrame:
+        """The field with the posterior's word on the doubtful wires: confirmed, replaced, or given up."""
+        assert self._exact is not None
+        known = np.array(guide.status) == Status.CONVERGED
+        converged = np.array(field.status) == Status.CONVERGED
+        spread = np.hypot(field.displacement_std_m, guide.displacement_std_m)
+        gap = np.abs(field.displacement_m - guide.displacement_m)
+        agreed = doubtful & converged & known & (gap <= AGREE * spread).all(axis=(1, 2))
+        if agreed.any():
+            if self._confirmed is None:
+                self._confirmed = np.full_like(field.displacement_m, np.inf)
+            self._confirmed[agreed] = field.displacement_m[agreed]
+        replaced = doubtful & ~agreed & known
+        status = list(field.status)
+        for u in np.flatnonzero(doubtful & ~agreed).tolist():
+            if replaced[u]:
+                status[u] = Status.CONVERGED
+            elif converged[u]:
+                status[u] = Status.ILL_CONDITIONED
+        moved, std = field.displacement_m.copy(), field.displacement_std_m.copy()
+        residual = field.residual.copy()
+        moved[replaced], std[replaced] = guide.displacement_m[replaced], guide.displacement_std_m[replaced]
+        residual[replaced] = guide.residual[replaced]
+        std[doubtful & ~agreed & ~replaced] = np.inf
+        self._exact.adopt(replaced, moved)
+        stats = dataclasses.replace(
+            field.stats,
+            evaluations=field.stats.evaluations + guide.stats.evaluations,
+            jacobians=field.stats.jacobians + guide.stats.jacobians,
+            steps=field.stats.steps + guide.stats.steps,
+            time_s=field.stats.time_s + guide.stats.time_s,
+        )
+        force = field.force_n
+        if force is not None and self._exact.stiffness_n_per_m is not None:
+            force = self._exact.stiffness_n_per_m * moved
+        return dataclasses.replace(
+            field,
+            displacement_m=moved,
+            displacement_std_m=std,
+            status=tuple(status),
+            residual=residual,
+            stats=stats,
+            force_n=force,
+            by_prior=replaced,
+        )
+
+
+def _choose(
+    layout: PatchLayout, method: str, relative_noise: ArrayLike, normal_only: bool, nuisances: list[str]
+) -> tuple[str, str]:
+    """The method and why."""
+    if method != "auto":
+        if method == "exact" and nuisances:
+            raise ValueError(f"method: got 'exact' with {nuisances[0]}, must be posterior or auto")
+        return method, "asked for"
+    if nuisances:
+        return "posterior", f"{' and '.join(nuisances)} asked for"
+    unknowns = layout.unknowns // 3 if normal_only else layout.unknowns
+    if layout.shape[1] < unknowns:
+        return "posterior", f"{layout.shape[1]} lower wires for {unknowns} unknowns an upper wire"
+    share = exact_deviation(layout, relative_noise, normal_only)
+    chosen = "exact" if share <= EXACT_SHARE else "posterior"
+    return chosen, (
+        f"the noise leaves the exact inverse a deviation of {100 * share:.2g} % of the clearance between the "
+        f"layers at rest, where {100 * EXACT_SHARE:g} % is the limit"
+    )
+
+
+def exact_deviation(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> float:
+    """RMS deviation of the exact inverse at rest over the least clearance of an electrode: the Cramér-Rao
+    bound J⁺ diag(σ²) J⁺ᵀ. Inf where a Jacobian is singular."""
+    problem = PatchProblem.of(layout)
+    slopes = jacobian(layout, layout.upper_m) * layout.pitch_m**2 * problem.a_rest[..., None, None]
+    slopes = slopes[..., 2:] if normal_only else slopes
+    weighted = slopes.reshape(*layout.shape, -1) / np.broadcast_to(relative_noise, layout.shape)[..., None]
+    singular = np.linalg.svd(weighted, compute_uv=False)
+    with np.errstate(divide="ignore"):
+        variance = (1.0 / singular**2).sum(axis=1).mean() / weighted.shape[2]
+    return math.sqrt(float(variance)) / float(problem.clearance.min())

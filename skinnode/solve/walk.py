@@ -148,7 +148,7 @@ class Walk:
     def guide(self, todo: Mask, tolerance: float, most_steps: int) -> None:
         """Solve the last sample from the smoothest displacement that explains it, and keep the smoother root.
 
-        A root is not CONVERGED where this comes to none, or, if it is rough, to another one."""
+        Where this comes to no root, the one there was is not CONVERGED."""
         if not todo.any():
             return
         solver = self.solver
@@ -163,14 +163,11 @@ class Walk:
         self._take(todo, tolerance, min(most_steps, GUIDED_STEPS), op.LEVENBERG_MARQUARDT)
         smoother = self.smoothness.roughness(solver.x) < self.smoothness.roughness(x)
         was, came = kept[0] == op.CONVERGED, self.status == op.CONVERGED
-        confirmed = came & (
-            np.abs(solver.x - x).max(axis=1) <= SAME * np.abs(x - self.problem.rest).max(axis=1)
-        )
         back = todo & was & ~(came & smoother)
         solver.x[back], self._inverse[back] = x[back], inverse[back]
         for now, then in zip((self.status, self.residual, self.error_estimate), kept, strict=True):
             now[back] = then[back]
-        self.status[(back & ~came) | (todo & was & ~confirmed & self._rough())] = op.ILL_CONDITIONED
+        self.status[back & ~came] = op.ILL_CONDITIONED
 
     def doubtful(self) -> Mask:
         """(U,) wires that came to no root, or to one too rough for a press, or had to take a step back."""

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.solve.problem import PatchProblem
 from skinnode.solve.schedule import shortest_cycle
+from skinnode.solve.walk import Walk
 
 from .press import frame_ohm, hertz_press
 
@@ -204,6 +206,23 @@ def test_adaptive_goes_by_the_samples_there_are(layout):
     assert wire_errors(path, slide(1)).max() < 1e-6
     between = np.isfinite(path.position) & (path.position < 12)
     assert between.any()
+
+
+def test_a_step_that_leaves_the_branch_is_taken_back():
+    layout = staggered(1.0)
+    problem = PatchProblem.of(layout)
+    truth = hertz_press(layout, 0.5)
+    walk = Walk(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
+    everywhere, there = np.ones(10, bool), np.zeros(10)
+    arrived = walk.step(everywhere, there, 1e-9, 6)
+    assert 0 < arrived.sum() < 10
+    at = problem.displacement_m(walk.solver.x)
+    np.testing.assert_array_equal(at[~arrived], 0)
+    np.testing.assert_allclose(at[arrived], truth[arrived], atol=1e-9)
+    halfway = walk.predict(np.full(10, -0.5)) - problem.rest  # as if the step had never been tried
+    fresh = Walk(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
+    expected = fresh.predict(np.full(10, -0.5)) - problem.rest
+    np.testing.assert_array_equal(halfway[~arrived], expected[~arrived])
 
 
 def test_adaptive_is_bounded_where_there_is_no_solution(layout):

@@ -45,7 +45,7 @@ def run(
 def _rows(case: Case, chosen: Sequence[str], seeds: int) -> list[dict[str, Any]]:
     """One row a method; all of them get the same streams."""
     solvers = {name: methods.of(case, name) for name in chosen}
-    tallies = {name: Tally(case.exact) for name in chosen}
+    tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
     name_code = zlib.crc32(case.name.encode())  # a case added or moved leaves the streams of the others
     for seed in range(seeds):

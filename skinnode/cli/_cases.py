@@ -43,8 +43,8 @@ class Case:
     skin: Skin
     make: Callable[[np.random.Generator], Stream]
     methods: tuple[str, ...] = TRACKERS
-    exact: bool = False
-    """The data has no noise."""
+    converter: Converter = FINE
+    """The streams are read by it, and the user knows its noise."""
     drift: str = "none"
     model_error: float = 0.0
     """Share of the change of R that the user knows the model may get wrong."""
@@ -101,7 +101,7 @@ def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: i
     skin = Skin(layout)
     shares = np.linspace(0.0, 1.0, samples + 1)
     make = pressing(skin, depth, Converter(), shares)
-    return Case(number, name, skin, make, (*PATHS, "exact"), exact=True)
+    return Case(number, name, skin, make, (*PATHS, "exact"), Converter())
 
 
 def _noisy(number: int, name: str, layout: PatchLayout, depth: float, samples: int) -> Case:
@@ -140,13 +140,13 @@ def _sudden_and_close() -> Iterator[Case]:
         skin = Skin(preset(kind, height))
         name = f"50% between two frames, {kind} h={height:g}"
         exact = pressing(skin, 0.5, Converter(), jump[:3])
-        yield Case(4, f"{name}, exact data", skin, exact, (*PATHS, "exact"), exact=True)
+        yield Case(4, f"{name}, exact data", skin, exact, (*PATHS, "exact"), Converter())
         yield Case(4, name, skin, pressing(skin, 0.5, FINE, jump))
     for height in (0.3, 0.5):
         skin = Skin(preset("staggered", height))
         name = f"almost touching, staggered h={height:g}"
         path = pressing(skin, 1.0, Converter(), np.linspace(0, 1, 31), presses=_touching(skin))
-        yield Case(5, f"{name}, exact data", skin, path, (*PATHS, "exact"), exact=True)
+        yield Case(5, f"{name}, exact data", skin, path, (*PATHS, "exact"), Converter())
         shares = press_and_release(8)
         yield Case(5, name, skin, pressing(skin, 1.0, FINE, shares, presses=_touching(skin)))
 
@@ -173,11 +173,13 @@ def _noise() -> Iterator[Case]:
     for kind in ("staggered", "aligned"):
         skin = Skin(preset(kind, 0.5))
         for sigma in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
-            make = pressing(skin, 0.2, Converter(sigma=sigma), shares)
-            yield Case(6, f"noise {sigma:.0e}, {kind} h=0.5", skin, make)
+            converter = Converter(sigma=sigma)
+            make = pressing(skin, 0.2, converter, shares)
+            yield Case(6, f"noise {sigma:.0e}, {kind} h=0.5", skin, make, TRACKERS, converter)
         for bits in (12, 14, 16, 24):
-            make = pressing(skin, 0.2, Converter(bits=bits), shares)
-            yield Case(6, f"{bits}-bit codes, {kind} h=0.5", skin, make)
+            converter = Converter(bits=bits)
+            make = pressing(skin, 0.2, converter, shares)
+            yield Case(6, f"{bits}-bit codes, {kind} h=0.5", skin, make, TRACKERS, converter)
 
 
 def _faults() -> Iterator[Case]:
@@ -194,7 +196,7 @@ def _faults() -> Iterator[Case]:
     for name, spoil in faults.items():
         yield Case(7, name, skin, pressing(skin, 0.3, FINE, shares, spoil=spoil))
     narrow = Converter(bits=16, lo=0.7, hi=1.02)
-    yield Case(7, "saturated codes", skin, pressing(skin, 0.5, narrow, shares))
+    yield Case(7, "saturated codes", skin, pressing(skin, 0.5, narrow, shares), TRACKERS, narrow)
 
 
 def _spoilt(taken: Stream, frames: Float, valid: np.ndarray) -> Stream:
@@ -283,7 +285,7 @@ def _wrong_roots() -> Iterator[Case]:
         skin = Skin(preset("staggered", height))
         for name, detour in (("swapped electrodes", _swap), ("mirror branch", _mirror)):
             make = _after_detour(skin, detour, converter)
-            yield Case(9, f"{name}, staggered h={height:g}", skin, make, exact=converter.exact)
+            yield Case(9, f"{name}, staggered h={height:g}", skin, make, TRACKERS, converter)
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:

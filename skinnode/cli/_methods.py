@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ from skinnode.solve.schedule import Adaptive, Uniform
 from skinnode.solve.tracker import Tracker
 
 Method = Callable[[Stream], Solved]
-EXPECTED: Final = 1e-5
-"""Noise told on construction; every frame then comes with its own."""
 
 
 def of(case: Case, name: str) -> Method:
@@ -63,7 +61,11 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
     """A solver of the case: ``exact``, ``posterior`` or ``auto``."""
-    common: dict[str, Any] = {"relative_noise": EXPECTED, "baseline_ohm": case.skin.rest_ohm}
+    # every frame comes with its own noise as well
+    common: dict[str, Any] = {
+        "relative_noise": case.converter.relative_std,
+        "baseline_ohm": case.skin.rest_ohm,
+    }
     if name == "exact":
         return Tracker(case.skin.layout, method="exact", **common)
     if case.drift != "none":

@@ -9,6 +9,7 @@ contact resistance in series. Converters spoil them as real ones do.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -176,6 +177,14 @@ class Converter:
     def exact(self) -> bool:
         """Whether a reading is the resistance itself."""
         return self.sigma == 0.0 and self.bits == 0
+
+    @property
+    def relative_std(self) -> float:
+        """Deviation of a reading at rest, relative: what its user knows about it."""
+        if self.exact:
+            return EXACT_NOISE
+        rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0
+        return math.hypot(self.sigma, rounding)
 
     def read(
         self, resistance: Float, rest: Float, rng: np.random.Generator

@@ -61,8 +61,8 @@ LOCAL_FLOOR: Final = 0.05
 LOCAL_CHANGE: Final = 0.35
 """Share of the expected loads that must have moved elsewhere before the prior is made anew: at 0.5 frames of
 a slow press reach 6 deviations, at 0.25 twice as many frames pay for it."""
-PRIOR_DOUBT: Final = 2.0
-"""A coordinate of which the data say nothing has √3 times the deviation of the prior, one that they determine
+PRIOR_DOUBT: Final = 3.0
+"""A coordinate of which the data say nothing has twice the deviation of the prior, one that they determine
 its own: how much load to expect at one place is itself known to a factor only. Without, one frame in four has
 a coordinate beyond 5 deviations where a layout hardly sees the shear (`aligned`)."""
 NEAR: Final = 0.25
@@ -214,14 +214,17 @@ class Estimator:
         kernels.residuals(x, self._problem.lower, data.a, data.weight, b.r)
         return np.asarray(b.r - np.einsum("ukp,p->uk", data.h, self.g))
 
-    def surprise(self, data: Data, moved: Float) -> tuple[Float, Float]:
-        """How badly a displacement explains the frame: (U,) χ² of each wire, and by how many deviations a
-        single coordinate is off at most. χ² alone overlooks what moves one electrode by 7 deviations."""
+    def surprise(self, data: Data, moved: Float) -> tuple[Float, Float, Float]:
+        """How badly a displacement explains the frame: (U,) χ² of each wire, (U,) by how many deviations a
+        single coordinate is off at most, and (U, f) by how much each would be, pitches.
+
+        χ² alone overlooks what moves one electrode by 7 deviations.
+        """
         self._linearise(data, moved)
         r = np.ascontiguousarray(self._b.r - np.einsum("ukp,p->uk", data.h, self.g))
-        sharpest = np.empty(len(r))
-        kernels.sharpest(self._free, self._b.jt, r, sharpest)
-        return (r**2).sum(axis=1), sharpest
+        move, top = np.empty((len(r), self._free.size)), np.empty(len(r))
+        kernels.single_moves(self._free, self._b.jt, r, move, top)
+        return (r**2).sum(axis=1), top, move
 
     def track(self, data: Data, members: Index) -> bool:
         """Solve from the displacement at hand; False where that leads nowhere near."""
@@ -257,11 +260,15 @@ class Estimator:
         self._measure(data)
         return self._chord(data) or self.track(data, members)
 
-    def signal(self, data: Data) -> float:
-        """What a field of scale 1 adds to χ² of the resistances at rest, on the average."""
-        every = np.arange(len(self.moved))
-        self._linearise(data, np.zeros_like(self.moved))
-        return self._assemble(data, every, 1.0, np.zeros_like(self.moved))
+    def signal(self) -> Float:
+        """(U, K) variance of each relative change of R at rest under a prior of scale 1, pitch⁻²."""
+        wires, f = len(self.moved), self._free.size
+        a = self._problem.a_rest
+        plain = Data(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
+        self._linearise(plain, np.zeros_like(self.moved))
+        slopes = self._b.jt[:, self._free]  # (U, f, K)
+        own = self._uniform.reshape(wires, f, wires, f)[np.arange(wires), :, np.arange(wires)]
+        return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, data: Data, members: Index) -> float:
         """s² at which the resistances would differ from those at rest as much as they do."""

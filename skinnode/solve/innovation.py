@@ -117,15 +117,19 @@ def residuals(x: Float, lower: Float, a: Float, weight: Float, r: Float) -> None
 
 
 @njit
-def sharpest(free: Index, jt: Float, r: Float, top: Float) -> None:
-    """The largest |Jᵢᵀ r| / ‖Jᵢ‖ of each wire into ``top`` (U,): by how many deviations a coordinate is off."""
+def single_moves(free: Index, jt: Float, r: Float, move: Float, top: Float) -> None:
+    """By how much each coordinate alone would have to move, Jᵢᵀ r / ‖Jᵢ‖², into ``move`` (U, f), and the
+    largest of a wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
     for u in range(jt.shape[0]):
         top[u] = 0.0
         for i in range(free.size):
             row = jt[u, free[i]]
-            norm = dot(row, row)
-            if norm > 0.0:
-                top[u] = max(top[u], abs(dot(row, r[u])) / math.sqrt(norm))
+            square = dot(row, row)
+            move[u, i] = 0.0
+            if square > 0.0:
+                along = dot(row, r[u])
+                move[u, i] = along / square
+                top[u] = max(top[u], abs(along) / math.sqrt(square))
 
 
 @njit_part

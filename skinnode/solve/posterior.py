@@ -31,8 +31,8 @@ DRIFTS: Final = ("none", "patch", "wire")
 
 QUIET_CHANCE: Final = 0.005
 """A wire at rest, or unmoved, is taken for moved with this chance a frame: χ² test."""
-QUIET_DEVIATIONS: Final = 4.0
-"""Or where a single coordinate would have to move by more than this: one in 50 unmoved frames of 300
+QUIET_DEVIATIONS: Final = 3.7
+"""Or where a single coordinate would have to move by more than this: one in 15 unmoved frames of 300
 coordinates."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
 """A wire that obeys the model is called INCONSISTENT with at most this chance a frame."""
@@ -127,12 +127,7 @@ class Posterior:
         self._contacts = ContactFinder(self._prior, layout)
         height = float(np.median(self._problem.clearance))
         self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
-        at_rest = Data(
-            self._problem.a_rest, 1.0 / self._noise, np.zeros((*layout.shape, self._d.size)), self._d
-        )
-        self._scale_least = (
-            SCALE_LEAST**2 * layout.shape[0] * layout.shape[1] / self._estimator.signal(at_rest)
-        )
+        self._signal = self._estimator.signal()
         self.reset()
 
     def reset(self) -> None:
@@ -140,6 +135,7 @@ class Posterior:
         wires = self.layout.shape[0]
         self._estimator.reset(self._fixed_scale or self._scale_rest)
         self._factor = 1.0  # estimated noise over the noise given
+        self._scale_least = self._scale_rest
         self._members: Index = np.arange(0)
         self._kept = np.zeros(wires, np.int64)
         self._trusted = np.zeros_like(self._estimator.moved)  # last field that passed, its nuisances
@@ -148,6 +144,7 @@ class Posterior:
         self._force = np.zeros((*self.layout.upper_m.shape,))
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
+        self._overlooked = np.zeros_like(self._estimator.std)
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -181,6 +178,7 @@ class Posterior:
         estimator.until = start + self._seconds
         estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
         data = self._data(a, noise, usable)
+        self._set_least(data)
         if self._is_quiet(data):
             held = np.ones(len(a), bool)
             status = np.full(len(a), Status.CONVERGED)
@@ -214,6 +212,13 @@ class Posterior:
             h[..., -1] = weight * change
         return Data(a, weight, h, self._d)
 
+    def _set_least(self, data: Data) -> None:
+        """The smallest scale at the noise of the frame."""
+        power = float((data.weight**2 * self._signal).sum())
+        count = np.count_nonzero(data.weight)
+        least = SCALE_LEAST**2 * count / power if power > 0 else math.inf
+        self._scale_least = min(least, self._scale_most)
+
     def _is_quiet(self, data: Data) -> bool:
         """Whether the last field explains the frame within noise. A member's residual is the difference of
         two noises, its own and the one that was solved into the field."""
@@ -221,13 +226,17 @@ class Posterior:
             return False
         noises = np.ones(len(self._wires))
         noises[self._members] = 2.0
-        return not self._stirred(data, self._trusted, noises).any()
+        stirred, self._overlooked = self._stirred(data, self._trusted, noises)
+        return not stirred.any()
 
-    def _stirred(self, data: Data, moved: Float, noises: float | Float = 1.0) -> NDArray[np.bool_]:
-        """(U,) wires whose residuals are beyond noise of variance ``noises``."""
-        total, sharpest = self._estimator.surprise(data, moved)
+    def _stirred(
+        self, data: Data, moved: Float, noises: float | Float = 1.0
+    ) -> tuple[NDArray[np.bool_], Float]:
+        """(U,) wires whose residuals are beyond noise of variance ``noises``; (U, f) how far each coordinate
+        seems to have moved, were it the only one."""
+        total, sharpest, move = self._estimator.surprise(data, moved)
         limit = chi_square(np.count_nonzero(data.weight, axis=1).astype(float), QUIET_CHANCE)
-        return np.asarray((total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises)))
+        return (total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises)), np.abs(move)
 
     def _squares(self, data: Data, moved: Float) -> tuple[Float, Float]:
         """(U,) Σ (residual/σ)² and number of equations."""
@@ -237,7 +246,7 @@ class Posterior:
     def _touched(self, data: Data) -> Index:
         """Wires whose resistances are not those at rest; one in the last solve stays a little longer."""
         at_rest = np.zeros_like(self._trusted)
-        touched = self._stirred(data, at_rest)
+        touched, _ = self._stirred(data, at_rest)
         total, count = self._squares(data, at_rest)
         stay = np.zeros(len(total), bool)
         stay[self._members] = True
@@ -266,7 +275,7 @@ class Posterior:
                 return self._give_up(Status.NON_FINITE)
             total, count = self._squares(data, estimator.moved)
             left = np.setdiff1d(self._wires, wanted)
-            surprised = left[self._stirred(data, estimator.moved)[left]] if left.size else left
+            surprised = left[self._stirred(data, estimator.moved)[0][left]] if left.size else left
             if surprised.size:  # moved, and not as the others say, or stayed where they say it moved
                 self._kept[surprised] = KEPT
                 wanted = np.union1d(wanted, surprised)
@@ -355,6 +364,8 @@ class Posterior:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std = np.zeros_like(self._trusted)
         std[:, self._free] = estimator.std
+        if held.all():  # half of what it may overlook
+            std[:, self._free] = np.maximum(estimator.std, 0.5 * self._overlooked)
         if self._known and not held.all():
             self._force, self._contacts_found = self._contacts.find(estimator)
         r = estimator.residuals(data, self._trusted) * self._factor * noise

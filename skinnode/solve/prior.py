@@ -30,8 +30,8 @@ MARGIN: Final = 2
 all over the patch and half off it by less than 1 in 800."""
 SHEAR_SHARE: Final = 0.4
 """Deviation of the shear loads as a share of that of the normal ones: a contact that slides at a friction of
-0.6 lies at 1.5 deviations. From 0.25 to 0.4 the evidence changes by 2 %; below, layouts that hardly see the shear
-(`aligned`) promise more than they know."""
+0.6 lies at 1.5 deviations. From 0.25 to 0.4 the evidence changes by 2 %; below, layouts that hardly see the
+shear (`aligned`) promise more than they know."""
 SLACK: Final = 0.005
 """ε as a share of the deviation of the normal displacement. From 0.001 to 0.02 it changes nothing; it keeps C
 regular."""

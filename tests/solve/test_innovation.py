@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 import skinnode as sk
 from skinnode.solve import innovation
 from skinnode.solve.dense import cholesky
-from skinnode.solve.estimate import Data, Estimator
+from skinnode.solve.estimate import PRIOR_DOUBT, Data, Estimator
 from skinnode.solve.prior import ElasticPrior
 from skinnode.solve.problem import PatchProblem
 
@@ -255,7 +255,7 @@ def test_covariance_and_directions_known_are_the_textbooks(name):
     covariance = covariance[:n, :n]
     np.testing.assert_allclose(solver.covariance(), covariance, rtol=0, atol=0.01 * covariance.max())
     variance, prior = np.diag(covariance), it.scale2 * np.diag(it.c)
-    widened = np.sqrt(variance * (1 + 2 * variance / prior))
+    widened = np.sqrt(variance * (1 + PRIOR_DOUBT * variance / prior))
     np.testing.assert_allclose(solver.std.ravel(), widened, rtol=0.02)
     if not it.data.d.size:
         known = n - np.trace(np.linalg.solve(it.scale2 * it.c, covariance))
@@ -301,11 +301,12 @@ def test_sharpest_is_the_wald_test_of_each_coordinate():
     it = case(lower=40, nuisances=0, missing=True)
     moved = np.zeros((3, 12))
     r, j, _ = it.system(moved)
-    total, sharpest = estimator(it).surprise(it.data, moved)
+    total, sharpest, moves = estimator(it).surprise(it.data, moved)
     for u in range(3):
         best = 0.0
-        for column in j[u, :, u].T:
+        for i, column in enumerate(j[u, :, u].T):
             step = np.linalg.lstsq(column[:, None], -r[u], rcond=None)[0][0]
+            assert abs(moves[u, i]) == pytest.approx(abs(step), rel=1e-6)
             best = max(best, (r[u] ** 2).sum() - ((r[u] + column * step) ** 2).sum())
         assert sharpest[u] == pytest.approx(np.sqrt(best), rel=1e-6)
         assert total[u] == pytest.approx((r[u] ** 2).sum(), rel=1e-9)

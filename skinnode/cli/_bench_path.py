@@ -168,14 +168,14 @@ def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int
         times.append(time.perf_counter() - start)
     errors = [one.error(path) for one, path in zip(made, paths, strict=True)]
     good = [path.status == (Status.CONVERGED,) for path in paths]
-    before = [path.evaluations[path.searched :][:-1] for path in paths]
+    before = [path.evaluations[_walked(path)][:-1] for path in paths]
     reached = [error for error, converged in zip(errors, good, strict=True) if converged]
     cycles = [path.cycle for path in paths if path.cycle is not None]
     return {
         "steps": samples,
         "calls_per_step": _mean([float(each.mean()) for each in before if each.size]),
         "evaluations": _mean([path.stats.evaluations for path in paths]),
-        "iterations": _mean([float(path.steps[path.searched :].sum()) for path in paths]),
+        "iterations": _mean([float(path.steps[_walked(path)].sum()) for path in paths]),
         "search_iterations": _mean([float(path.steps[: path.searched].sum()) for path in paths]),
         "cycle": statistics.median(cycles) if cycles else None,
         "tol_x": _mean(
@@ -199,8 +199,14 @@ def _mean(values: Sequence[float]) -> float | None:
     return statistics.mean(finite) if finite else None
 
 
+def _walked(path: PathResult) -> slice:
+    """Rows of the path itself: after the search for a cycle, without second tries and checks."""
+    at = path.position[path.searched :, 0]
+    return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
+
+
 def _final(path: PathResult) -> float:
-    return float(path.optimality[-1, 0])
+    return float(path.optimality[_walked(path)][-1, 0])
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
@@ -231,12 +237,12 @@ def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
     uniform = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     periodic = [one.solve(Periodic(plain=True), samples=samples) for one in made]
     return {
-        "uniform": _mean([float(path.steps.sum()) for path in uniform]),
-        "periodic": _mean([float(path.steps[path.searched :].sum()) for path in periodic]),
+        "uniform": _mean([float(path.steps[_walked(path)].sum()) for path in uniform]),
+        "periodic": _mean([float(path.steps[_walked(path)].sum()) for path in periodic]),
         "search": _mean([float(path.steps[: path.searched].sum()) for path in periodic]),
         "uniform_each": uniform[0].steps[:samples, 0].tolist(),
-        "periodic_at": (1 + periodic[0].position[periodic[0].searched :, 0]).tolist(),
-        "periodic_each": periodic[0].steps[periodic[0].searched :, 0].tolist(),
+        "periodic_at": (1 + periodic[0].position[_walked(periodic[0]), 0]).tolist(),
+        "periodic_each": periodic[0].steps[_walked(periodic[0]), 0].tolist(),
     }
 
 
@@ -250,10 +256,11 @@ def _last_step(one: Experiment, periodic: bool) -> list[float]:
         return Uniform(plain=True, final_steps=most)
 
     whole = one.solve(schedule(1000), samples=50)
-    before = int(whole.position[-2, 0]) if len(whole.position) > 1 else 0
+    walked = _walked(whole)
+    before = int(whole.position[walked][-2, 0])
     chosen = one.samples_ohm[SAMPLES // 50 - 1 :: SAMPLES // 50]
     start = solve_path(one.layout, chosen[: before + 1], schedule=Uniform(plain=True))
-    iterations = range(1, int(whole.steps[-1, 0]) + 1)
+    iterations = range(1, int(whole.steps[walked][-1, 0]) + 1)
     after = [_final(one.solve(schedule(most), samples=50)) for most in iterations]
     return [optimality(one.layout, start.upper_m, chosen[-1]), *after]
 

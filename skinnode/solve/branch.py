@@ -24,8 +24,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""ℓ. With 1.0 the guided start finds 3204 of the 3209 wires that are on the branch of the rest position, in 82
-random presses each of 70 % on staggered, h = 0.5, and of 10, 30 and 50 % on h = 1; 0.7 and 1.5 lose more."""
+"""ℓ. With 1.0 the guided start finds 3204 of the 3209 wires that are on the branch of the rest position, in
+82 random presses each of 70 % on staggered, h = 0.5, and 10, 30 and 50 % on h = 1; 0.7 and 1.5 lose more."""
 ROUGH_SHARE: Final = 1e-3
 """Share of C that is not smooth, so that C⁻¹ exists in floating point."""
 NOISE_LEVELS: Final = tuple(10.0 ** (-0.5 * np.arange(2, 16)))

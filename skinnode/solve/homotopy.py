@@ -27,7 +27,7 @@ class PathResult:
     """Where a path ended, and what each point on it cost.
 
     Row s of the last four arrays is one call of the solver, in order; a wire the call left alone has a
-    position and an optimality of NaN.
+    position and an optimality of NaN. After the first row at the last sample come second tries and checks.
     """
 
     upper_m: Float

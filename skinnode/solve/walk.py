@@ -25,9 +25,9 @@ TWIN_REACH: Final = 2.0
 least 1.3 times as rough on staggered, h = 0.3 … 1."""
 TWIN_ROUGHNESS: Final = 1.05
 """Of two roots at a fold the smoother is taken for true where the other is rougher by this factor. Over 82
-random presses of 50 % on staggered, h = 1, the twins of wrong roots were at most 1.044 times as rough; 4 in 100
-right roots have a twin as smooth, and lose their CONVERGED. On 60 presses more of each depth and height (6710
-wires in all, h = 0.3 to 1) no wrong root ended CONVERGED, on 40 others (4510) one did."""
+random presses of 50 % on staggered, h = 1, the twins of wrong roots were at most 1.044 times as rough; 4 in
+100 right roots have a twin as smooth, and lose their CONVERGED. Of 60 presses more of each depth and height
+(6710 wires, h = 0.3 to 1) no wrong root ended CONVERGED, of 40 others (4510) one did."""
 ROUGH: Final = 0.8
 """√(uᵀ C⁻¹ u) of a press is 0.67 of its size, less than 0.9 for nine in ten and to 1.9 where it moves one
 electrode; of wrong roots 0.7 to 2. Above, the smoothest displacement is looked for."""

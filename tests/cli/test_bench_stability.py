@@ -236,9 +236,9 @@ def test_the_fingertip_is_the_flat_patch_bent() -> None:
     skin = CASES["fingertip, 30%"].skin
     assert skin.layout.pitch_m == pytest.approx(4e-3, rel=0.02)
     taken = CASES["fingertip, 30%"].make(np.random.default_rng(1))
-    deepest = np.unravel_index(np.linalg.norm(taken.truth_m[3], axis=-1).argmax(), (10, 10))
+    deepest = np.unravel_index(np.linalg.norm(taken.truth_m[2], axis=-1).argmax(), (10, 10))
     out = skin.axes[deepest][2]
-    assert taken.truth_m[3][deepest] @ out < -0.8 * np.linalg.norm(taken.truth_m[3][deepest])
+    assert taken.truth_m[2][deepest] @ out < -0.8 * np.linalg.norm(taken.truth_m[2][deepest])
 
 
 # --- command

@@ -295,7 +295,9 @@ class Estimator:
     def covariance(self) -> Float:
         """(U f, U f) of the displacement, pitch²."""
         v = self._b.whitened[: self.members.size * self._rows]
-        return np.asarray(self.scale2 * self._covariance - v.T @ v)
+        told = np.empty_like(self._covariance)
+        multiply(np.ascontiguousarray(v.T), v, told)
+        return np.asarray(self.scale2 * self._covariance - told)
 
     def _fits(self, data: Data, members: Index) -> bool:
         """Whether the factors at hand were made for these wires, noise and scale."""

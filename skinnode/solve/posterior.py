@@ -145,6 +145,7 @@ class Posterior:
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
         self._overlooked = np.zeros_like(self._estimator.std)
+        self._seen = np.zeros(self.layout.shape, bool)  # resistances that the trusted field had
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -188,7 +189,7 @@ class Posterior:
             except TimeoutError:
                 status, held = self._give_up(Status.DEADLINE)
             data = self._data(a, noise, usable)
-        return self._field(data, status, held, noise, start)
+        return self._field(data, status, held, start)
 
     def covariance_m2(self) -> Float:
         """(3UN, 3UN) covariance of the displacement of the last solved frame; 0 for coordinates that are not
@@ -222,8 +223,8 @@ class Posterior:
     def _is_quiet(self, data: Data) -> bool:
         """Whether the last field explains the frame within noise. A member's residual is the difference of
         two noises, its own and the one that was solved into the field."""
-        if not (self._hold and self._known):
-            return False
+        if not (self._hold and self._known and np.array_equal(data.weight > 0, self._seen)):
+            return False  # fewer resistances know less of the field, more know more
         noises = np.ones(len(self._wires))
         noises[self._members] = 2.0
         stirred, self._overlooked = self._stirred(data, self._trusted, noises)
@@ -259,13 +260,15 @@ class Posterior:
         self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """(U,) statuses and wires not solved. Moves the estimator, and on success the trusted field."""
+        if not usable.any():
+            return self._give_up(Status.ILL_CONDITIONED)
         estimator = self._estimator
         status = np.full(len(a), int(Status.CONVERGED))
         self._kept -= self._kept > 0
         touched = self._touched(data)
         # it takes all wires to say that nothing is there
         wanted = touched if self._hold and touched.size else self._wires
-        usable = usable.copy()
+        seen, usable = usable, usable.copy()
         for _ in range(LEFT_OUT + 3):
             members = wanted[np.count_nonzero(data.weight[wanted], axis=1) > 0]
             if not self._converge(data, members):
@@ -293,7 +296,7 @@ class Posterior:
             return self._give_up(Status.ILL_CONDITIONED)
         self._trusted[:] = estimator.moved
         self._trusted_g[:] = estimator.g
-        self._members, self._known = members, True
+        self._members, self._known, self._seen = members, True, seen
         held = np.ones(len(a), bool)
         held[members] = False
         return status, held
@@ -358,7 +361,7 @@ class Posterior:
         return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
 
     def _field(
-        self, data: Data, status: NDArray[np.int64], held: NDArray[np.bool_], noise: Float, start: float
+        self, data: Data, status: NDArray[np.int64], held: NDArray[np.bool_], start: float
     ) -> FieldFrame:
         estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
         displacement = problem.displacement_m(problem.rest + self._trusted)
@@ -368,9 +371,9 @@ class Posterior:
             std[:, self._free] = np.maximum(estimator.std, 0.5 * self._overlooked)
         if self._known and not held.all():
             self._force, self._contacts_found = self._contacts.find(estimator)
-        r = estimator.residuals(data, self._trusted) * self._factor * noise
         used = data.weight > 0
-        rms = np.sqrt((np.where(used, r, 0.0) ** 2).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
+        r = estimator.residuals(data, self._trusted) / np.where(used, data.weight, np.inf)
+        rms = np.sqrt((r**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
         gains = self._trusted_g[: self._gains]
         return FieldFrame(
             displacement_m=displacement,

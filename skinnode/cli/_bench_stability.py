@@ -50,14 +50,15 @@ def _rows(case: Case, chosen: Sequence[str], seeds: int) -> list[dict[str, Any]]
     name_code = zlib.crc32(case.name.encode())  # a case added or moved leaves the streams of the others
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
-        truth = {True: stream.truth_m[-1:], False: stream.truth_m}
+        tracked = stream.every(case.stride)
         found: dict[str, Solved] = {}
         for name, solve in solvers.items():
             start = time.perf_counter()
+            path = methods.last_only(name)
             known = name == "auto" and seed >= TWIN_SEEDS and twins
-            found[name] = found[twins[0]] if known else solve(stream)
+            found[name] = found[twins[0]] if known else solve(stream if path else tracked)
             tallies[name].time_s += time.perf_counter() - start
-            tallies[name].add(seed, found[name], truth[methods.last_only(name)])
+            tallies[name].add(seed, found[name], stream.truth_m[-1:] if path else tracked.truth_m)
         twins = [other for other in twins if found["auto"].equals(found[other])]
     head = {"number": case.number, "case": case.name}
     same = {"auto": twins[0]} if twins and seeds > TWIN_SEEDS else {}

@@ -28,6 +28,8 @@ TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
 """About a 16-bit converter."""
+STRIDE: Final = 4
+"""A tracker gets every so many of the samples of a path."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
 """Share of the change of R that the wrong models of case 13 get wrong. Measured on a 30 % press, staggered,
@@ -46,6 +48,8 @@ class Case:
     converter: Converter = FINE
     """The streams are read by it, and the user knows its noise."""
     drift: str = "none"
+    stride: int = 1
+    """A tracker gets every so many of the frames; a path all of them."""
     model_error: float = 0.0
     """Share of the change of R that the user knows the model may get wrong."""
 
@@ -101,7 +105,7 @@ def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: i
     skin = Skin(layout)
     shares = np.linspace(0.0, 1.0, samples + 1)
     make = pressing(skin, depth, Converter(), shares)
-    return Case(number, name, skin, make, (*PATHS, "exact"), Converter())
+    return Case(number, name, skin, make, (*PATHS, "exact"), Converter(), stride=STRIDE)
 
 
 def _noisy(number: int, name: str, layout: PatchLayout, depth: float, steps: int) -> Case:
@@ -145,8 +149,8 @@ def _sudden_and_close() -> Iterator[Case]:
     for height in (0.3, 0.5):
         skin = Skin(preset("staggered", height))
         name = f"almost touching, staggered h={height:g}"
-        path = pressing(skin, 1.0, Converter(), np.linspace(0, 1, 31), presses=_touching(skin))
-        yield Case(5, f"{name}, exact data", skin, path, (*PATHS, "exact"), Converter())
+        path = pressing(skin, 1.0, Converter(), np.linspace(0, 1, 29), presses=_touching(skin))
+        yield Case(5, f"{name}, exact data", skin, path, (*PATHS, "exact"), Converter(), stride=STRIDE)
         shares = press_and_release(6)
         yield Case(5, name, skin, pressing(skin, 1.0, FINE, shares, presses=_touching(skin)))
 

@@ -226,6 +226,17 @@ class Stream:
     """(T, 3) sum of all loads; NaN as above."""
     presses: tuple[Press, ...] = ()
 
+    def every(self, stride: int) -> Stream:
+        """Every so many frames, from the first on."""
+        return Stream(
+            self.frames_ohm[::stride],
+            self.valid[::stride],
+            self.noise[::stride],
+            self.truth_m[::stride],
+            self.force_n[::stride],
+            self.presses,
+        )
+
 
 def stream(
     skin: Skin,

@@ -65,7 +65,7 @@ def sensible(kind: str) -> tuple[str, ...]:
 
 
 def narrowed(layout: PatchLayout) -> PatchLayout:
-    """The three middle upper wires. A path solves its wires one by one; nobody learns more from ten of them."""
+    """The three middle upper wires: a path solves wire by wire, and ten tell no more than three."""
     return PatchLayout(layout.upper_m[4:7], layout.lower_m, layout.resistivity_ohm_per_m)
 
 

@@ -1,11 +1,14 @@
-"""The tracker everyone uses: what it passes on."""
+"""The tracker everyone uses: what it passes on, what it chooses, and what it puts to the prior."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 import pytest
 
 import skinnode as sk
+from skinnode.model.elastic import Rubber
 from skinnode.solve.exact import ExactTracker
 
 from .press import frame_ohm, hertz_press
@@ -40,3 +43,203 @@ def test_exact_method_is_the_exact_tracker(layout):
 def test_unknown_method_is_named(layout):
     with pytest.raises(ValueError, match="method: got 'magic'"):
         sk.Tracker(layout, method="magic")
+
+
+def noisy(
+    layout: sk.PatchLayout, moved: np.ndarray, rng: np.random.Generator, sigma: float = 1e-5
+) -> np.ndarray:
+    return np.asarray(frame_ohm(layout, moved) * (1 + sigma * rng.normal(size=layout.shape)))
+
+
+def deviations(field: sk.FieldFrame, moved: np.ndarray) -> np.ndarray:
+    assert np.isfinite(field.displacement_std_m).all()
+    return np.asarray((field.displacement_m - moved) / field.displacement_std_m)
+
+
+FEW = {"upper_wires": 4, "upper_electrodes": 4, "lower_electrodes": 5}
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes", "options", "method", "reason"),
+    [
+        ("staggered", {}, {}, "exact", r"deviation of 0\.0\d+ % .* 0\.25 % is the limit"),
+        (
+            "staggered",
+            {},
+            {"relative_noise": 1e-3},
+            "posterior",
+            r"deviation of \d.* % .* 0\.25 % is the limit",
+        ),
+        ("aligned", {}, {}, "posterior", r"deviation of \d.* % .* 0\.25 % is the limit"),
+        ("aligned", {}, {"relative_noise": 1e-9}, "exact", r"deviation of 0\.0\d+ %"),
+        ("aligned", {}, {"normal_only": True}, "exact", r"deviation of 0\.\d+ %"),
+        ("staggered", {"lower_wires": 29}, {}, "posterior", "29 lower wires for 30 unknowns"),
+        ("staggered", {"lower_wires": 29}, {"normal_only": True}, "exact", "deviation of"),
+        ("staggered", {}, {"drift": "wire"}, "posterior", "drift asked for"),
+        ("staggered", {}, {"model_error": 0.01}, "posterior", "model_error asked for"),
+        (
+            "staggered",
+            {},
+            {"estimate_noise": True, "drift": "patch"},
+            "posterior",
+            "drift and estimate_noise",
+        ),
+        ("staggered", {}, {"method": "posterior"}, "posterior", "asked for"),
+        ("aligned", {}, {"method": "exact"}, "exact", "asked for"),
+    ],
+)
+def test_auto_takes_what_the_noise_allows_and_says_why(name, sizes, options, method, reason):
+    tracker = sk.Tracker(sk.PatchLayout.preset(name, **sizes), **options)
+    assert tracker.method == method
+    assert re.search(reason, tracker.reason), tracker.reason
+    field = tracker.update(frame_ohm(tracker.layout, np.zeros_like(tracker.layout.upper_m)))
+    assert field.method == method
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-5])
+def test_the_reason_is_the_deviation_that_noise_leaves(sigma):
+    """300 noisy frames at rest: their scatter over the clearance is the percentage that the reason gives."""
+    layout = sk.PatchLayout.preset("staggered", **FEW)
+    tracker = sk.Tracker(layout, relative_noise=sigma, hold=False)
+    rng = np.random.default_rng(1)
+    rest = np.zeros_like(layout.upper_m)
+    errors = [tracker.update(noisy(layout, rest, rng, sigma)).displacement_m for _ in range(300)]
+    gaps = layout.upper_m[:, :, None, None] - layout.lower_m
+    clearance = np.linalg.norm(gaps, axis=-1).min()
+    percent = 100 * np.sqrt(np.mean(np.square(errors))) / clearance
+    told = float(re.search(r"deviation of (\S+) %", tracker.reason)[1])
+    assert told == pytest.approx(percent, rel=0.1)
+
+
+def test_exact_refuses_what_it_cannot_give(layout):
+    for options, name in [({"drift": "patch"}, "drift"), ({"model_error": 0.1}, "model_error")]:
+        with pytest.raises(ValueError, match=f"method: got 'exact' with {name}"):
+            sk.Tracker(layout, method="exact", **options)
+
+
+def test_posterior_method_is_the_posterior(layout):
+    rng = np.random.default_rng(2)
+    options = {"relative_noise": 1e-4, "rubber": Rubber(1e6), "drift": "patch", "hold": False}
+    tracker, alone = sk.Tracker(layout, method="posterior", **options), sk.Posterior(layout, **options)
+    for depth in (0.0, 0.1, 0.2):
+        frame = noisy(layout, hertz_press(layout, depth, centre_m=(6e-3, 6e-3)), rng, 1e-4)
+        field, expected = tracker.update(frame), alone.update(frame)
+        np.testing.assert_array_equal(field.displacement_m, expected.displacement_m)
+        np.testing.assert_array_equal(field.force_n, expected.force_n)
+        np.testing.assert_array_equal(field.gain, expected.gain)
+        assert len(field.contacts) == len(expected.contacts)
+    tracker.reset()
+    alone.reset()
+    np.testing.assert_array_equal(tracker.update(frame).displacement_m, alone.update(frame).displacement_m)
+
+
+@pytest.mark.parametrize("lost", [1, 8, 30])
+def test_a_wire_short_of_resistances_is_estimated_with_its_neighbours(lost):
+    """Its own equations do not do: by_prior, CONVERGED, right; and exact again in the next complete frame."""
+    layout = sk.PatchLayout.preset("staggered")
+    rng = np.random.default_rng(3)
+    tracker, complete = sk.Tracker(layout), sk.Tracker(layout)
+    for depth in (0.0, 0.1, 0.2, 0.2, 0.1):
+        moved = hertz_press(layout, depth)
+        frame = noisy(layout, moved, rng)
+        complete.update(frame)
+        assert tracker.update(frame).trusted
+        frame = noisy(layout, moved, rng)
+        whole = complete.update(frame)
+        bad = frame.copy()
+        bad[4, rng.permutation(30)[:lost]] = np.nan
+        field = tracker.update(bad)
+        assert field.trusted
+        assert field.method == "exact"
+        assert field.by_prior is not None
+        assert np.flatnonzero(field.by_prior).tolist() == [4]
+        assert np.abs(deviations(field, moved)).max() < 5
+        rest = np.arange(10) != 4
+        close = 0.1 * whole.displacement_std_m[rest]
+        assert (np.abs(field.displacement_m - whole.displacement_m)[rest] <= close + 5e-6 * 4e-3).all()
+        frame = noisy(layout, moved, rng)
+        back, whole = tracker.update(frame), complete.update(frame)
+        assert back.trusted
+        assert back.by_prior is None or not back.by_prior.any()
+        assert np.abs(deviations(back, moved)).max() < 5
+
+
+@pytest.mark.parametrize("kind", ["nan", "all alike", "doubled"])
+def test_a_wire_that_nobody_can_solve_is_not_trusted_alone(kind):
+    layout = sk.PatchLayout.preset("staggered")
+    rng = np.random.default_rng(4)
+    tracker = sk.Tracker(layout)
+    for depth in (0.0, 0.1):
+        before = tracker.update(noisy(layout, hertz_press(layout, depth), rng))
+    moved = hertz_press(layout, 0.12)
+    frame = noisy(layout, moved, rng)
+    bad = frame.copy()
+    match kind:
+        case "nan":
+            bad[:] = np.nan
+        case "all alike":
+            bad[4] = bad[4].mean()
+        case _:
+            bad[4] *= 2
+    field = tracker.update(bad)
+    assert np.isfinite(field.displacement_m).all()
+    good = np.array(field.status) == sk.Status.CONVERGED
+    assert not good[4]
+    assert np.isinf(field.displacement_std_m[~good]).all()
+    z = (field.displacement_m - moved)[good] / field.displacement_std_m[good]
+    assert (np.abs(z) < 5).all()
+    np.testing.assert_array_equal(field.displacement_m[4], before.displacement_m[4])
+    assert tracker.update(frame).trusted
+
+
+@pytest.mark.parametrize(
+    ("name", "height", "depth"), [("staggered", 1.0, 0.5), ("staggered", 0.5, 0.4), ("staggered", 1.0, 0.3)]
+)
+def test_a_jump_never_ends_converged_and_wrong(name, height, depth):
+    """From rest to a deep press within one frame, each wire that claims to be CONVERGED lies within 6
+    deviations, which are a few percent of the layer at most."""
+    layout = sk.PatchLayout.preset(name, height_m=height * 4e-3)
+    rng = np.random.default_rng(5)
+    tracker = sk.Tracker(layout, method="exact")
+    claimed = 0
+    for _ in range(12):
+        tracker.reset()
+        tracker.update(noisy(layout, np.zeros_like(layout.upper_m), rng))
+        moved = hertz_press(layout, depth, centre_m=tuple(rng.uniform(8e-3, 28e-3, 2)))
+        for _ in range(2):
+            field = tracker.update(noisy(layout, moved, rng))
+            good = np.array(field.status) == sk.Status.CONVERGED
+            claimed += int(good.sum())
+            error = np.abs(field.displacement_m - moved)[good]
+            assert (error < 6 * field.displacement_std_m[good]).all()
+            assert error.max(initial=0.0) < 0.15 * layout.height_m
+    assert claimed > 120  # of 240
+
+
+def test_wires_solved_by_prior_carry_the_force_of_their_stiffness():
+    layout = sk.PatchLayout.preset("staggered")
+    rng = np.random.default_rng(6)
+    tracker = sk.Tracker(layout, stiffness_n_per_m=250.0)
+    tracker.update(noisy(layout, np.zeros_like(layout.upper_m), rng))
+    frame = noisy(layout, hertz_press(layout, 0.1), rng)
+    frame[4] = np.nan
+    field = tracker.update(frame)
+    assert field.by_prior is not None
+    assert field.by_prior[4]
+    np.testing.assert_allclose(field.force_n, 250.0 * field.displacement_m, rtol=1e-12)
+
+
+def test_reset_forgets_the_stream_of_both_methods():
+    layout = sk.PatchLayout.preset("staggered")
+    rng = np.random.default_rng(7)
+    frames = [noisy(layout, hertz_press(layout, depth), rng) for depth in (0.0, 0.1, 0.25)]
+    frames[1][4] = np.nan
+    used, fresh = sk.Tracker(layout), sk.Tracker(layout)
+    for frame in reversed(frames):
+        used.update(frame)
+    used.reset()
+    for frame in frames:
+        one, two = used.update(frame), fresh.update(frame)
+        np.testing.assert_array_equal(one.displacement_m, two.displacement_m)
+        np.testing.assert_array_equal(one.displacement_std_m, two.displacement_std_m)
+        assert one.status == two.status

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,10 +17,19 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
+from skinnode.solve.branch import BLIND, REFEREE_NOISE, has_folds, wire_deviations
+from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.schedule import Schedule, Uniform
 from skinnode.solve.system import operator_code
 from skinnode.solve.walk import Walk
+
+CONSULT_TOLERANCE: Final = 1e-12
+CONSULT_STEPS: Final = 100
+"""The paper's final tolerance, and its most steps of an intermediate sample."""
+RIVALS: Final = 8
+"""Starts, drawn from the posterior, from which another root is looked for where a layout has folds; the same
+ones every time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +100,10 @@ def solve_path(
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a diverged wire, told by its status
         walk = Walk(problem, samples * problem.gain, code)
         (Uniform() if schedule is None else schedule).follow(walk)
+        if has_folds(layout):
+            _consult(walk, layout, samples[-1], baseline_ohm)
         walk.doubt_twins()
+        walk.refuse(wire_deviations(layout, 1.0) > BLIND)
     displacement = problem.displacement_m(walk.solver.x)
     position, steps, evaluations, optimality = walk.log
     total = int(evaluations.sum())
@@ -108,3 +121,24 @@ def solve_path(
         optimality=optimality,
         stats=SolveStats(total, total, int(steps.sum()), time.perf_counter() - start),
     )
+
+
+def _consult(walk: Walk, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None) -> None:
+    """Let the posterior of the patch say which root of the last sample the skin is at."""
+    patch = Posterior(layout, relative_noise=REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False)
+    field = patch.update(last_ohm)
+    if not field.trusted:
+        return
+    shape = walk.problem.rest.shape
+    moved, std = (
+        (metres / layout.pitch_m).reshape(shape)
+        for metres in (field.displacement_m, field.displacement_std_m)
+    )
+    estimate = walk.problem.rest + moved
+    walk.consult(estimate, std, CONSULT_TOLERANCE, CONSULT_STEPS)
+    covariance = patch.covariance_m2().reshape(*shape, *shape) / layout.pitch_m**2
+    own = covariance[np.arange(shape[0]), :, np.arange(shape[0])]
+    power, axes = np.linalg.eigh(own)
+    z = np.random.default_rng(1).normal(size=(RIVALS, *shape)) * np.sqrt(np.maximum(power, 0.0))
+    drawn = estimate + np.einsum("uij,suj->sui", axes, z)
+    walk.weigh_rivals(drawn, patch.energy, CONSULT_TOLERANCE, CONSULT_STEPS)

@@ -36,6 +36,9 @@ QUIET_DEVIATIONS: Final = 3.7
 coordinates."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
 """A wire that obeys the model is called INCONSISTENT with at most this chance a frame."""
+NOISE_LEAST: Final = 1e-6
+"""Least relative noise: a fifth of a 16-bit code. Less forces the field onto a root of F = b, and there are
+wrong ones; and the forward model is no better than that."""
 LEFT_OUT: Final = 3
 """Most wires left out one after the other before the whole frame is called INCONSISTENT."""
 
@@ -169,7 +172,7 @@ class Posterior:
         with np.errstate(over="ignore", invalid="ignore"):
             a = frame * self._problem.gain
         known = (noise > 0) & (noise < NOISE_MAX)
-        noise = np.where(known, noise, 1.0)
+        noise = np.where(known, np.maximum(noise, NOISE_LEAST), 1.0)
         usable = known & (a > A_MIN) & (a < A_MAX)
         if valid is not None:
             usable &= checked_mask(valid, self.layout)
@@ -199,6 +202,11 @@ class Posterior:
         full = np.zeros((wires * coordinates, wires * coordinates))
         full[np.ix_(every, every)] = self._estimator.covariance() * self.layout.pitch_m**2
         return full
+
+    def energy(self, moved: Float) -> float:
+        """uᵀ (s² C)⁻¹ u of a displacement (U, 3N) in pitches, −2 log of its prior density to a constant, with
+        the prior as the last frame left it."""
+        return self._estimator.roughness(moved) / self._estimator.scale2
 
     def _data(self, a: Float, noise: Float, usable: NDArray[np.bool_]) -> Data:
         change = a / self._problem.a_rest - 1.0

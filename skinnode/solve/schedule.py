@@ -210,6 +210,7 @@ def _finish(walk: Walk, how: Uniform | Periodic) -> None:
     if not how.plain:
         walk.extrapolate(walk.samples - 1)
     walk.finish(how.final_tolerance, how.final_steps)
+    walk.second_tries = not how.plain
     if how.plain:
         walk.doubt_rough(how.final_tolerance, how.final_steps)
     else:

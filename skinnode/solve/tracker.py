@@ -4,24 +4,24 @@
 elastic prior. ``auto`` takes the exact inverse where the converter's noise leaves it accurate.
 
 What the exact inverse cannot solve (too few resistances, a root on another branch, a jump too far), and a
-large displacement too rough for a press, is put to the posterior, which knows the neighbouring wires.
+large displacement too rough for a press, is put to the posterior, which knows the neighbouring wires. Where
+a layout has folds within the reach of a press, every frame is: F = b then has roots nearby that the inverse
+alone cannot tell apart.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.elastic import Rubber
-from skinnode.model.forward import jacobian
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.branch import Smoothness
+from skinnode.solve.branch import AGREE, REFEREE_NOISE, Smoothness, exact_deviation, has_folds
 from skinnode.solve.exact import ExactTracker
 from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
@@ -35,8 +35,6 @@ LARGE: Final = 0.1
 ROUGH: Final = 1.2
 """Roughness of a displacement over its size, in the units of :class:`Smoothness`, above which it is put to
 the posterior. Presses have 0.5 to 1 and up to 1.7 where they move one electrode, wrong roots 1 to 2."""
-AGREE: Final = 6.0
-"""Deviations of both estimates within which the posterior confirms a root."""
 
 
 class Tracker:
@@ -97,6 +95,7 @@ class Tracker:
         if self.method == "posterior":
             self._exact = None
             return
+        self._noise = relative_noise
         self._exact = ExactTracker(
             layout,
             operator=operator,
@@ -113,6 +112,7 @@ class Tracker:
         self._step_limit = problem.step_limit
         self._large_m = LARGE * float(problem.clearance.min()) * layout.pitch_m
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
+        self._folded = has_folds(layout, normal_only)
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
@@ -139,9 +139,14 @@ class Tracker:
             return self._posterior.update(frame_ohm, valid, relative_noise)
         field = self._exact.update(frame_ohm, valid, relative_noise)
         doubtful = self._doubtful(field)
+        if self._folded and field.held is not None:
+            doubtful |= ~field.held & (np.array(field.status) != Status.DEADLINE)
         if not doubtful.any():
             return field
-        return self._refer(field, doubtful, self._posterior.update(frame_ohm, valid, relative_noise))
+        if self._folded:
+            self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
+        noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
+        return self._refer(field, doubtful, self._posterior.update(frame_ohm, valid, noise))
 
     def _doubtful(self, field: FieldFrame) -> NDArray[np.bool_]:
         """(U,) wires to put to the posterior: those without a root, and the rough ones."""
@@ -183,6 +188,9 @@ class Tracker:
         moved[replaced], std[replaced] = guide.displacement_m[replaced], guide.displacement_std_m[replaced]
         residual[replaced] = guide.residual[replaced]
         std[doubtful & ~agreed & ~replaced] = np.inf
+        if self._folded:  # two roots may lie closer than the posterior can tell
+            apart = 2.0 * np.sqrt((gap**2).mean(axis=(1, 2), keepdims=True))
+            std = np.where(agreed[:, None, None], np.hypot(std, apart), std)
         self._exact.adopt(replaced, moved)
         stats = dataclasses.replace(
             field.stats,
@@ -225,16 +233,3 @@ def _choose(
         f"the noise leaves the exact inverse a deviation of {100 * share:.2g} % of the clearance between the "
         f"layers at rest, where {100 * EXACT_SHARE:g} % is the limit"
     )
-
-
-def exact_deviation(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> float:
-    """RMS deviation of the exact inverse at rest over the least clearance of an electrode: the Cramér-Rao
-    bound J⁺ diag(σ²) J⁺ᵀ. Inf where a Jacobian is singular."""
-    problem = PatchProblem.of(layout)
-    slopes = jacobian(layout, layout.upper_m) * layout.pitch_m**2 * problem.a_rest[..., None, None]
-    slopes = slopes[..., 2:] if normal_only else slopes
-    weighted = slopes.reshape(*layout.shape, -1) / np.broadcast_to(relative_noise, layout.shape)[..., None]
-    singular = np.linalg.svd(weighted, compute_uv=False)
-    with np.errstate(divide="ignore"):
-        variance = (1.0 / singular**2).sum(axis=1).mean() / weighted.shape[2]
-    return math.sqrt(float(variance)) / float(problem.clearance.min())

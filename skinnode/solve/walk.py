@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 from skinnode.solve import operators as op
 from skinnode.solve import wires
-from skinnode.solve.branch import Smoothness, guided_start, near_twin
+from skinnode.solve.branch import AGREE, Smoothness, guided_start, near_twin
 from skinnode.solve.linear import Index
 from skinnode.solve.problem import PatchProblem
 
@@ -35,6 +36,9 @@ GUIDED_STEPS: Final = 100
 """A guided start is next to its root or next to none: 1 to 20 steps."""
 SAME: Final = 1e-3
 """Two solutions closer than that share of the displacement are one root."""
+UNLIKELY: Final = 4.0
+"""Energy by which other roots must be less likely. On staggered, h = 1, and aligned, h = 0.5 and 1, 40
+presses of 50 and 70 %, the right one of two roots was always the likelier, by 0.1 to 36."""
 TWIN_TOLERANCE: Final = 1e-9
 TWIN_STEPS: Final = 30
 
@@ -66,6 +70,9 @@ class Walk:
         self._weight = np.ones_like(problem.a_rest)
         self._everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
         self._smoothness: Smoothness | None = None
+        self._estimate: tuple[Float, Float] | None = None
+        self.second_tries = True
+        """Whether a wire may be moved from where its path led it; if not, it is only doubted."""
         self._log: list[tuple[Float, Index, Index, Float]] = []
         self._rest_branch = self.solver.solve_rest()
         self._rest = self.solver.inverse.copy(), self.solver.a_solved.copy()
@@ -196,6 +203,69 @@ class Walk:
         self.solver.x[:], self._inverse[:], self.status[:] = x, inverse, status
         self.residual, self.error_estimate = residual, error_estimate
 
+    def consult(self, x: Float, std: Float, tolerance: float, most_steps: int) -> None:
+        """Hold every root against an estimate of the whole patch, ``x`` and ``std`` (U, n), pitches. Where
+        they disagree, and where there is no root, one is looked for from the estimate on."""
+        solver, reach = self.solver, AGREE * std
+        self._estimate = x, reach
+        agreed = (np.abs(solver.x - x) <= reach).all(axis=1)
+        todo = ~(agreed & (self.status == op.CONVERGED))
+        if not todo.any():
+            return
+        root, converged = solver.x.copy(), self.status == op.CONVERGED
+        if not self.second_tries:
+            self.status[todo & converged] = op.ILL_CONDITIONED
+            return
+        solver.x[todo] = x[todo]
+        self._take(todo, tolerance, most_steps, op.LEVENBERG_MARQUARDT)
+        agreed = (np.abs(solver.x - x) <= reach).all(axis=1)
+        found = (self.status == op.CONVERGED) & agreed
+        self.status[todo & (self.status == op.CONVERGED) & ~found] = op.ILL_CONDITIONED
+        back = todo & converged & ~found
+        solver.x[back] = root[back]
+        self.status[back] = op.ILL_CONDITIONED
+
+    def weigh_rivals(
+        self, starts: Float, energy: Callable[[Float], float], tolerance: float, most_steps: int
+    ) -> None:
+        """Of the roots that other starts ``starts`` (S, U, n), pitches, come to, keep the likeliest: that of
+        the least ``energy``, −2 log of the density of a displacement field (U, n) to a constant.
+
+        It is CONVERGED only where no other comes near.
+        """
+        solver, rest = self.solver, self.problem.rest
+        found = solver.x.copy()
+        root = found.copy()
+        size, least = np.abs(root - rest).max(axis=1), energy(root - rest)
+        close, better = np.zeros(self.wires, bool), np.zeros(self.wires, bool)
+        for start in starts:
+            todo = self.status == op.CONVERGED
+            call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
+            solver.x[:] = start
+            self._call(call, self.samples - 1.0, 0, TWIN_TOLERANCE, TWIN_STEPS, op.LEVENBERG_MARQUARDT)
+            other = np.abs(solver.x - root).max(axis=1) > SAME * size
+            other &= todo & (solver.report[:, wires.STATUS] == op.CONVERGED)
+            for u in np.flatnonzero(other & ~self.problem.out_of_reach(solver.x)).tolist():
+                rival = root.copy()
+                rival[u] = solver.x[u]
+                gain = least - energy(rival - rest)
+                close[u] = abs(gain) < UNLIKELY or (close[u] and gain < 0)
+                if gain > 0:
+                    root[u], better[u] = rival[u], True
+                    least -= gain
+        if not self.second_tries:
+            self.status[(close | better) & (self.status == op.CONVERGED)] = op.ILL_CONDITIONED
+            solver.x[:] = found
+            return
+        solver.x[:] = root
+        if better.any():
+            self._take(better, tolerance, most_steps, op.LEVENBERG_MARQUARDT)
+        self.status[close & (self.status == op.CONVERGED)] = op.ILL_CONDITIONED
+
+    def refuse(self, blind: Mask) -> None:
+        """Take CONVERGED from these wires (U,), whatever they came to."""
+        self.status[blind & (self.status == op.CONVERGED)] = op.ILL_CONDITIONED
+
     def doubt_twins(self) -> None:
         """Take CONVERGED from a root with a twin as smooth on the other side of a fold."""
         if self.problem.layout.shape[1] != self.problem.layout.unknowns:
@@ -213,6 +283,9 @@ class Walk:
             self._call(call, self.samples - 1.0, 0, TWIN_TOLERANCE, TWIN_STEPS, op.LEVENBERG_MARQUARDT)
             other = solver.report[:, wires.BRANCH] * self._rest_branch < 0
             other &= todo & ~self.problem.out_of_reach(solver.x)
+            if self._estimate is not None:  # and the patch speaks for it
+                x, reach = self._estimate
+                other &= (np.abs(solver.x - x) <= reach).all(axis=1)
             twins = self.smoothness.roughness(solver.x) < TWIN_ROUGHNESS * self.smoothness.roughness(root)
             self.status[other & twins] = op.ILL_CONDITIONED
         solver.x[:] = root

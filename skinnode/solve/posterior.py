@@ -162,7 +162,8 @@ class Posterior:
                 its resistance unused.
 
         Never raises for numbers. A wire without usable resistances is estimated from its neighbours, and its
-        deviation says so. A wire that no deformation explains is INCONSISTENT and left out of the estimate.
+        deviation says so. A wire that no deformation explains is INCONSISTENT and left out of the estimate,
+        and so is one that no steps lead to a deformation of, not even on its own: MAX_STEPS.
         Where the whole frame cannot be solved, the last trusted field is held with an infinite deviation.
         Raises ValueError for wrong shapes.
         """
@@ -280,7 +281,12 @@ class Posterior:
         for _ in range(LEFT_OUT + 3):
             members = wanted[np.count_nonzero(data.weight[wanted], axis=1) > 0]
             if not self._converge(data, members):
-                return self._give_up(Status.MAX_STEPS)
+                lost = [u for u in members.tolist() if not self._converge(data, np.array([u]))]
+                if not lost or len(lost) > min(LEFT_OUT, members.size - 1):
+                    return self._give_up(Status.MAX_STEPS)
+                status[lost], usable[lost] = Status.MAX_STEPS, False
+                data = self._data(a, noise, usable)
+                continue
             data = self._adapt(data, a, noise, usable, members, local=touched.size > 0)
             if not np.isfinite(estimator.moved).all():
                 return self._give_up(Status.NON_FINITE)

@@ -215,8 +215,9 @@ SPOILT_WIRE = {
 
 
 @pytest.mark.parametrize("kind", SPOILT_WIRE)
-def test_a_scrambled_wire_leads_nobody_astray(staggered, kind):
-    """What is CONVERGED beside it is right, and the next good frame is solved as if nothing had happened."""
+def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
+    """It alone is not CONVERGED, its deviation is its neighbours' knowledge of it, and the next good frame is
+    solved as if nothing had happened."""
     rng = np.random.default_rng(9)
     tracker = sk.Posterior(staggered)
     for depth in (0.0, 0.1, 0.2):
@@ -224,12 +225,10 @@ def test_a_scrambled_wire_leads_nobody_astray(staggered, kind):
         bad = noisy(frame_ohm(staggered, moved), rng)
         bad[6] = SPOILT_WIRE[kind](bad[6], rng)
         field = tracker.update(bad)
-        assert field.status[6] is not sk.Status.CONVERGED
-        for u, status in enumerate(field.status):
-            if status is sk.Status.CONVERGED:
-                z = (field.displacement_m[u] - moved[u]) / field.displacement_std_m[u]
-                assert np.abs(z).max() < 5
-        assert field.residual[6] > 2 * np.delete(field.residual, 6).max()
+        assert [u for u, status in enumerate(field.status) if status is not sk.Status.CONVERGED] == [6]
+        assert field.status[6] in (sk.Status.INCONSISTENT, sk.Status.MAX_STEPS)
+        assert np.abs(deviations(field, moved)).max() < 5
+        assert field.residual[6] > 100 * np.delete(field.residual, 6).max()
         field = tracker.update(noisy(frame_ohm(staggered, moved), rng))
         assert field.trusted
         z = deviations(field, moved)
@@ -237,23 +236,16 @@ def test_a_scrambled_wire_leads_nobody_astray(staggered, kind):
         assert np.sqrt(np.mean(z**2)) < 1.15
 
 
-@pytest.mark.xfail(
-    reason="the Gauss-Newton steps fail before a wire is judged: the whole frame is MAX_STEPS", strict=True
-)
-@pytest.mark.parametrize("kind", SPOILT_WIRE)
-def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
-    rng = np.random.default_rng(9)
-    tracker = sk.Posterior(staggered)
-    for depth in (0.0, 0.1, 0.2):
-        moved = hertz_press(staggered, depth)
-        frame = noisy(frame_ohm(staggered, moved), rng)
-        tracker.update(frame)
-        frame[6] = SPOILT_WIRE[kind](frame[6], rng)
-        field = tracker.update(frame)
-        named = [u for u, status in enumerate(field.status) if status is not sk.Status.CONVERGED]
-        assert named == [6]
-        assert field.status[6] is sk.Status.INCONSISTENT
-        assert np.abs(deviations(field, moved)).max() < 5
+def test_scrambled_wires_of_a_first_frame_are_left_out(staggered):
+    """Two at once, on one deep in the press, without any frame before."""
+    rng = np.random.default_rng(10)
+    moved = hertz_press(staggered, 0.3)
+    bad = noisy(frame_ohm(staggered, moved), rng)
+    bad[4] = bad[4, ::-1]
+    bad[8] *= rng.uniform(0.9, 1.1, 30)
+    field = sk.Posterior(staggered).update(bad)
+    assert [u for u, status in enumerate(field.status) if status is not sk.Status.CONVERGED] == [4, 8]
+    assert np.abs(deviations(field, moved)).max() < 5
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ HERTZ_SPREAD: Final = 2.5
 
 
 class ContactFinder:
-    """The constants of a patch."""
+    """The constants of a patch, and the deviations of its sums of cells."""
 
     def __init__(self, prior: ElasticPrior, layout: PatchLayout) -> None:
         self._prior = prior
@@ -48,6 +48,9 @@ class ContactFinder:
         self._box = np.zeros((rows * columns, 3 * rows * columns))
         self._box[:, 2::3] = box.reshape(rows * columns, -1)
 
+        self._made_by = -1
+        self._box_std = np.full(rows * columns, np.nan)
+
     def find(self, estimator: Estimator) -> tuple[Float, tuple[Contact, ...]]:
         """(U, N, 3) forces on the cells of the electrodes, N, and the contacts, the strongest first."""
         q = estimator.loads()
@@ -55,7 +58,7 @@ class ContactFinder:
         pressing = -np.einsum("bq,q->b", self._box, q.ravel())
         strong = np.flatnonzero(pressing > RELEVANT * max(float(pressing.max()), 0.0))
         seed = np.zeros(len(pressing), bool)
-        seed[strong] = pressing[strong] > SIGNIFICANT * estimator.load_std(self._box[strong])
+        seed[strong] = pressing[strong] > SIGNIFICANT * self._deviations(strong, estimator)
         found = [
             contact
             for region in _regions(seed.reshape(self._prior.shape))
@@ -63,6 +66,16 @@ class ContactFinder:
         ]
         found.sort(key=lambda contact: -contact.normal_force_n)
         return force[self._own].reshape(self._electrodes), tuple(found)
+
+    def _deviations(self, boxes: NDArray[np.int64], estimator: Estimator) -> Float:
+        """(B,) deviations of these sums; each is worked out once for a set of factors."""
+        if self._made_by != estimator.factors:
+            self._made_by = estimator.factors
+            self._box_std[:] = np.nan
+        new = boxes[np.isnan(self._box_std[boxes])]
+        if new.size:
+            self._box_std[new] = estimator.load_std(self._box[new])
+        return self._box_std[boxes]
 
     def _contact(self, region: NDArray[np.int64], q: Float, estimator: Estimator) -> Contact | None:
         """The contact on the cells ``region``."""

@@ -101,6 +101,7 @@ class Estimator:
         self._rows = min(equations, free.size + nuisances)
         self._reach = NEAR * float(problem.clearance.min())
         self._correction = np.zeros(wires * free.size + nuisances)
+        self._every = np.arange(wires)
         self._uniform = np.ascontiguousarray(prior.covariance[np.ix_(every, every)])
         self._covariance, self._root = self._uniform.copy(), np.empty_like(self._uniform)
         self.moved = np.zeros((wires, coordinates))
@@ -119,6 +120,8 @@ class Estimator:
         self._factored: tuple[Float, float] | None = None
         self._stiffness: Float | None = None  # (3Q,) k of each load by the factors at hand
         self.evaluations = self.factorisations = 0
+        self.factors = 0
+        """Number of the factors at hand."""
         self.until = math.inf
         """Time of :func:`time.perf_counter` after which a solve is broken off with a TimeoutError."""
         self.reset(1.0)
@@ -309,12 +312,14 @@ class Estimator:
         new, old = data.weight[members], weight[members]
         return bool(np.array_equal(new > 0, old > 0) and (np.abs(new - old) <= 0.1 * old).all())
 
-    def _linearise(self, data: Data, moved: Float) -> None:
+    def _linearise(self, data: Data, moved: Float, members: Index | None = None) -> None:
         if self.until < math.inf and perf_counter() > self.until:
             raise TimeoutError
         b = self._b
-        kernels.linearise(self._problem.rest + moved, self._problem.lower, data.a, data.weight, b.r, b.jt)
-        self.evaluations += len(moved)
+        members = self._every if members is None else members
+        x = self._problem.rest + moved
+        kernels.linearise(members, x, self._problem.lower, data.a, data.weight, b.r, b.jt)
+        self.evaluations += members.size
 
     def _assemble(self, data: Data, members: Index, scale2: float, moved: Float) -> float:
         return kernels.assemble(members, self._free, self._covariance, scale2, data.h, data.d, moved, self._b)
@@ -323,10 +328,11 @@ class Estimator:
         """One Gauss-Newton step with new factors; how far it moved any coordinate, inf where it failed."""
         b = self._b
         self._factored = None
-        self._linearise(data, self.moved)
+        self._linearise(data, self.moved, members)
         self._assemble(data, members, self.scale2, self.moved)
         m = members.size * self._rows
         self.factorisations += 1
+        self.factors += 1
         self._stiffness = None
         if not cholesky(b.innovation, m):
             return math.inf
@@ -359,7 +365,7 @@ class Estimator:
         enough = SETTLED * math.sqrt(float(np.mean(self.std**2)))
         before = math.inf
         for _ in range(CHORDS):
-            self._linearise(data, self.moved)
+            self._linearise(data, self.moved, self.members)
             kernels.chord_step(
                 self.members, self._free, self._covariance, self.scale2, data.h, data.d, self.moved, self.g,
                 self._correction, b,

@@ -93,9 +93,10 @@ def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: 
 
 
 @njit
-def linearise(x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for every wire."""
-    for u in range(x.shape[0]):
+def linearise(members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
+    """r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    for i in range(members.size):
+        u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
         potential_jacobian(x[u], lower, r_u, jt_u)
         for k in range(r_u.size):

@@ -80,6 +80,7 @@ class Posterior:
             size of the electrodes, conductivity under strain): half of its variance in common, half singly.
         normal_only: electrodes move along z only, which asks a third of the unknowns.
         hold: solve only wires that were touched, and nothing where nothing moved.
+        contacts: give forces and contacts too.
         deadline_us: an update returns after this time and at most one more factorisation; what could not be
             solved by then is DEADLINE.
 
@@ -100,6 +101,7 @@ class Posterior:
         model_error: float = 0.0,
         normal_only: bool = False,
         hold: bool = True,
+        contacts: bool = True,
         deadline_us: float | None = None,
     ) -> None:
         if drift not in DRIFTS:
@@ -127,7 +129,10 @@ class Posterior:
         if model_error > 0:
             self._d[-1] = 0.5 * model_error**2
         self._estimator = Estimator(self._problem, self._prior, self._free, self._d.size)
-        self._contacts = ContactFinder(self._prior, layout)
+        self._contacts = ContactFinder(self._prior, layout) if contacts else None
+        self._quiet, self._impossible = (
+            chi_square_limits(layout.shape[1], chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
+        )
         height = float(np.median(self._problem.clearance))
         self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
         self._signal = self._estimator.signal()
@@ -236,31 +241,26 @@ class Posterior:
             return False  # fewer resistances know less of the field, more know more
         noises = np.ones(len(self._wires))
         noises[self._members] = 2.0
-        stirred, self._overlooked = self._stirred(data, self._trusted, noises)
+        stirred, self._overlooked, _ = self._stirred(data, self._trusted, noises)
         return not stirred.any()
 
     def _stirred(
         self, data: Data, moved: Float, noises: float | Float = 1.0
-    ) -> tuple[NDArray[np.bool_], Float]:
+    ) -> tuple[NDArray[np.bool_], Float, Float]:
         """(U,) wires whose residuals are beyond noise of variance ``noises``; (U, f) how far each coordinate
-        seems to have moved, were it the only one."""
+        seems to have moved, were it the only one; (U,) χ²."""
         total, sharpest, move = self._estimator.surprise(data, moved)
-        limit = chi_square(np.count_nonzero(data.weight, axis=1).astype(float), QUIET_CHANCE)
-        return (total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises)), np.abs(move)
-
-    def _squares(self, data: Data, moved: Float) -> tuple[Float, Float]:
-        """(U,) Σ (residual/σ)² and number of equations."""
-        r = self._estimator.residuals(data, moved)
-        return (r**2).sum(axis=1), np.count_nonzero(data.weight, axis=1).astype(float)
+        limit = self._quiet[np.count_nonzero(data.weight, axis=1)]
+        stirred = (total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises))
+        return stirred, np.abs(move), total
 
     def _touched(self, data: Data) -> Index:
         """Wires whose resistances are not those at rest; one in the last solve stays a little longer."""
         at_rest = np.zeros_like(self._trusted)
-        touched, _ = self._stirred(data, at_rest)
-        total, count = self._squares(data, at_rest)
+        touched, _, total = self._stirred(data, at_rest)
         stay = np.zeros(len(total), bool)
         stay[self._members] = True
-        touched |= stay & (total > count)
+        touched |= stay & (total > np.count_nonzero(data.weight, axis=1))
         if touched.any():
             touched |= self._kept > 0
         return np.flatnonzero(touched)
@@ -290,14 +290,14 @@ class Posterior:
             data = self._adapt(data, a, noise, usable, members, local=touched.size > 0)
             if not np.isfinite(estimator.moved).all():
                 return self._give_up(Status.NON_FINITE)
-            total, count = self._squares(data, estimator.moved)
+            stirred, _, total = self._stirred(data, estimator.moved)
             left = np.setdiff1d(self._wires, wanted)
-            surprised = left[self._stirred(data, estimator.moved)[0][left]] if left.size else left
+            surprised = left[stirred[left]]
             if surprised.size:  # moved, and not as the others say, or stayed where they say it moved
                 self._kept[surprised] = KEPT
                 wanted = np.union1d(wanted, surprised)
                 continue
-            excess = total / np.maximum(chi_square(count, IMPOSSIBLE_CHANCE), 1e-300)
+            excess = total / self._impossible[np.count_nonzero(data.weight, axis=1)]
             if (excess <= 1.0).all():
                 break
             worst = int(np.argmax(excess))
@@ -364,8 +364,8 @@ class Posterior:
 
     def _noise_factor(self, data: Data, members: Index) -> float:
         """The factor on the noise at which the residuals are what they should be (MacKay)."""
-        squares = self._squares(data, self._estimator.moved)
-        total, count = (float(values[members].sum()) for values in squares)
+        total = float((self._estimator.residuals(data)[members] ** 2).sum())
+        count = float(np.count_nonzero(data.weight[members]))
         left = max(count - self._estimator.gamma, 0.0)
         return math.sqrt((self._factor**2 * total + NOISE_WORTH) / (left + NOISE_WORTH))
 
@@ -383,7 +383,7 @@ class Posterior:
         std[:, self._free] = estimator.std
         if held.all():  # half of what it may overlook
             std[:, self._free] = np.maximum(estimator.std, 0.5 * self._overlooked)
-        if self._known and not held.all():
+        if self._contacts is not None and self._known and not held.all():
             self._force, self._contacts_found = self._contacts.find(estimator)
         used = data.weight > 0
         r = estimator.residuals(data, self._trusted) / np.where(used, data.weight, np.inf)
@@ -397,7 +397,7 @@ class Posterior:
             stats=SolveStats(
                 estimator.evaluations, estimator.evaluations, estimator.factorisations, perf_counter() - start
             ),
-            force_n=self._force,
+            force_n=None if self._contacts is None else self._force,
             held=held,
             method="posterior",
             contacts=self._contacts_found if self._known else (),
@@ -406,8 +406,8 @@ class Posterior:
         )
 
 
-def chi_square(count: Float, chance: float) -> Float:
-    """χ² of ``count`` degrees of freedom that is exceeded with ``chance``; 0 for none."""
+def chi_square_limits(most: int, chance: float) -> Float:
+    """(most + 1,) χ² of 0, 1, … degrees of freedom that is exceeded with ``chance``; tiny for none."""
     from scipy.special import chdtri
 
-    return np.asarray(chdtri(np.maximum(count, 1e-9), chance))
+    return np.concatenate([[1e-300], chdtri(np.arange(1.0, most + 1.0), chance)])

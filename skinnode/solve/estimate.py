@@ -229,6 +229,16 @@ class Estimator:
         kernels.single_moves(self._free, self._b.jt, r, move, top)
         return (r**2).sum(axis=1), top, move
 
+    def objective(self, data: Data, moved: Float | None = None, g: Float | None = None) -> float:
+        """What a solve minimises, χ² and the prior's part, at the field at hand or another; with equal
+        factors."""
+        moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
+        b = self._b
+        x = self._problem.rest + moved
+        kernels.residuals(x, self._problem.lower, data.a, data.weight, b.r)
+        r = (b.r - np.einsum("ukp,p->uk", data.h, g))[self.members]
+        return float((r**2).sum() + self.roughness(moved) / self.scale2 + (g**2 / data.d).sum())
+
     def track(self, data: Data, members: Index) -> bool:
         """Solve from the displacement at hand; False where that leads nowhere near."""
         if self._fits(data, members) and self._chord(data):

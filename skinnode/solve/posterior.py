@@ -20,6 +20,7 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
+from skinnode.solve.branch import JUMP
 from skinnode.solve.contacts import ContactFinder
 from skinnode.solve.estimate import Data, Estimator, Index
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
@@ -133,6 +134,7 @@ class Posterior:
         self._quiet, self._impossible = (
             chi_square_limits(layout.shape[1], chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
         )
+        self._jump = JUMP * float(self._problem.clearance.min())
         height = float(np.median(self._problem.clearance))
         self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
         self._signal = self._estimator.signal()
@@ -321,11 +323,23 @@ class Posterior:
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
         if self._known and estimator.track(data, members):
-            return True
+            jump = float(np.abs(estimator.moved - self._trusted).max())
+            return jump < self._jump or self._anneal_and_compare(data, members)
         estimator.spread(self._fixed_scale or self._scale_rest)
         if self._fixed_scale is None:
             estimator.scale2 = self._bounded(estimator.guess_scale(data, members))
         return estimator.anneal(data, members)
+
+    def _anneal_and_compare(self, data: Data, members: Index) -> bool:
+        """After a jump the next maximum need not be the right one: the better of it and the annealed."""
+        estimator = self._estimator
+        tracked = estimator.moved.copy(), estimator.g.copy()
+        estimator.spread(self._fixed_scale or self._bounded(estimator.guess_scale(data, members)))
+        annealed = estimator.anneal(data, members)
+        if annealed and estimator.objective(data) <= estimator.objective(data, *tracked):
+            return True
+        estimator.moved[:], estimator.g[:] = tracked
+        return estimator.track(data, members)
 
     def _bounded(self, scale2: float) -> float:
         return min(max(scale2, self._scale_least), self._scale_most)

@@ -21,7 +21,7 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.branch import AGREE, REFEREE_NOISE, Smoothness, exact_deviation, has_folds
+from skinnode.solve.branch import AGREE, JUMP, REFEREE_NOISE, Smoothness, exact_deviation, has_folds
 from skinnode.solve.exact import ExactTracker
 from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
@@ -30,7 +30,10 @@ METHODS: Final = ("auto", "exact", "posterior")
 EXACT_SHARE: Final = 0.0025
 """Deviation of the exact inverse at rest, in clearances, up to which ``auto`` takes it: 2.5 % of a press of a
 tenth of the layer. 16-bit codes leave 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
-LARGE: Final = 0.1
+NONLINEAR: Final = 0.02
+"""Deviation of the exact inverse, in clearances, from which on F is not linear within its noise: a root is
+then as doubtful as near a fold."""
+LARGE: Final = 0.03
 """Displacement, in clearances, from which on its roughness is looked at: folds lie at larger ones still."""
 ROUGH: Final = 1.2
 """Roughness of a displacement over its size, in the units of :class:`Smoothness`, above which it is put to
@@ -110,9 +113,12 @@ class Tracker:
         problem = PatchProblem.of(layout, baseline_ohm)
         self._smoothness, self._rest = Smoothness(problem), problem.rest
         self._step_limit = problem.step_limit
-        self._large_m = LARGE * float(problem.clearance.min()) * layout.pitch_m
+        clearance_m = float(problem.clearance.min()) * layout.pitch_m
+        self._large_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
+        self._last_m = np.zeros_like(layout.upper_m)
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
-        self._folded = has_folds(layout, normal_only)
+        rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
+        self._folded = rough_noise or has_folds(layout, normal_only)
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
@@ -120,6 +126,7 @@ class Tracker:
         if self._exact is not None:
             self._exact.reset()
             self._confirmed = None
+            self._last_m[:] = 0.0
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -138,22 +145,29 @@ class Tracker:
         if self._exact is None:
             return self._posterior.update(frame_ohm, valid, relative_noise)
         field = self._exact.update(frame_ohm, valid, relative_noise)
-        doubtful = self._doubtful(field)
-        if self._folded and field.held is not None:
-            doubtful |= ~field.held & (np.array(field.status) != Status.DEADLINE)
-        if not doubtful.any():
-            return field
-        if self._folded:
-            self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
-        noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
-        return self._refer(field, doubtful, self._posterior.update(frame_ohm, valid, noise))
+        lost, unsure = self._doubtful(field)
+        if (lost | unsure).any():
+            if unsure.any():
+                self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
+            noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
+            guide = self._posterior.update(frame_ohm, valid, noise)
+            field = self._refer(field, lost | unsure, guide)
+        self._last_m = field.displacement_m
+        return field
 
-    def _doubtful(self, field: FieldFrame) -> NDArray[np.bool_]:
-        """(U,) wires to put to the posterior: those without a root, and the rough ones."""
+    def _doubtful(self, field: FieldFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(U,) wires without a root, and (U,) those whose root may not be the right one: where the layout has
+        folds all that were solved, elsewhere those that jumped and the rough ones."""
         status = np.array(field.status)
-        lost = (status != Status.CONVERGED) & (status != Status.DEADLINE)
+        solved = status == Status.CONVERGED
+        lost = ~solved & (status != Status.DEADLINE)
+        if field.held is not None:
+            solved &= ~field.held
+        if self._folded:
+            return lost, solved
         moved = field.displacement_m
-        large = np.abs(moved).max(axis=(1, 2)) > self._large_m
+        unsure = solved & (np.abs(moved - self._last_m).max(axis=(1, 2)) > self._jump_m)
+        large = solved & (np.abs(moved).max(axis=(1, 2)) > self._large_m)
         if large.any():
             pitches = (moved / self.layout.pitch_m).reshape(len(moved), -1)
             size = np.sqrt((pitches**2).sum(axis=1)) / self._step_limit
@@ -161,8 +175,8 @@ class Tracker:
             if self._confirmed is not None:  # what was confirmed a moment ago is not asked again
                 change = np.abs(moved - self._confirmed).max(axis=(1, 2))
                 rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
-            lost |= rough & (status == Status.CONVERGED)
-        return np.asarray(lost)
+            unsure |= rough
+        return lost, unsure
 
     def _refer(self, field: FieldFrame, doubtful: NDArray[np.bool_], guide: FieldFrame) -> FieldFrame:
         """The field with the posterior's word on the doubtful wires: confirmed, replaced, or given up."""

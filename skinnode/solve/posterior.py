@@ -284,7 +284,7 @@ class Posterior:
             members = wanted[np.count_nonzero(data.weight[wanted], axis=1) > 0]
             if not self._converge(data, members):
                 lost = [u for u in members.tolist() if not self._converge(data, np.array([u]))]
-                if not lost or len(lost) > min(LEFT_OUT, members.size - 1):
+                if not lost or len(lost) > min(LEFT_OUT, len(a) - 1):
                     return self._give_up(Status.MAX_STEPS)
                 status[lost], usable[lost] = Status.MAX_STEPS, False
                 data = self._data(a, noise, usable)
@@ -354,6 +354,8 @@ class Posterior:
             estimator.track(data, members)
         refinements = REFINEMENTS if local else 0
         for _ in range(ADAPTIONS):
+            moved, g, scale2 = estimator.moved.copy(), estimator.g.copy(), estimator.scale2
+            share, factor, before = estimator.share.copy(), self._factor, data
             changed = False
             if self._fixed_scale is None:
                 if local:
@@ -372,7 +374,14 @@ class Posterior:
                     self._factor = factor
                     data = self._data(a, noise, usable)
                     changed = True
-            if not changed or not (estimator.track(data, members) or estimator.anneal(data, members)):
+            if not changed:
+                break
+            if not (estimator.track(data, members) or estimator.anneal(data, members)):
+                # not from there: back to the field that was found, and the prior it was found with
+                estimator.moved[:], estimator.g[:], self._factor, data = moved, g, factor, before
+                if not estimator.localise(scale2 * share):
+                    estimator.scale2 = scale2
+                estimator.track(data, members)
                 break
         return data
 

@@ -236,6 +236,18 @@ def test_a_scrambled_wire_is_named_and_the_others_are_solved(staggered, kind):
         assert np.sqrt(np.mean(z**2)) < 1.15
 
 
+@pytest.mark.parametrize(("height", "sigma", "seed"), [(0.5, 1e-5, 48), (1.0, 1e-6, 40)])
+def test_a_prior_set_anew_that_leads_nowhere_costs_no_wire(height, sigma, seed):
+    """Ridges whose solve fails once loads are expected along them: what was found before stays."""
+    layout = sk.PatchLayout.preset("aligned", height_m=height * 4e-3)
+    rng = np.random.default_rng(seed)
+    moved = dent(layout, rng, 0.3, "ridge")
+    frame = noisy(sk.resistance_ohm(layout, layout.upper_m + moved), rng, sigma)
+    field = sk.Posterior(layout, relative_noise=sigma).update(frame)
+    assert field.trusted
+    assert np.abs(deviations(field, moved)).max() < 5
+
+
 def test_scrambled_wires_of_a_first_frame_are_left_out(staggered):
     """Two at once, on one deep in the press, without any frame before."""
     rng = np.random.default_rng(10)

@@ -87,12 +87,12 @@ SETTINGS = [  # layout, noise, most that may lie within 1.96 deviations
 @pytest.mark.parametrize("kind", ["sphere", "gauss", "ridge", "plateau"])
 @pytest.mark.parametrize(("name", "sigma", "most"), SETTINGS)
 def test_reported_deviations_hold(name, sigma, most, kind):
-    """A jump from rest to each of 12 scenes: 95 % within 1.96, RMS error no more than reported."""
+    """A jump from rest to each of 10 scenes: 95 % within 1.96, RMS error no more than reported."""
     layout = sk.PatchLayout.preset(name)
     rng = np.random.default_rng(8)
     tracker = sk.Posterior(layout, relative_noise=sigma)
     inside, error2, reported2 = [], [], []
-    for depth in rng.uniform(0.05, 0.4, 12):
+    for depth in rng.uniform(0.05, 0.4, 10):
         moved = sphere(layout, rng, depth) if kind == "sphere" else dent(layout, rng, depth, kind)
         tracker.reset()
         field = tracker.update(noisy(sk.resistance_ohm(layout, layout.upper_m + moved), rng, sigma))
@@ -102,7 +102,7 @@ def test_reported_deviations_hold(name, sigma, most, kind):
         inside.append(np.mean(np.abs(z) < 1.96))
         error2.append(np.mean((field.displacement_m - moved) ** 2))
         reported2.append(np.mean(field.displacement_std_m**2))
-    assert len(inside) >= 10
+    assert len(inside) >= 8
     assert 0.90 <= np.mean(inside) <= most
     assert np.sqrt(np.sum(error2) / np.sum(reported2)) <= 1.15
 

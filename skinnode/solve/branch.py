@@ -47,9 +47,9 @@ BLIND: Final = 1e7
 """∂x/∂(ln R) of a wire over the clearance from which on a root says nothing: its electrodes cross the layer
 within the seventh digit of R. Wires on a symmetry line of the layout are like that, where each root has its
 mirror image; of the others only those of layers of 1.5 pitches and more above aligned lower wires."""
-JUMP: Final = 0.1
+JUMP: Final = 0.2
 """Share of the clearance by which an electrode may move between two frames before a root is no longer taken
-for the right one because it is the next one: folds were passed from 0.2 on."""
+for the right one because it is the next one: folds were passed from 0.24 on."""
 REFEREE_NOISE: Final = 1e-5
 """Least noise of the posterior of the patch when it is asked about a root: with less it is drawn to roots
 itself."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.elastic import Rubber
+from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
@@ -85,7 +86,7 @@ class Posterior:
         deadline_us: an update returns after this time and at most one more factorisation; what could not be
             solved by then is DEADLINE.
 
-    Compiles its kernels on the first frame. Raises ValueError for arguments of the wrong shape or range.
+    Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
     """
 
     def __init__(
@@ -139,6 +140,15 @@ class Posterior:
         self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
         self._signal = self._estimator.signal()
         self.reset()
+        self._warm_up()
+        self.reset()
+
+    def _warm_up(self) -> None:
+        """Solve a touched frame, lest the first touch of a stream wait for the compiler."""
+        touched = self.layout.upper_m.copy()
+        touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
+        potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
+        self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""

@@ -21,8 +21,8 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.branch import AGREE, JUMP, REFEREE_NOISE, Smoothness, exact_deviation, has_folds
-from skinnode.solve.exact import ExactTracker
+from skinnode.solve.branch import AGREE, BLIND, JUMP, REFEREE_NOISE, Smoothness, exact_deviation, has_folds,
+wire_deviations from skinnode.solve.exact import ExactTracker
 from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
 
@@ -117,6 +117,7 @@ class Tracker:
         self._large_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
+        self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
         rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
         self._folded = rough_noise or has_folds(layout, normal_only)
 
@@ -185,7 +186,7 @@ class Tracker:
         converged = np.array(field.status) == Status.CONVERGED
         spread = np.hypot(field.displacement_std_m, guide.displacement_std_m)
         gap = np.abs(field.displacement_m - guide.displacement_m)
-        agreed = doubtful & converged & known & (gap <= AGREE * spread).all(axis=(1, 2))
+        agreed = ~self._blind & doubtful & converged & known & (gap <= AGREE * spread).all(axis=(1, 2))
         if agreed.any():
             if self._confirmed is None:
                 self._confirmed = np.full_like(field.displacement_m, np.inf)
@@ -203,7 +204,7 @@ class Tracker:
         residual[replaced] = guide.residual[replaced]
         std[doubtful & ~agreed & ~replaced] = np.inf
         if self._folded:  # two roots may lie closer than the posterior can tell
-            apart = 2.0 * np.sqrt((gap**2).mean(axis=(1, 2), keepdims=True))
+            apart = 3.0 * np.sqrt((gap**2).mean(axis=(1, 2), keepdims=True))
             std = np.where(agreed[:, None, None], np.hypot(std, apart), std)
         self._exact.adopt(replaced, moved)
         stats = dataclasses.replace(

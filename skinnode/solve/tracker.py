@@ -21,8 +21,17 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.branch import AGREE, BLIND, JUMP, REFEREE_NOISE, Smoothness, exact_deviation, has_folds,
-wire_deviations from skinnode.solve.exact import ExactTracker
+from skinnode.solve.branch import (
+    AGREE,
+    BLIND,
+    JUMP,
+    REFEREE_NOISE,
+    Smoothness,
+    exact_deviation,
+    has_folds,
+    wire_deviations,
+)
+from skinnode.solve.exact import ExactTracker
 from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
 

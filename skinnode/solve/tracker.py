@@ -200,7 +200,7 @@ class Tracker:
             if self._confirmed is None:
                 self._confirmed = np.full_like(field.displacement_m, np.inf)
             self._confirmed[agreed] = field.displacement_m[agreed]
-        replaced = doubtful & ~agreed & known
+        replaced = ~self._blind & doubtful & ~agreed & known
         status = list(field.status)
         for u in np.flatnonzero(doubtful & ~agreed).tolist():
             if replaced[u]:

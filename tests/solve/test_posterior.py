@@ -102,7 +102,7 @@ def test_reported_deviations_hold(name, sigma, most, kind):
         inside.append(np.mean(np.abs(z) < 1.96))
         error2.append(np.mean((field.displacement_m - moved) ** 2))
         reported2.append(np.mean(field.displacement_std_m**2))
-    assert len(inside) >= 8
+    assert len(inside) >= 7  # of 10
     assert 0.90 <= np.mean(inside) <= most
     assert np.sqrt(np.sum(error2) / np.sum(reported2)) <= 1.15
 

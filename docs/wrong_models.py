@@ -1,0 +1,146 @@
+"""What a wrong model costs: the measurements of docs/solver.md, section 5.
+
+    .venv/bin/python docs/wrong_models.py [SEEDS]
+
+Two tables. First the wrong models of ``skinnode bench stability`` (case 13), once with nothing told to the
+solvers and once with ``model_error``. Then presses on a layer of rubber that is bonded to a rigid base, which
+the posterior takes for a half-space.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import j0, j1
+
+import skinnode as sk
+from skinnode.cli import _bench_stability as stability
+from skinnode.cli._cases import MODEL_ERROR, all_cases
+from skinnode.model.elastic import Rubber
+
+Float = NDArray[np.float64]
+
+WAVES = 6000
+"""Wave numbers of the integrals: a layer of 1 m then moves as a half-space to 0.3 % of the press."""
+SHARPEST = 40.0
+"""Greatest wave number, in units of one over the smaller of contact radius and thickness."""
+DEEP = 20.0
+"""k t from which on the bottom of the layer is not felt: e⁻²⁰."""
+NOISE = 1e-5
+SHARES = (1 / 3, 2 / 3, 1.0)
+
+
+def layer_response(k: Float, thickness_m: float, shear_modulus_pa: float) -> tuple[Float, Float]:
+    """Displacement of the surface of an incompressible layer, bonded below, by a pressure of wave number k.
+
+    A pressure cos(k x) moves the surface by U sin(k x) along it and W cos(k x) along its normal, m/Pa. With
+    Z = k z the displacement is (−f′ sin, f cos), which keeps the volume, and f = C Z sinh Z +
+    D (sinh Z − Z cosh Z), which solves G ∇²u = ∇p and vanishes with its slope at the base. No shear at the
+    surface asks f″ + f = 0; the pressure there is then −G k (3 f′ − f‴). Around an axis the same U and W go
+    with J₁ and J₀.
+    """
+    z = np.minimum(k * thickness_m, DEEP)
+    s, c = np.sinh(z), np.cosh(z)
+    first = (z * s, s + z * c, 2 * c + z * s, 3 * s + z * c)  # f, f′, f″, f‴
+    second = (s - z * c, -z * s, -s - z * c, -2 * c - z * s)
+    a, b = -(second[2] + second[0]), first[2] + first[0]
+    f, slope, _, third = (a * one + b * other for one, other in zip(first, second, strict=True))
+    pressure = -shear_modulus_pa * k * (3 * slope - third)
+    deep = k * thickness_m >= DEEP
+    along = np.where(deep, 0.0, -slope / pressure)
+    return along, np.where(deep, -0.5 / (shear_modulus_pa * k), f / pressure)
+
+
+def hertz_displacement(
+    points_m: Float, center_m: Float, radius_m: float, thickness_m: float, rubber: Rubber
+) -> Float:
+    """(P, 3) displacement of the surface by the pressure √(1 − r²/a²), 1 Pa at most, on a bonded layer."""
+    k = (np.arange(WAVES) + 0.5) * SHARPEST / min(radius_m, thickness_m) / WAVES
+    # Hankel transform of the pressure, times k dk
+    load = (np.sin(k * radius_m) - k * radius_m * np.cos(k * radius_m)) / (k**2 * radius_m) * (k[1] - k[0])
+    along, normal = layer_response(k, thickness_m, rubber.shear_modulus_pa)
+    gap = points_m - center_m
+    r = np.hypot(*gap.T)
+    outward = j1(np.outer(r, k)) @ (along * load) / np.maximum(r, 1e-12)
+    return np.column_stack([outward[:, None] * gap, j0(np.outer(r, k)) @ (normal * load)])
+
+
+def press_layers(seeds: int) -> None:
+    """One line a depth and thickness, means over ``seeds`` presses by bodies as blunt as a fingertip."""
+    layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
+    rubber = Rubber()
+    points = layout.upper_m[..., :2].reshape(-1, 2)
+    rest = sk.resistance_ohm(layout, layout.upper_m)
+    posterior = sk.Posterior(layout, relative_noise=NOISE, baseline_ohm=rest, rubber=rubber)
+    exact = sk.Tracker(layout, method="exact", relative_noise=NOISE, baseline_ohm=rest)
+    print(
+        "\nBonded layer, staggered, h = 0.5 (2 mm), noise 1e-5; errors over the wires CONVERGED\n"
+        f"{'press':>6}{'layer':>9}{'exact':>8}{'conv.':>7}{'posterior':>11}{'reported':>10}{'conv.':>7}"
+        f"{'in 95 %':>9}{'worst':>7}{'force / true':>14}{'reported':>10}"
+    )
+    for depth in (0.1, 0.3):
+        for thickness_m in (2e-3, 4e-3, 8e-3, 16e-3, 1.0):
+            rows = []
+            for seed in range(seeds):
+                rng = np.random.default_rng(seed)
+                center, radius = rng.uniform(8e-3, 28e-3, 2), float(rng.uniform(6e-3, 10e-3))
+                moved = hertz_displacement(points, center, radius, thickness_m, rubber)
+                pascal = depth * layout.height_m / np.abs(moved[:, 2]).max()
+                truth = pascal * moved.reshape(layout.upper_m.shape)
+                posterior.reset()
+                exact.reset()
+                for share in SHARES:
+                    clean = sk.resistance_ohm(layout, layout.upper_m + share * truth)
+                    frame = clean * (1.0 + NOISE * rng.standard_normal(clean.shape))
+                    found, inverted = posterior.update(frame), exact.update(frame)
+                force = pascal * 2 / 3 * np.pi * radius**2
+                rows.append((*_error(inverted, truth)[:2], *_error(found, truth), *_force(found, force)))
+            table = np.array(rows)
+            with np.errstate(invalid="ignore"):
+                exact_error, exact_conv, error, conv, reported, inside, _, pressed, std = np.nanmean(table, 0)
+            print(
+                f"{depth:6.0%}{1e3 * thickness_m:6g} mm{exact_error:8.1%}{exact_conv:7.0%}{error:11.1%}"
+                f"{reported:10.1%}{conv:7.0%}{inside:9.1%}{np.nanmax(table[:, 6]):7.1f}"
+                f"{pressed:14.2f}{std:10.2f}"
+            )
+
+
+def _error(field: sk.FieldFrame, truth: Float) -> tuple[float, float, float, float, float]:
+    """Error, wires converged, deviation, coverage and largest error in deviations."""
+    used = np.array([status is sk.Status.CONVERGED for status in field.status])
+    if not used.any():
+        return np.nan, 0.0, np.nan, np.nan, np.nan
+    error, std, size = (field.displacement_m - truth)[used], field.displacement_std_m[used], truth[used]
+    inside = float((np.abs(error) <= 1.96 * std).mean())
+    shares = (float(np.linalg.norm(each) / np.linalg.norm(size)) for each in (error, std))
+    return next(shares), float(used.mean()), next(shares), inside, float((np.abs(error) / std).max())
+
+
+def _force(field: sk.FieldFrame, true_n: float) -> tuple[float, float]:
+    """Normal force of all contacts and its deviation, over the true one; NaN where none was found."""
+    if not field.contacts:
+        return np.nan, np.nan
+    std = np.sqrt(sum(contact.normal_force_std_n**2 for contact in field.contacts))
+    return sum(contact.normal_force_n for contact in field.contacts) / true_n, float(std) / true_n
+
+
+def main() -> None:
+    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    print(stability.HEAD)
+    for share in (0.0, MODEL_ERROR):
+        print(f"model_error={share:g}")
+        cases = [dataclasses.replace(case, model_error=share) for case in all_cases() if case.number == 13]
+        stability.run(
+            seeds,
+            cases=cases,
+            only=("exact", "posterior"),
+            report=lambda row: print(stability.line(row), flush=True),
+        )
+    press_layers(seeds)
+
+
+if __name__ == "__main__":
+    main()

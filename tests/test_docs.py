@@ -1,0 +1,114 @@
+"""What docs/solver.md says exists, runs, and has the value it prints."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from typer.main import get_command
+
+from skinnode.model.elastic import HertzContact, Rubber
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE = (DOCS / "solver.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+
+
+def anchor(heading: str) -> str:
+    """As GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_python_blocks_run(number: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", BLOCKS[number]], capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def test_commands_exist_with_their_options() -> None:
+    from skinnode.cli.main import app
+
+    lines = re.findall(r"(?:`|\.venv/bin/)skinnode ([^`\n]+)", PAGE)
+    commands: set[tuple[str, str | None]] = set()
+    for line in lines:
+        found = re.match(r"(?:bench )?[a-z]+", line)
+        assert found, line
+        commands |= {(found[0], option) for option in [None, *re.findall(r"--[a-z-]+", line)]}
+    assert {("bench kernel", None), ("bench stability", None), ("bench path", "--plot")} <= commands
+    for name, option in commands:
+        done = CliRunner().invoke(get_command(app), [*name.split(), "--help"])
+        assert done.exit_code == 0, name
+        assert option is None or option in done.output, f"{name} {option}"
+
+
+def test_links_and_pictures_lead_somewhere() -> None:
+    headings = {anchor(heading) for heading in re.findall(r"^#+ (.*)$", PAGE, flags=re.MULTILINE)}
+    targets = re.findall(r"\]\(([^)]+)\)", PAGE)
+    assert targets
+    for target in targets:
+        if target.startswith("#"):
+            assert target[1:] in headings, target
+        elif not target.startswith("http"):
+            assert (DOCS / target).is_file(), target
+
+
+def test_files_named_exist() -> None:
+    package = DOCS.parent
+    for name in set(re.findall(r"`((?:solve|model|cli|docs|tests)/[\w/]+\.py)`", PAGE)):
+        assert (package / name).is_file() or (package / "skinnode" / name).is_file(), name
+
+
+def test_constants_have_the_values_printed() -> None:
+    rows = re.findall(r"^\| `(\w+)\.([A-Z_0-9]+)` \| ([^|]+) \|", PAGE, flags=re.MULTILINE)
+    assert len(rows) > 40
+    for module, name, value in rows:
+        found = getattr(importlib.import_module(f"skinnode.solve.{module}"), name)
+        assert found == pytest.approx(float(value), rel=1e-12), f"{module}.{name}"
+
+
+def test_statuses_and_fields_of_the_table_are_those_of_the_code() -> None:
+    from skinnode.model.frames import FieldFrame
+    from skinnode.model.status import Status
+
+    table = PAGE.split("### Statuses")[1].split("### Flags")[0]
+    cells = re.findall(r"^\| ([A-Z_, ]+) \|", table, flags=re.MULTILINE)
+    assert sorted(", ".join(cells).split(", ")) == sorted(status.name for status in Status)
+    flags = PAGE.split("### Flags beside the status")[1].split("### What a deviation means")[0]
+    for name in re.findall(r"^\| `(\w+)", flags, flags=re.MULTILINE):
+        assert name in FieldFrame.__dataclass_fields__, name
+
+
+def script(name: str) -> types.ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_bonded_layer_is_a_half_space_when_thick_and_reynolds_film_when_thin() -> None:
+    wrong = script("wrong_models")
+    rubber = Rubber()
+    points = np.array([[0.0, 0.0], [2e-3, 1e-3], [9e-3, 4e-3]])
+    hertz = HertzContact(rubber, radius_m=0.1, indentation_m=6e-4)
+    pressed = hertz.peak_pressure_pa * wrong.hertz_displacement(
+        points, np.zeros(2), hertz.contact_radius_m, 1.0, rubber
+    )
+    np.testing.assert_allclose(pressed, hertz.displacement_m(points), atol=0.01 * 6e-4)
+    # a film between a wall and a free surface: flux t³/3G, speed of the surface t²/2G of the gradient
+    k, t, g = np.array([3e-3, 1e-2]), 1.0, 2.0
+    along, normal = wrong.layer_response(k, t, g)
+    np.testing.assert_allclose(along, k * t**2 / (2 * g), rtol=1e-3)
+    np.testing.assert_allclose(normal, -(k**2) * t**3 / (3 * g), rtol=1e-3)

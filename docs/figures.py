@@ -151,8 +151,8 @@ def accuracy(figures: dict[str, Any]) -> str:
     parts.append(table(["scene", "who", "how", "µs a wire", "error"], rows))
     parts.append(
         "A 10 % press: RMS error (reported deviation) of the wires CONVERGED, shares of the displacement. "
-        "*Bound*: Cramér-Rao without a prior. *exact* is `Tracker(method='exact')` with its referee: where it "
-        "is better than the bound, wires were taken from the posterior."
+        "*Bound*: Cramér-Rao without a prior. *exact* is `Tracker(method='exact')` with its referee: where "
+        "it is better than the bound, wires were taken from the posterior."
     )
     rows = [
         [

@@ -89,10 +89,7 @@ class ContactFinder:
         away = place - centroid
         spread = (away**2).sum(axis=1)
         mean = float((pressure * spread).sum() / force)
-        cell = (
-            self._prior.cell_area_m2 / 6.0
-        )  # mean r² of a cell's own load, which is no part of the contact's
-        area = math.pi * HERTZ_SPREAD * max(mean - cell, 0.0)
+        area = math.pi * HERTZ_SPREAD * max(mean, 0.0)
         weights = np.zeros((7, 3 * len(q)))  # force, centroid, mean r², shear: by the delta method
         weights[0, 3 * region + 2] = load[2]
         weights[1:4, 3 * region + 2] = away.T * (load[2] / force)

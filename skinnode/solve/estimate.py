@@ -48,8 +48,11 @@ CHORDS: Final = 4
 """Most chord steps with one set of factors."""
 CHORD_RATE: Final = 0.35
 """Contraction of chord steps above which new factors are the shorter way: they cost ten chord steps."""
-NEWTONS: Final = 5
-"""Most factorisations of a solve that starts near."""
+NEWTONS: Final = 12
+"""Most factorisations of a solve that starts near: one or two as a rule, more where full steps would
+cycle."""
+HALVINGS: Final = 6
+"""Most times such a step is halved."""
 LOCAL_SPREAD: Final = 0.7
 """Deviation, in cells, of the Gaussian that spreads the squares of the loads found over their neighbours.
 Less trusts single cells, which is better for contacts on rubber as the prior has it, and overconfident for
@@ -130,8 +133,13 @@ class Estimator:
         """The rest position, nothing known."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
-        self.std[:] = np.inf
+        self.forget_factors()
         self.spread(scale2)
+
+    def forget_factors(self) -> None:
+        """Nothing is known of the field at hand."""
+        self.std[:] = np.inf
+        self._factored = None
 
     def spread(self, scale2: float) -> None:
         """Loads are expected all over the patch alike, at scale s²."""
@@ -241,14 +249,16 @@ class Estimator:
 
     def track(self, data: Data, members: Index) -> bool:
         """Solve from the displacement at hand; False where that leads nowhere near."""
-        if self._fits(data, members) and self._chord(data):
+        if self._fits(data, members) and self._settle(data):
             return True
         for _ in range(NEWTONS):
+            before = self.moved.copy(), self.g.copy()
             size = self._newton(data, members)
             if not size <= self._reach:
                 return False
+            self._shorten(data, *before)
             self._measure(data)
-            if self._chord(data):
+            if self._settle(data):
                 return True
         return False
 
@@ -271,7 +281,7 @@ class Estimator:
         if not self._newton(data, members) < math.inf:
             return False
         self._measure(data)
-        return self._chord(data) or self.track(data, members)
+        return self._settle(data) or self.track(data, members)
 
     def signal(self) -> Float:
         """(U, K) variance of each relative change of R at rest under a prior of scale 1, pitch⁻²."""
@@ -356,6 +366,28 @@ class Estimator:
         self._factored = (data.weight.copy(), self.scale2)
         return size
 
+    def _shorten(self, data: Data, moved: Float, g: Float) -> None:
+        """From there towards the field at hand, to the minimum of the parabola through what is minimised.
+
+        Gauss-Newton leaves out the curvature of F, and where the data say little its full steps go to and fro
+        across the minimum for ever.
+        """
+        way = self.moved - moved, self.g - g
+
+        def at(share: float) -> float:
+            return self.objective(data, moved + share * way[0], g + share * way[1])
+
+        start, far = at(0.0), 1.0
+        middle, end = at(0.5), at(1.0)
+        for _ in range(HALVINGS):  # far from the minimum it is no parabola
+            if end < 4.0 * start + 1.0:
+                break
+            far *= 0.5
+            middle, end = at(0.5 * far), middle
+        slope, bend = 4.0 * middle - end - 3.0 * start, 2.0 * (end - 2.0 * middle + start)
+        share = far * (min(max(-0.5 * slope / bend, 0.1), 1.0) if bend > 0.0 else 1.0)
+        self.moved[:], self.g[:] = moved + share * way[0], g + share * way[1]
+
     def _measure(self, data: Data) -> None:
         """Deviations and γ by the factors at hand."""
         b, m = self._b, self.members.size * self._rows
@@ -368,6 +400,15 @@ class Estimator:
         self.std[:] = np.sqrt(variance * (1.0 + PRIOR_DOUBT * variance / prior)).reshape(self.std.shape)
         inverse_diagonal(b.innovation, b.work, b.v, m)
         self.gamma = m - float(b.v[:m].sum())
+
+    def _settle(self, data: Data) -> bool:
+        """Chord steps to the maximum; where they do not settle, the better of the fields before and after."""
+        moved, g = self.moved.copy(), self.g.copy()
+        if self._chord(data):
+            return True
+        if not self.objective(data) <= self.objective(data, moved, g):
+            self.moved[:], self.g[:] = moved, g
+        return False
 
     def _chord(self, data: Data) -> bool:
         """Chord steps until the correction is small against the deviation."""

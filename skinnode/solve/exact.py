@@ -41,6 +41,7 @@ from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
 from skinnode.solve import operators as op
 from skinnode.solve import wires
+from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.system import operator_code
 
@@ -67,8 +68,6 @@ STALE: Final = 2.0
 """The J⁺ of a tall system is used again while no equation's share of the weights has changed by more."""
 TINY: Final = 1e-200
 """Far below any square of a slope, and nothing overflows that is divided by it."""
-NOISE_MAX: Final = 1e12
-"""A relative deviation above is no knowledge, and its square must not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +131,8 @@ class ExactTracker:
         self.layout = layout
         self._problem = PatchProblem.of(layout, baseline_ohm)
         self.stiffness_n_per_m = stiffness_n_per_m
-        self._noise, self._sigma = self._checked_noise(relative_noise)
+        self._noise = checked_noise(relative_noise, layout)
+        self._sigma = float(self._noise.min())
         self._hold = hold
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
         self._active_only = active_only
@@ -254,10 +254,18 @@ class ExactTracker:
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
         """Go on from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
         moved = (displacement_m / self.layout.pitch_m).reshape(self._x.shape)
+        if self._active_only:  # with every electrode an unknown again, as the displacement has them all
+            for u in np.flatnonzero(wires_).tolist():
+                self._set_electrodes(u, np.arange(self.layout.unknowns // 3))
         for u in np.flatnonzero(wires_).tolist():
             self._x[u] = self._problem.rest[u] + moved[u]
             self._a[u] = 1.0 / (1.0 + self._relative_residual(self._x[u], np.ones(self.layout.shape[1])))
             self._predictable[u] = False
+
+    def distrust(self, wires_: NDArray[np.bool_]) -> None:
+        """Solve these wires (U,) from rest in the next frame, whatever they came to in this one."""
+        self._x[wires_], self._a[wires_] = self._problem.rest[wires_], self._problem.a_rest[wires_]
+        self._predictable[wires_] = False
 
     def _solve(self, todo: NDArray[np.uint8], frame: _Frame) -> NDArray[np.bool_]:
         """Solve the wires in ``todo`` for the frame, in turn where there is a deadline; (U,) who had one."""
@@ -457,39 +465,17 @@ class ExactTracker:
         frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         noise, sigma = self._noise, self._sigma
         if relative_noise is not None:
-            noise = self._broadcast_noise(relative_noise)
+            noise = broadcast_noise(relative_noise, self.layout)
             known = (noise > 0) & (noise < NOISE_MAX)
             noise = np.where(known, noise, np.inf)
             sigma = float(noise.min()) if known.any() else self._sigma
         weight = sigma / noise
         if valid is not None:
-            weight *= self._checked_mask(valid)
+            weight *= checked_mask(valid, self.layout)
         with np.errstate(over="ignore", invalid="ignore"):
             a = frame * self._problem.gain
             used = np.where((a > wires.A_MIN) & (a < wires.A_MAX), weight, 0.0)
         return _Frame(a, weight, used, sigma, start + self._seconds)
-
-    def _broadcast_noise(self, relative_noise: ArrayLike) -> Float:
-        try:
-            return np.broadcast_to(np.asarray(relative_noise, np.float64), self.layout.shape)
-        except (TypeError, ValueError) as error:
-            got = f"got shape {np.shape(relative_noise)}" if np.ndim(relative_noise) else f"{error}"
-            raise ValueError(f"relative_noise: {got}, must be a number or {self.layout.shape}") from None
-
-    def _checked_noise(self, relative_noise: ArrayLike) -> tuple[Float, float]:
-        """(U, K) deviations and the smallest of them."""
-        noise = self._broadcast_noise(relative_noise)
-        if not ((noise > 0) & (noise < np.inf)).all():
-            worst = noise[~((noise > 0) & (noise < np.inf))][0]
-            raise ValueError(f"relative_noise: got {worst}, must be positive and finite everywhere")
-        return noise, float(noise.min())
-
-    def _checked_mask(self, valid: ArrayLike) -> NDArray[np.bool_]:
-        mask = np.asarray(valid)
-        if mask.dtype != np.bool_ or mask.shape != self.layout.shape:
-            got = f"{mask.dtype} of shape {mask.shape}"
-            raise ValueError(f"valid: got {got}, must be bool of shape {self.layout.shape}")
-        return mask
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:

@@ -27,7 +27,7 @@ from skinnode.solve.walk import Walk
 CONSULT_TOLERANCE: Final = 1e-12
 CONSULT_STEPS: Final = 100
 """The paper's final tolerance, and its most steps of an intermediate sample."""
-RIVALS: Final = 8
+RIVALS: Final = 12
 """Starts, drawn from the posterior, from which another root is looked for where a layout has folds; the same
 ones every time."""
 

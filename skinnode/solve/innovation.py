@@ -119,8 +119,8 @@ def residuals(x: Float, lower: Float, a: Float, weight: Float, r: Float) -> None
 
 @njit
 def single_moves(free: Index, jt: Float, r: Float, move: Float, top: Float) -> None:
-    """By how much each coordinate alone would have to move, Jᵢᵀ r / ‖Jᵢ‖², into ``move`` (U, f), and the
-    largest of a wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
+    """By how much each coordinate alone would be off, Jᵢᵀ r / ‖Jᵢ‖², into ``move`` (U, f), and the largest of
+    a wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
     for u in range(jt.shape[0]):
         top[u] = 0.0
         for i in range(free.size):
@@ -216,15 +216,14 @@ def assemble(
 
 
 @njit
-def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers) -> float:
-    """The Gauss-Newton step into ``x`` and ``g``, with L in place of S; yᵀ S⁻¹ y."""
+def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers) -> None:
+    """The Gauss-Newton step into ``x`` and ``g``, with L in place of S."""
     f = free.size
     rows = b.jacobian.shape[0] // x.shape[0]
     m = members.size * rows
     for k in range(m):
         b.v[k] = b.y[k]
     solve_lower_vector(b.innovation, b.v, m)
-    square = dot(b.v[:m], b.v[:m])
     solve_lower_transposed_vector(b.innovation, b.v, m)
     for j in range(b.gradient.size):
         b.gradient[j] = 0.0
@@ -240,7 +239,6 @@ def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buff
         for k in range(m):
             total += b.nuisance[k, q] * b.v[k]
         g[q] = -d[q] * total
-    return square
 
 
 @njit

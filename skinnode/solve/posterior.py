@@ -126,6 +126,7 @@ class Posterior:
         self._free = np.arange(2, 3 * electrodes, 3) if normal_only else np.arange(3 * electrodes)
         self._prior = ElasticPrior.of(layout, rubber)
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
+        self._until = math.inf
         self._gains = {"none": 0, "patch": 1, "wire": wires}[drift]
         self._d = np.full(self._gains + (model_error > 0), drift_std**2)
         if model_error > 0:
@@ -197,7 +198,7 @@ class Posterior:
         a = np.where(usable, a, self._problem.a_rest)
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
-        estimator.until = start + self._seconds
+        estimator.until = min(start + self._seconds, self._until)
         estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
         data = self._data(a, noise, usable)
         self._set_least(data)
@@ -208,13 +209,21 @@ class Posterior:
             try:
                 status, held = self._solve(data, a, noise, usable)
             except TimeoutError:
+                start_known = self._known
                 status, held = self._give_up(Status.DEADLINE)
+                self._known = start_known  # the next frame starts where this one did
             data = self._data(a, noise, usable)
         return self._field(data, status, held, start)
 
     def covariance_m2(self) -> Float:
-        """(3UN, 3UN) covariance of the displacement of the last solved frame; 0 for coordinates that are not
-        free."""
+        """(3UN, 3UN) covariance of the displacement of the last frame as the factors have it, without the
+        allowance for what the prior itself may get wrong (``PRIOR_DOUBT``); 0 for coordinates that are not
+        free.
+
+        Raises RuntimeError where that frame was not solved.
+        """
+        if not np.isfinite(self._estimator.std).all():
+            raise RuntimeError("covariance_m2: the last frame was not solved")
         wires, coordinates = self._estimator.moved.shape
         every = (self._wires[:, None] * coordinates + self._free).ravel()
         full = np.zeros((wires * coordinates, wires * coordinates))
@@ -238,6 +247,10 @@ class Posterior:
         if self._model_error > 0:
             h[..., -1] = weight * change
         return Data(a, weight, h, self._d)
+
+    def stop_at(self, until: float) -> None:
+        """Let the next updates end at this time of :func:`time.perf_counter`, inf for never."""
+        self._until = until
 
     def _set_least(self, data: Data) -> None:
         """The smallest scale at the noise of the frame."""
@@ -332,9 +345,10 @@ class Posterior:
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
-        if self._known and estimator.track(data, members):
+        hurry = self._seconds < math.inf  # annealing takes several frames' worth of time
+        if (self._known or hurry) and estimator.track(data, members):
             jump = float(np.abs(estimator.moved - self._trusted).max())
-            return jump < self._jump or self._anneal_and_compare(data, members)
+            return jump < self._jump or hurry or self._anneal_and_compare(data, members)
         estimator.spread(self._fixed_scale or self._scale_rest)
         if self._fixed_scale is None:
             estimator.scale2 = self._bounded(estimator.guess_scale(data, members))
@@ -404,7 +418,8 @@ class Posterior:
 
     def _give_up(self, status: Status) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         self._known = False
-        self._estimator.std[:] = np.inf
+        self._seen[:] = False
+        self._estimator.forget_factors()
         return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
 
     def _field(

@@ -12,6 +12,8 @@ alone cannot tell apart.
 from __future__ import annotations
 
 import dataclasses
+import math
+from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -108,6 +110,7 @@ class Tracker:
             self._exact = None
             return
         self._noise = relative_noise
+        self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
         self._exact = ExactTracker(
             layout,
             operator=operator,
@@ -154,12 +157,14 @@ class Tracker:
         """
         if self._exact is None:
             return self._posterior.update(frame_ohm, valid, relative_noise)
+        start = perf_counter()
         field = self._exact.update(frame_ohm, valid, relative_noise)
         lost, unsure = self._doubtful(field)
         if (lost | unsure).any():
             if unsure.any():
                 self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
             noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
+            self._posterior.stop_at(start + self._seconds)
             guide = self._posterior.update(frame_ohm, valid, noise)
             field = self._refer(field, lost | unsure, guide)
         self._last_m = field.displacement_m
@@ -213,9 +218,10 @@ class Tracker:
         residual[replaced] = guide.residual[replaced]
         std[doubtful & ~agreed & ~replaced] = np.inf
         if self._folded:  # two roots may lie closer than the posterior can tell
-            apart = 3.0 * np.sqrt((gap**2).mean(axis=(1, 2), keepdims=True))
+            apart = 1.5 * gap.max(axis=(1, 2), keepdims=True)
             std = np.where(agreed[:, None, None], np.hypot(std, apart), std)
         self._exact.adopt(replaced, moved)
+        self._exact.distrust(doubtful & ~agreed & ~replaced)
         stats = dataclasses.replace(
             field.stats,
             evaluations=field.stats.evaluations + guide.stats.evaluations,

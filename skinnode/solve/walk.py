@@ -36,9 +36,9 @@ GUIDED_STEPS: Final = 100
 """A guided start is next to its root or next to none: 1 to 20 steps."""
 SAME: Final = 1e-3
 """Two solutions closer than that share of the displacement are one root."""
-UNLIKELY: Final = 4.0
-"""Energy by which other roots must be less likely. On staggered, h = 1, and aligned, h = 0.5 and 1, 40
-presses of 50 and 70 %, the right one of two roots was always the likelier, by 0.1 to 36."""
+UNLIKELY: Final = 9.0
+"""Energy by which other roots must be less likely: 3 deviations. On staggered, h = 1, and aligned, h = 0.5
+and 1, 40 presses of 50 and 70 %, the right one of two roots was always the likelier, by 0.1 to 36."""
 TWIN_TOLERANCE: Final = 1e-9
 TWIN_STEPS: Final = 30
 

@@ -50,6 +50,8 @@ mirror image; of the others only those of layers of 1.5 pitches and more above a
 JUMP: Final = 0.2
 """Share of the clearance by which an electrode may move between two frames before a root is no longer taken
 for the right one because it is the next one: folds were passed from 0.24 on."""
+NEARLY_BLIND: Final = 1e5
+"""The same where a root has to be clearly likelier than any other: aligned from h = 1 on."""
 REFEREE_NOISE: Final = 1e-5
 """Least noise of the posterior of the patch when it is asked about a root: with less it is drawn to roots
 itself."""

@@ -36,9 +36,6 @@ GUIDED_STEPS: Final = 100
 """A guided start is next to its root or next to none: 1 to 20 steps."""
 SAME: Final = 1e-3
 """Two solutions closer than that share of the displacement are one root."""
-UNLIKELY: Final = 9.0
-"""Energy by which other roots must be less likely: 3 deviations. On staggered, h = 1, and aligned, h = 0.5
-and 1, 40 presses of 50 and 70 %, the right one of two roots was always the likelier, by 0.1 to 36."""
 TWIN_TOLERANCE: Final = 1e-9
 TWIN_STEPS: Final = 30
 
@@ -226,12 +223,17 @@ class Walk:
         self.status[back] = op.ILL_CONDITIONED
 
     def weigh_rivals(
-        self, starts: Float, energy: Callable[[Float], float], tolerance: float, most_steps: int
+        self,
+        starts: Float,
+        energy: Callable[[Float], float],
+        unlikely: Float,
+        tolerance: float,
+        most_steps: int,
     ) -> None:
         """Of the roots that other starts ``starts`` (S, U, n), pitches, come to, keep the likeliest: that of
         the least ``energy``, −2 log of the density of a displacement field (U, n) to a constant.
 
-        It is CONVERGED only where no other comes near.
+        It is CONVERGED only where no other comes within ``unlikely`` (U,) of it.
         """
         solver, rest = self.solver, self.problem.rest
         found = solver.x.copy()
@@ -249,7 +251,7 @@ class Walk:
                 rival = root.copy()
                 rival[u] = solver.x[u]
                 gain = least - energy(rival - rest)
-                close[u] = abs(gain) < UNLIKELY or (close[u] and gain < 0)
+                close[u] = abs(gain) < unlikely[u] or (close[u] and gain < 0)
                 if gain > 0:
                     root[u], better[u] = rival[u], True
                     least -= gain

@@ -37,6 +37,7 @@ class Solver:
         self._facts = facts
         self._tracker = Tracker(
             facts.layout,
+            method=config.method,
             operator=config.operator,
             relative_noise=facts.config.relative_noise,
             baseline_ohm=facts.baseline_ohm,
@@ -66,7 +67,9 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
     or reads them from the cache: not while a node waits."""
     layout = patch.layout.build()
     try:
-        Tracker(layout, operator=config.operator).update(resistance_ohm(layout, layout.upper_m))
+        Tracker(layout, method=config.method, operator=config.operator).update(
+            resistance_ohm(layout, layout.upper_m)
+        )
     except ValueError as error:
         raise ConfigError(f"patch {patch.name!r}", layout.name, str(error)) from None
 

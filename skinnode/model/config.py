@@ -36,6 +36,7 @@ and whoever else is on the bus; above 70 % the response times of low priorities 
 Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35, 2007)."""
 
 Preset = Literal["aligned", "symmetric", "staggered"]
+Method = Literal["auto", "exact", "posterior"]
 Operator = Literal["gauss_newton", "levenberg_marquardt", "dogleg"]
 
 
@@ -166,7 +167,10 @@ class SyncConfig(_Table):
 class SolverConfig(_Table):
     """How resistances become displacements."""
 
+    method: Annotated[Method, _Allowed(" or ".join(get_args(Method)))] = "auto"
+    """The exact inverse of each wire, the posterior of the patch, or what suits layout and noise."""
     operator: Annotated[Operator, _Allowed(" or ".join(get_args(Operator)))] = "dogleg"
+    """Of the exact inverse."""
     stiffness_n_per_m: _Stiffness | None = None
     """Stiffness of the rubber under one electrode; with it a field carries forces."""
     workers: Annotated[int | None, Field(ge=1, le=64), _Allowed("an integer from 1 to 64")] = None

@@ -221,9 +221,22 @@ def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:
     assert all(len(times) == 1 for times in by_scan.values())
 
 
+def test_patch_of_fewer_wires_than_unknowns_is_solved_with_its_prior(
+    make_hand: Callable[..., HandConfig],
+) -> None:
+    table = make_hand(patches=1).model_dump(mode="json")
+    table["patches"][0]["layout"]["lower_wires"] = 11
+    hand = parse_hand(table)
+    with Fleet(hand), Host.from_config(hand) as host:
+        fields = take(host.fields(timeout_s=10), 3)
+    assert {field.method for field in fields} == {"posterior"}
+    assert all(field.trusted for field in fields)
+
+
 def test_patch_that_cannot_be_solved(make_hand: Callable[..., HandConfig]) -> None:
     table = make_hand(patches=1).model_dump(mode="json")
     table["patches"][0]["layout"]["lower_wires"] = 11
+    table["solver"]["method"] = "exact"
     hand = parse_hand(table)
     with Fleet(hand), pytest.raises(ConfigError) as caught, Host.from_config(hand):
         pass

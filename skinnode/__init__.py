@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from skinnode.host import Host
+    from skinnode.model.elastic import Rubber
     from skinnode.model.forward import jacobian, resistance_ohm
     from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
     from skinnode.model.layout import PatchLayout
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Host": "skinnode.host",
     "PatchLayout": "skinnode.model.layout",
+    "Rubber": "skinnode.model.elastic",
     "resistance_ohm": "skinnode.model.forward",
     "jacobian": "skinnode.model.forward",
     "Contact": "skinnode.model.frames",
@@ -51,6 +53,7 @@ __all__ = [
     "Periodic",
     "Posterior",
     "ResistanceFrame",
+    "Rubber",
     "ScanStamp",
     "SolveStats",
     "Status",

@@ -74,6 +74,13 @@ HEAD = (
 )
 
 
+LEGEND = (
+    "# is the number of the hard case; error and reported deviation are shares of the displacement of the\n"
+    "CONVERGED wires in the deepest frame, the worst that of any frame. Wires of all frames are accurate,\n"
+    "flagged (not CONVERGED), or wrong: CONVERGED and off by more than chance and the deviation allow."
+)
+
+
 def line(row: dict[str, Any]) -> str:
     """A row of the table."""
     method = row["method"] if row["same_as"] is None else f"{row['method']} = {row['same_as']}"

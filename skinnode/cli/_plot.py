@@ -38,7 +38,7 @@ class PatchTrace:
 def require_matplotlib(file: Path) -> None:
     """Raises ConfigError where matplotlib is missing or does not write files of this kind."""
     if find_spec("matplotlib") is None:
-        raise ConfigError("--plot", str(file), "only with matplotlib: pip install matplotlib")
+        raise ConfigError("--plot", str(file), "only with matplotlib: sh install.sh plot")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     kinds = sorted(FigureCanvasAgg.get_supported_filetypes())

@@ -130,6 +130,7 @@ class Tally:
             if size > 0:
                 self._errors.append(float(np.linalg.norm(error[deepest][used])) / size)
                 self._reported.append(float(np.linalg.norm(std[deepest][used])) / size)
+                self._worst_error = float(np.fmax(self._worst_error, self._errors[-1]))
         each = np.sqrt(np.nansum(error**2, axis=(1, 2, 3)))
         worst = float(each.max()) / float(np.linalg.norm(truth[deepest]))
         if np.isfinite(error).any():

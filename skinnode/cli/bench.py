@@ -54,7 +54,7 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
         typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
     typer.echo("ratio: to skinnode dogleg; tolerance: the loosest given to the solver that reaches 1e-9.")
     if not any("pyceres" in row["who"] for row in figures["rows"]):
-        typer.echo("Ceres is not installed: with pip install pyceres it is measured too.")
+        typer.echo("Ceres is not installed: after sh install.sh bench it is measured too.")
     _write(json, figures)
     if plot is not None:
         from skinnode.cli._plot_ratios import draw_solve
@@ -77,7 +77,10 @@ def stability(
     typer.echo(bench.HEAD)
     figures = bench.run(seeds, report=lambda row: typer.echo(bench.line(row)))
     wrong = [row for row in figures["rows"] if row["wrong"]]
-    typer.echo(f"\n{len(figures['rows'])} rows, {seeds} seeds each: {len(wrong)} converged and wrong")
+    _print_machine(figures)
+    typer.echo(bench.LEGEND)
+    each = "one seed" if seeds == 1 else f"{seeds} seeds each"
+    typer.echo(f"\n{len(figures['rows'])} rows, {each}: {len(wrong)} converged and wrong")
     for row in wrong:
         typer.echo(f"  {named(row)}")
     _write(json, figures)

@@ -91,8 +91,8 @@ class FieldFrame:
     method: str = "exact"
     """``exact``: each wire inverted; ``posterior``: the patch estimated with its elastic prior."""
     by_prior: NDArray[np.bool_] | None = None
-    """(U,) wires of an exact field that were estimated with the prior, since their own equations did not
-    do."""
+    """(U,) wires whose own equations did not do: of an exact field those estimated with the prior, of a
+    posterior those without any. ``trusted`` may rest on the prior alone there."""
     contacts: tuple[Contact, ...] = ()
     """Found by the posterior, the strongest first."""
     gain: Float | None = None

@@ -18,7 +18,7 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.forward import jacobian
 from skinnode.model.kernels import potential_jacobian
@@ -127,9 +127,9 @@ def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Floa
     return np.asarray(x - 2.0 * least / curvature * v)
 
 
-def has_folds(layout: PatchLayout, normal_only: bool = False) -> bool:
-    """Whether presses on this layout run into folds of F = b."""
-    return exact_deviation(layout, 1.0, normal_only) > FOLDED
+def folded_wires(layout: PatchLayout, normal_only: bool = False) -> NDArray[np.bool_]:
+    """(U,) wires on which presses run into folds of F = b."""
+    return wire_deviations(layout, 1.0, normal_only) > FOLDED
 
 
 def exact_deviation(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
-from skinnode.solve.branch import BLIND, NEARLY_BLIND, REFEREE_NOISE, has_folds, wire_deviations
+from skinnode.solve.branch import BLIND, NEARLY_BLIND, REFEREE_NOISE, folded_wires, wire_deviations
 from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.schedule import Schedule, Uniform
@@ -100,12 +100,19 @@ def solve_path(
     if not (samples > 0).all():
         where = tuple(int(i) for i in np.argwhere(~(samples > 0))[0])
         raise ValueError(f"samples_ohm: got {samples[where]} at {list(where)}, must be positive")
+    if layout.shape[1] < layout.unknowns:
+        raise ValueError(
+            f"layout: got {layout.shape[1]} lower wires for {layout.unknowns} unknowns an upper wire, "
+            "must be at least as many"
+        )
+    if schedule is not None and (isinstance(schedule, type) or not hasattr(schedule, "follow")):
+        raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic(), Adaptive() or alike")
     problem = PatchProblem.of(layout, baseline_ohm)
     start = time.perf_counter()
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a diverged wire, told by its status
         walk = Walk(problem, samples * problem.gain, code)
         (Uniform() if schedule is None else schedule).follow(walk)
-        if has_folds(layout):
+        if folded_wires(layout).any():
             _consult(walk, layout, samples[-1], baseline_ohm)
         walk.doubt_twins()
         walk.refuse(wire_deviations(layout, 1.0) > BLIND)

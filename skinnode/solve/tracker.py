@@ -30,7 +30,7 @@ from skinnode.solve.branch import (
     REFEREE_NOISE,
     Smoothness,
     exact_deviation,
-    has_folds,
+    folded_wires,
     wire_deviations,
 )
 from skinnode.solve.exact import ExactTracker
@@ -131,7 +131,7 @@ class Tracker:
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
         rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
-        self._folded = rough_noise or has_folds(layout, normal_only)
+        self._folded = folded_wires(layout, normal_only) | rough_noise
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
@@ -178,10 +178,9 @@ class Tracker:
         lost = ~solved & (status != Status.DEADLINE)
         if field.held is not None:
             solved &= ~field.held
-        if self._folded:
-            return lost, solved
         moved = field.displacement_m
-        unsure = solved & (np.abs(moved - self._last_m).max(axis=(1, 2)) > self._jump_m)
+        unsure = solved & self._folded
+        unsure |= solved & (np.abs(moved - self._last_m).max(axis=(1, 2)) > self._jump_m)
         large = solved & (np.abs(moved).max(axis=(1, 2)) > self._large_m)
         if large.any():
             pitches = (moved / self.layout.pitch_m).reshape(len(moved), -1)
@@ -217,9 +216,10 @@ class Tracker:
         moved[replaced], std[replaced] = guide.displacement_m[replaced], guide.displacement_std_m[replaced]
         residual[replaced] = guide.residual[replaced]
         std[doubtful & ~agreed & ~replaced] = np.inf
-        if self._folded:  # two roots may lie closer than the posterior can tell
-            apart = 1.5 * gap.max(axis=(1, 2), keepdims=True)
-            std = np.where(agreed[:, None, None], np.hypot(std, apart), std)
+        if self._folded.any():  # two roots may lie closer than the posterior can tell
+            std[replaced & self._folded] *= 2.0
+            apart = 3.0 * gap.max(axis=(1, 2), keepdims=True)
+            std = np.where((agreed & self._folded)[:, None, None], np.hypot(std, apart), std)
         self._exact.adopt(replaced, moved)
         self._exact.distrust(doubtful & ~agreed & ~replaced)
         stats = dataclasses.replace(

@@ -14,6 +14,7 @@ roughness      √(uᵀ C⁻¹ u): of two roots the smoother one is the more lik
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Final
 
@@ -140,10 +141,21 @@ def exact_deviation(layout: PatchLayout, relative_noise: ArrayLike, normal_only:
 
 def wire_deviations(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool = False) -> Float:
     """(U,) :func:`exact_deviation` wire by wire."""
+    if np.ndim(relative_noise) == 0:
+        return np.asarray(relative_noise) * _unit_deviations(layout, normal_only)
+    return _deviations(layout, np.broadcast_to(relative_noise, layout.shape), normal_only)
+
+
+@functools.lru_cache(maxsize=64)  # 3 ms a layout, and asked for by every path
+def _unit_deviations(layout: PatchLayout, normal_only: bool) -> Float:
+    return _deviations(layout, np.ones(layout.shape), normal_only)
+
+
+def _deviations(layout: PatchLayout, relative_noise: Float, normal_only: bool) -> Float:
     problem = PatchProblem.of(layout)
     slopes = jacobian(layout, layout.upper_m) * layout.pitch_m**2 * problem.a_rest[..., None, None]
     slopes = slopes[..., 2:] if normal_only else slopes
-    weighted = slopes.reshape(*layout.shape, -1) / np.broadcast_to(relative_noise, layout.shape)[..., None]
+    weighted = slopes.reshape(*layout.shape, -1) / relative_noise[..., None]
     singular = np.linalg.svd(weighted, compute_uv=False)
     with np.errstate(divide="ignore"):
         variance = (1.0 / singular**2).sum(axis=1) / weighted.shape[2]

@@ -9,6 +9,7 @@ equation.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Final
 
@@ -46,8 +47,7 @@ class PatchProblem:
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
         """``baseline_ohm`` (U, K) are measured rest resistances. ValueError unless they are positive."""
         pitch = layout.pitch_m
-        rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
-        potential = potential_per_m(layout, layout.upper_m) * pitch
+        rest, lower, potential, share, clearance = _at_rest(layout)
         gain = np.full(layout.shape, 1.0 / (layout.resistivity_ohm_per_m * pitch))
         if baseline_ohm is not None:
             baseline = require_array("baseline_ohm", baseline_ohm, layout.shape)
@@ -55,13 +55,7 @@ class PatchProblem:
                 where = tuple(int(i) for i in np.argwhere(~(baseline > 0))[0])
                 raise ValueError(f"baseline_ohm: got {baseline[where]} at {list(where)}, must be positive")
             gain = 1.0 / (baseline * potential)
-        gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)
-        distance = np.sqrt((gaps**2).sum(axis=-1)) / pitch
-        share = (1.0 / distance.reshape(*rest.shape[:1], -1, *layout.lower_m.shape[:2])).sum(axis=-1)
-        return cls(
-            layout, rest, lower_rows(layout.lower_m / pitch), gain, 1.0 / potential, share,
-            distance.min(axis=-1),
-        )  # fmt: skip
+        return cls(layout, rest, lower, gain, 1.0 / potential, share, clearance)
 
     @property
     def step_limit(self) -> float:
@@ -81,3 +75,24 @@ class PatchProblem:
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):
             return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))
+
+
+@functools.lru_cache(maxsize=64)  # 2 ms a layout, as long as ten paths of a wire
+def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
+    """rest, lower, F at rest, shares of F and clearance of a :class:`PatchProblem`; none of them is written
+    to."""
+    pitch = layout.pitch_m
+    rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
+    gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)
+    distance = np.sqrt((gaps**2).sum(axis=-1)) / pitch
+    share = (1.0 / distance.reshape(*rest.shape[:1], -1, *layout.lower_m.shape[:2])).sum(axis=-1)
+    found = (
+        rest,
+        lower_rows(layout.lower_m / pitch),
+        potential_per_m(layout, layout.upper_m) * pitch,
+        share,
+        distance.min(axis=-1),
+    )
+    for array in found:
+        array.setflags(write=False)
+    return found

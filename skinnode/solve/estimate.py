@@ -64,8 +64,8 @@ LOCAL_FLOOR: Final = 0.05
 LOCAL_CHANGE: Final = 0.35
 """Share of the expected loads that must have moved elsewhere before the prior is made anew: at 0.5 frames of
 a slow press reach 6 deviations, at 0.25 twice as many frames pay for it."""
-PRIOR_DOUBT: Final = 3.0
-"""A coordinate of which the data say nothing has twice the deviation of the prior, one that they determine
+PRIOR_DOUBT: Final = 4.0
+"""A coordinate of which the data say nothing has √5 times the deviation of the prior, one that they determine
 its own: how much load to expect at one place is itself known to a factor only. Without, one frame in four has
 a coordinate beyond 5 deviations where a layout hardly sees the shear (`aligned`)."""
 NEAR: Final = 0.25

@@ -41,7 +41,7 @@ METHODS: Final = ("auto", "exact", "posterior")
 EXACT_SHARE: Final = 0.0025
 """Deviation of the exact inverse at rest, in clearances, up to which ``auto`` takes it: 2.5 % of a press of a
 tenth of the layer. 16-bit codes leave 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
-NONLINEAR: Final = 0.02
+NONLINEAR: Final = 0.003
 """Deviation of the exact inverse, in clearances, from which on F is not linear within its noise: a root is
 then as doubtful as near a fold."""
 LARGE: Final = 0.03

@@ -149,7 +149,7 @@ class Forces:
 
 def _case(kind: str, height: float) -> Case:
     def never(rng: np.random.Generator) -> Stream:
-        raise NotImplementedError
+        raise RuntimeError("of this case the skin is used, and no stream")
 
     return Case(0, f"{kind} h={height:g}", Skin(preset(kind, height)), never)
 

@@ -87,7 +87,7 @@ SETTINGS = [  # layout, noise, most that may lie within 1.96 deviations
 @pytest.mark.parametrize("kind", ["sphere", "gauss", "ridge", "plateau"])
 @pytest.mark.parametrize(("name", "sigma", "most"), SETTINGS)
 def test_reported_deviations_hold(name, sigma, most, kind):
-    """A jump from rest to each of 10 scenes: 95 % within 1.96, RMS error no more than reported."""
+    """A jump from rest to each of 10 scenes is solved: 95 % within 1.96, RMS error no more than reported."""
     layout = sk.PatchLayout.preset(name)
     rng = np.random.default_rng(8)
     tracker = sk.Posterior(layout, relative_noise=sigma)
@@ -96,13 +96,11 @@ def test_reported_deviations_hold(name, sigma, most, kind):
         moved = sphere(layout, rng, depth) if kind == "sphere" else dent(layout, rng, depth, kind)
         tracker.reset()
         field = tracker.update(noisy(sk.resistance_ohm(layout, layout.upper_m + moved), rng, sigma))
-        if not field.trusted:  # a jump too far is said to be one
-            continue
+        assert field.trusted
         z = deviations(field, moved)
         inside.append(np.mean(np.abs(z) < 1.96))
         error2.append(np.mean((field.displacement_m - moved) ** 2))
         reported2.append(np.mean(field.displacement_std_m**2))
-    assert len(inside) >= 7  # of 10
     assert 0.90 <= np.mean(inside) <= most
     assert np.sqrt(np.sum(error2) / np.sum(reported2)) <= 1.15
 

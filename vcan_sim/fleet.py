@@ -12,7 +12,7 @@ from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner, PatchNode
 from skinnode.transport import CanPort
-from skinnode.wire.profile import chunk_cob_id, summary_cob_id
+from skinnode.wire.indices import chunk_cob_id, summary_cob_id
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 

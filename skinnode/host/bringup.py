@@ -18,7 +18,7 @@ from skinnode.errors import NodeError, NodeTimeout, ProfileError
 from skinnode.host.network import RemoteOd
 from skinnode.model.config import PatchConfig, SyncConfig
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile
 

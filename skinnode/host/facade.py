@@ -24,7 +24,7 @@ from skinnode.host.sync import SyncProducer, SyncStats, Ticks
 from skinnode.host.workers import Workers
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 from skinnode.wire.assembler import ScanAssembler
 from skinnode.wire.profile import PatchProfile
 

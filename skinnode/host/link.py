@@ -15,7 +15,7 @@ from skinnode.errors import BusError, CodecError, SkinError
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Receiver
-from skinnode.wire.profile import sdo_response_cob_id
+from skinnode.wire.indices import sdo_response_cob_id
 from skinnode.wire.timing import BusLoad
 
 _log = logging.getLogger(__name__)

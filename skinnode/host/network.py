@@ -16,7 +16,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
-from skinnode.wire.profile import DEVICE_TYPE
+from skinnode.wire.indices import DEVICE_TYPE
 
 ATTEMPTS: Final = 3
 """Tries of a transfer that was not answered or whose answer belongs to an earlier one."""

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from skinnode.errors import BusError
-from skinnode.wire.profile import SYNC_COB_ID
+from skinnode.wire.indices import SYNC_COB_ID
 
 
 class Tick(NamedTuple):

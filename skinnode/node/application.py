@@ -19,7 +19,7 @@ from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.od import ObjectStore
 from skinnode.node.tpdo import OutgoingScan, TpdoEngine
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 from skinnode.wire.codec import SendMode, SummaryFlag, pack_scan
 from skinnode.wire.coordinates import pack_coordinates
 from skinnode.wire.profile import PatchProfile

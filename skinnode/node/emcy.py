@@ -9,7 +9,7 @@ from typing import Final
 
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.wire.profile import ERROR_FIELD_LENGTH
+from skinnode.wire.indices import ERROR_FIELD_LENGTH
 
 _WAITING: Final = 16  # messages kept while inhibit time or a stopped node hold them back; the oldest give way
 

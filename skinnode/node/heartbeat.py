@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 
 
 class HeartbeatProducer:

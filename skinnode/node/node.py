@@ -27,7 +27,7 @@ from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, PdoRecords, check_cob_id
 from skinnode.node.sdo import SdoServer
 from skinnode.node.source import ResistanceSource
 from skinnode.node.tpdo import TpdoEngine
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile
 

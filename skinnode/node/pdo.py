@@ -10,7 +10,7 @@ from typing import Final
 
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.od import ObjectStore
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 
 INVALID_BIT: Final = 1 << 31
 EXTENDED_BIT: Final = 1 << 29

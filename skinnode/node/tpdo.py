@@ -33,7 +33,7 @@ from enum import Enum, auto
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import PdoRecords
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 from skinnode.wire.codec import SummaryFlag, pack_summary
 
 Send = Callable[[int, bytes], None]

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from skinnode.errors import CodecError, ConfigError
 from skinnode.wire.codec import MISSING, PDO_BYTES, Codes, Summary, SummaryFlag, unpack_scan, unpack_summary
-from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile, chunk_cob_id, summary_cob_id
+from skinnode.wire.indices import chunk_cob_id, summary_cob_id
+from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""

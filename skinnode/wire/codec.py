@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from skinnode.errors import CodecError, ConfigError
 from skinnode.model.layout import Float
-from skinnode.wire.profile import DEFAULT_CODE_HI, DEFAULT_CODE_LO, TARE_SIGNATURE, PatchProfile
+from skinnode.wire.indices import TARE_SIGNATURE
+from skinnode.wire.profile import DEFAULT_CODE_HI, DEFAULT_CODE_LO, PatchProfile
 
 Codes = NDArray[np.uint32]
 
@@ -244,7 +245,7 @@ class Command(NamedTuple):
     """A command as it is on the wire."""
 
     tare: int
-    """:data:`~skinnode.wire.profile.TARE_SIGNATURE` to tare, anything else does nothing."""
+    """:data:`~skinnode.wire.indices.TARE_SIGNATURE` to tare, anything else does nothing."""
     single_scan: int
     send_mode: int
 

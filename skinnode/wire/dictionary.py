@@ -6,6 +6,7 @@ Numbers and words are those of CiA 301 (object codes, data types) and CiA 306 (a
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 Value = int | float | str
@@ -92,3 +93,51 @@ class Object:
             if entry.subindex == subindex:
                 return entry
         raise KeyError(f"0x{self.index:04X} has no sub-index {subindex}")
+
+
+def var(
+    index: int,
+    name: str,
+    data_type: DataType,
+    access: str,
+    default: Value | None = None,
+    *,
+    plus_node_id: bool = False,
+    mappable: bool = False,
+    high: int | None = None,
+) -> Object:
+    """A single value, or a domain."""
+    entry = Entry(index, 0, name, data_type, access, default, plus_node_id, mappable, None, high)
+    kind = ObjectType.DOMAIN if data_type is DataType.DOMAIN else ObjectType.VAR
+    return Object(index, name, kind, (entry,))
+
+
+def highest(index: int, highest: int, access: str = "const", default: int | None = None) -> Entry:
+    """Sub-index 0 of an array or a record; ``default``: its value at start, where that may be written."""
+    value = highest if default is None else default
+    high = highest if access == "rw" else None
+    return Entry(index, 0, "Highest sub-index supported", DataType.UNSIGNED8, access, value, high=high)
+
+
+def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None = None) -> Object:
+    """A record; ``first``: its sub-index 0, if that is not a constant."""
+    first = first or highest(index, entries[-1].subindex)
+    return Object(index, name, ObjectType.RECORD, (first, *entries))
+
+
+def array(
+    index: int,
+    name: str,
+    labels: Sequence[str],
+    data_type: DataType,
+    access: str,
+    default: Value | None = None,
+    *,
+    first: Entry | None = None,
+    high: int | None = None,
+) -> Object:
+    """An array with one entry for each of ``labels``; ``first`` as in :func:`record`."""
+    entries = tuple(
+        Entry(index, sub, label, data_type, access, default, high=high) for sub, label in enumerate(labels, 1)
+    )
+    return Object(index, name, ObjectType.ARRAY, (first or highest(index, len(entries)), *entries))

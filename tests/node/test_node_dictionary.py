@@ -67,7 +67,7 @@ def test_every_object_of_the_eds_is_there(make: Callable, code_bits: int) -> Non
 
 def test_nothing_else_is_there(desk) -> None:
     dictionary = eds.import_eds(io.StringIO(eds_text(desk.node.profile)), 4)
-    for index in (0x0005, 0x0FFF, 0x1002, 0x1802, 0x2102, 0x2202, 0x2FFF, 0x6000, 0xFFFF):
+    for index in (0x0005, 0x0FFF, 0x1002, 0x1804, 0x2102, 0x2202, 0x2FFF, 0x6000, 0xFFFF):
         assert index not in dictionary or index < 0x1000
         assert upload(desk, index, 0) == 0x06020000
 

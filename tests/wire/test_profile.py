@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 from skinnode.cli.eds import eds
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
-from skinnode.wire import profile as od
+from skinnode.wire import indices as od
 from skinnode.wire.codec import pack_chunk, pack_command, pack_summary
 from skinnode.wire.dictionary import DataType, Entry, ObjectType
-from skinnode.wire.profile import REFERENCE_PROFILES, PatchProfile, eds_name, eds_text
+from skinnode.wire.profile import DEFAULT_PERIOD_MS, REFERENCE_PROFILES, PatchProfile, eds_name, eds_text
 
 EDS = Path(__file__).parents[2] / "eds"
 NODE_ID = 5
@@ -112,7 +112,7 @@ def test_the_head_names_the_device() -> None:
     assert information.product_number == od.PRODUCT_CODE
     assert information.revision_number == od.REVISION_NUMBER
     assert information.allowed_baudrates == {125_000, 250_000, 500_000, 1_000_000}
-    assert (information.nr_of_RXPDO, information.nr_of_TXPDO) == (1, 2)
+    assert (information.nr_of_RXPDO, information.nr_of_TXPDO) == (4, 4)
     assert not information.LSS_supported
 
 
@@ -143,10 +143,12 @@ def test_cob_ids_are_the_predefined_connection_set() -> None:
 def test_every_object_asked_for_is_there_with_its_type() -> None:
     types = {item.index: item.type for item in REFERENCE_PROFILES[0].objects()}
     var, array, record = ObjectType.VAR, ObjectType.ARRAY, ObjectType.RECORD
-    expected = dict.fromkeys((0x1000, 0x1001, 0x1005, 0x1006, 0x1008, 0x1009, 0x100A), var)
-    expected |= dict.fromkeys((0x1014, 0x1015, 0x1017, 0x1019), var)
-    expected |= dict.fromkeys((0x1003, 0x1010, 0x1011, 0x1016, 0x1029), array)
-    expected |= dict.fromkeys((0x1018, 0x1200, 0x1400, 0x1600, 0x1800, 0x1801, 0x1A00, 0x1A01), record)
+    expected = dict.fromkeys((0x1000, 0x1001, 0x1005, 0x1006, 0x1008, 0x1009, 0x100A, 0x100C), var)
+    expected |= dict.fromkeys((0x100D, 0x1012, 0x1014, 0x1015, 0x1017, 0x1019), var)
+    expected |= dict.fromkeys((0x1003, 0x1010, 0x1011, 0x1016, 0x1020, 0x1029), array)
+    expected |= dict.fromkeys((0x1018, 0x1200), record)
+    pdos = (base + number for base in (0x1400, 0x1600, 0x1800, 0x1A00) for number in range(4))
+    expected |= dict.fromkeys(pdos, record)
     expected |= dict.fromkeys((0x2000, 0x2010, 0x2011, 0x2020, 0x2021), record)
     expected |= dict.fromkeys((0x2030, 0x2031, *range(0x2100, 0x210A), *range(0x2200, 0x220A)), array)
     expected[0x2300] = ObjectType.DOMAIN
@@ -167,7 +169,10 @@ def test_indices_and_subindices_ascend_and_names_are_unique(profile: PatchProfil
         assert len({entry.name for entry in item.entries}) == len(item.entries)
         if item.type in (ObjectType.ARRAY, ObjectType.RECORD):
             assert item.entries[0].data_type is DataType.UNSIGNED8
-            if item.index not in (0x1003, 0x1600, 0x1A00, 0x1A01):  # there sub-index 0 counts what is in use
+            if item.index != 0x1003 and item.index >> 8 not in (
+                0x16,
+                0x1A,
+            ):  # there sub-index 0 counts what is in use
                 assert item.entries[0].default == subindices[-1]
 
 
@@ -237,7 +242,7 @@ def test_a_profile_has_the_sizes_of_its_layout() -> None:
 @pytest.mark.parametrize("reference", PROFILES, ids=eds_name)
 def test_a_full_scan_paced_by_default_fits_the_default_period(reference: PatchProfile) -> None:
     frames_ms = reference.n_chunks * reference.default_inhibit_100us / 10
-    assert frames_ms <= 0.9 * od.DEFAULT_PERIOD_MS
+    assert frames_ms <= 0.9 * DEFAULT_PERIOD_MS
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,138 @@
+"""Where things are on the wire: identity, COB-IDs, indices and sub-indices. Who needs one takes it from here.
+
+What stands at each index is said by :mod:`skinnode.wire.communication` (CiA 301) and
+:mod:`skinnode.wire.profile` (the patch).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+# --- identity (0x1018)
+VENDOR_ID: Final = 0
+"""No vendor-ID has been assigned by CiA to this project; 0 is never assigned to anybody."""
+PRODUCT_CODE: Final = 0x534B494E
+"""'SKIN'."""
+REVISION_NUMBER: Final = 0x0001_0000
+"""Major revision (CANopen behaviour) in the upper half, minor in the lower."""
+DEVICE_NAME: Final = "skinnode patch"
+
+# --- COB-IDs: the pre-defined connection set of CiA 301
+NMT_COB_ID: Final = 0x000
+SYNC_COB_ID: Final = 0x080
+TIME_COB_ID: Final = 0x100
+
+
+def emcy_cob_id(node_id: int) -> int:
+    """Emergency message of a node."""
+    return 0x080 + node_id
+
+
+def tpdo_cob_id(number: int, node_id: int) -> int:
+    """TPDO ``number`` of the pre-defined connection set, 0 to 3."""
+    return 0x180 + 0x100 * number + node_id
+
+
+def rpdo_cob_id(number: int, node_id: int) -> int:
+    """RPDO ``number`` of the pre-defined connection set, 0 to 3."""
+    return 0x200 + 0x100 * number + node_id
+
+
+def chunk_cob_id(node_id: int) -> int:
+    """TPDO1: a chunk of a scan."""
+    return tpdo_cob_id(0, node_id)
+
+
+def command_cob_id(node_id: int) -> int:
+    """RPDO1: tare, single scan, send mode."""
+    return rpdo_cob_id(0, node_id)
+
+
+def summary_cob_id(node_id: int) -> int:
+    """TPDO2: the end of a scan."""
+    return tpdo_cob_id(1, node_id)
+
+
+def sdo_response_cob_id(node_id: int) -> int:
+    """SDO server to client."""
+    return 0x580 + node_id
+
+
+def sdo_request_cob_id(node_id: int) -> int:
+    """SDO client to server."""
+    return 0x600 + node_id
+
+
+def heartbeat_cob_id(node_id: int) -> int:
+    """Boot-up, heartbeat and node guarding."""
+    return 0x700 + node_id
+
+
+# --- communication objects (CiA 301)
+DEVICE_TYPE: Final = 0x1000
+ERROR_REGISTER: Final = 0x1001
+ERROR_FIELD: Final = 0x1003
+COB_ID_SYNC: Final = 0x1005
+CYCLE_PERIOD: Final = 0x1006
+DEVICE_NAME_INDEX: Final = 0x1008
+HARDWARE_VERSION: Final = 0x1009
+SOFTWARE_VERSION: Final = 0x100A
+GUARD_TIME: Final = 0x100C
+LIFE_TIME_FACTOR: Final = 0x100D
+STORE: Final = 0x1010
+RESTORE: Final = 0x1011
+COB_ID_TIME: Final = 0x1012
+COB_ID_EMCY: Final = 0x1014
+EMCY_INHIBIT_TIME: Final = 0x1015
+HEARTBEAT_CONSUMER: Final = 0x1016
+HEARTBEAT_PRODUCER: Final = 0x1017
+IDENTITY: Final = 0x1018
+IDENTITY_VENDOR, IDENTITY_PRODUCT, IDENTITY_REVISION, IDENTITY_SERIAL = 1, 2, 3, 4
+SYNC_COUNTER_OVERFLOW: Final = 0x1019
+VERIFY_CONFIGURATION: Final = 0x1020
+VERIFY_DATE, VERIFY_TIME = 1, 2
+ERROR_BEHAVIOUR: Final = 0x1029
+SDO_SERVER: Final = 0x1200
+RPDO1_PARAMETER: Final = 0x1400
+RPDO1_MAPPING: Final = 0x1600
+TPDO1_PARAMETER: Final = 0x1800
+TPDO2_PARAMETER: Final = 0x1801
+TPDO1_MAPPING: Final = 0x1A00
+TPDO2_MAPPING: Final = 0x1A01
+"""Those of the n-th PDO, counted from 0, are n further on."""
+MAX_PDOS: Final = 512
+"""Each way: 0x1400 to 0x15FF and so on."""
+PDO_INVALID: Final = 1 << 31
+"""Bit of a PDO's COB-ID that switches it off."""
+PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
+"""Sub-indices of a PDO's communication parameter."""
+MAPPING_SLOTS: Final = 8
+"""Entries a PDO can map: eight bytes, and the smallest entry is one."""
+ERROR_FIELD_LENGTH: Final = 8
+HEARTBEAT_CONSUMERS: Final = 4
+
+# --- manufacturer objects
+DESCRIPTOR: Final = 0x2000
+ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
+CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
+CHUNK: Final = 0x2010
+CHUNK_INDEX, CHUNK_SCAN, CHUNK_FIRST_CODE = 1, 2, 3
+SUMMARY: Final = 0x2011
+SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
+SEND_POLICY: Final = 0x2020
+SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
+ACQUISITION: Final = 0x2021
+ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
+UPPER_WIRE_FAULTS: Final = 0x2030
+LOWER_WIRE_FAULTS: Final = 0x2031
+"""Masks of 32 wires: sub-index 2i+1 open, 2i+2 shorted, for the wires from 32 i on."""
+CODES: Final = 0x2100
+"""+ r: the last codes of upper wire r, one sub-index a column."""
+BASELINE: Final = 0x2200
+"""+ r: R0 of upper wire r in ohm, one sub-index a column; 0 where there is none yet."""
+COORDINATES: Final = 0x2300
+"""DOMAIN: see :func:`skinnode.wire.coordinates.pack_coordinates`."""
+
+TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
+STORE_SIGNATURE: Final = int.from_bytes(b"save", "little")
+RESTORE_SIGNATURE: Final = int.from_bytes(b"load", "little")

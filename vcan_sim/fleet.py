@@ -13,6 +13,7 @@ from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner, PatchNode
 from skinnode.transport import CanPort
 from skinnode.wire.indices import chunk_cob_id, summary_cob_id
+from skinnode.wire.profile import PatchProfile
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
@@ -134,7 +135,7 @@ class _Station:
             source,
             send=counted,
             serial=config.node_id if config.serial is None else config.serial,
-            code_bits=config.code_bits,
+            profile=PatchProfile.from_layout(source.scene.layout, config.code_bits),
         )
         self._node = node
         return node

@@ -1,7 +1,7 @@
 """What a node is for: scans of the patch, at SYNC, by its own timer or on command; tare; wire faults.
 
 Connects the manufacturer's objects (0x2000 to 0x2300) with the acquisition behind them and the TPDO engine
-before them. The communication around it is in :mod:`skinnode.node.node`.
+before them. The communication around it is in :mod:`skinnode.node.device`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import numpy as np
 from skinnode.model.layout import PRESET_IDS, PatchLayout
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.acquisition import Acquisition, Mask, WireFaults
-from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyCode, EmcyProducer
-from skinnode.node.od import ObjectStore
-from skinnode.node.tpdo import OutgoingScan, TpdoEngine
+from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.device import Services
+from skinnode.node.emcy import EmcyCode
+from skinnode.node.tpdo import OutgoingScan
 from skinnode.wire import indices as od
 from skinnode.wire.codec import SendMode, SummaryFlag, pack_scan
 from skinnode.wire.coordinates import pack_coordinates
@@ -33,21 +33,19 @@ _SUMMARY_FIELDS: Final = {
 
 
 class PatchApplication:
-    """Scans of one patch. ``now`` is the time of the event being handled."""
+    """Scans of one patch; an :class:`~skinnode.node.device.Application`."""
 
     def __init__(
         self,
         layout: PatchLayout,
         profile: PatchProfile,
         serial: int,
-        store: ObjectStore,
         acquisition: Acquisition,
-        tpdos: TpdoEngine,
-        emcy: EmcyProducer,
-        now: Clock,
+        services: Services,
     ) -> None:
-        self._profile, self._store, self._acquisition = profile, store, acquisition
-        self._tpdos, self._emcy, self._now = tpdos, emcy, now
+        self._profile, self._acquisition = profile, acquisition
+        self._store, self._now = services.store, services.now
+        self._tpdos, self._emcy = services.tpdos, services.emcy
         self._operational = False
         self._counter = -1
         self._period_ns = 0

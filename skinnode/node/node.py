@@ -1,54 +1,24 @@
-"""A patch as a CANopen device: what happens to it, and what it does about it.
-
-Synchronous and deterministic: it has no thread and reads no clock. Whoever drives it hands it frames and
-times and asks when it wants to be called again; :class:`~skinnode.node.runner.NodeRunner` does so on a bus, a
-test does so with numbers. No frame whatever raises out of it; an error of the source does, and one of
-``send``.
-"""
+"""A patch as a CANopen device: the device of :mod:`skinnode.node.device` with the application of
+:mod:`skinnode.node.application`."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import importlib.metadata
-from collections.abc import Callable
 from typing import Final
 
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.acquisition import Acquisition
 from skinnode.node.application import PatchApplication
-from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.emcy import EmcyCode, EmcyProducer
-from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
-from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, PdoRecords, check_cob_id
-from skinnode.node.sdo import SdoServer
+from skinnode.node.device import CanopenDevice, Send, Services
 from skinnode.node.source import ResistanceSource
-from skinnode.node.tpdo import TpdoEngine
-from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile
-
-HARDWARE_VERSION: Final = "none"
-"""A node in software has no board."""
 
 CATCH_UP_NS: Final = 10_000_000
 """Lateness of the driving thread that the pacing of chunks makes up for: two switch intervals of the
 interpreter. At the default pace no more than 15 frames come at once."""
 
-TPDOS: Final = 2
 
-_COMMUNICATION: Final = 0x1000, 0x1FFF
-_EVERYTHING: Final = 0x1000, 0x9FFF
-_SYNC_PRODUCER_BIT: Final = 1 << 30
-
-Handler = Callable[[bytes, int], None]
-"""Takes the payload of a frame and its time."""
-
-
-class PatchNode:
+class PatchNode(CanopenDevice):
     """One patch.
 
     Args:
@@ -56,8 +26,8 @@ class PatchNode:
         layout: its electrodes; decides the sizes of the object dictionary.
         source: its analogue port, read once per scan.
         send: called with COB-ID and payload of every frame the node sends, in order.
+        profile: its wire format. Default: that of the layout, with codes of 16 bits.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
-        code_bits: 16 or 24.
         baseline_ohm: (U, K) R0 remembered from before, ohm; None to tare at the first power-on.
         catch_up_ns: see :mod:`skinnode.node.tpdo`; 0 for a strict inhibit time.
 
@@ -70,46 +40,23 @@ class PatchNode:
         layout: PatchLayout,
         source: ResistanceSource,
         *,
-        send: Callable[[int, bytes], None],
+        send: Send,
+        profile: PatchProfile | None = None,
         serial: int = 0,
-        code_bits: int = 16,
         baseline_ohm: Float | None = None,
         catch_up_ns: int = CATCH_UP_NS,
     ) -> None:
-        if not 1 <= node_id <= 127:
-            raise ValueError(f"node_id: got {node_id}, must be 1 to 127")
-        if not 0 <= serial < 1 << 32:
-            raise ValueError(f"serial: got {serial}, must be an unsigned number of 32 bits")
-        self.node_id = node_id
-        self.profile = PatchProfile.from_layout(layout, code_bits)
-        self.nmt_state = NmtState.INITIALISING
-        self._send = send
-        self._now_ns = 0
-        self._store = ObjectStore(self.profile.objects(), node_id)
-        self._sdo = SdoServer(self._store)
-        self._emcy = EmcyProducer(self._send_emcy)
-        self._heartbeat = HeartbeatProducer()
-        self._consumer = HeartbeatConsumer(self._store)
-        self._tpdos = TpdoEngine(self._store, TPDOS, send, self._now, catch_up_ns)
-        self._rpdo = PdoRecords(self._store, od.RPDO1_PARAMETER, od.RPDO1_MAPPING, transmits=False)
-        self._command = self._rpdo.read()
-        self._pending_command: bytes | None = None  # of a synchronous RPDO, until the next SYNC
-        self._wrong_sync_length: int | None = None
-        self._handlers: dict[int, Handler] = {}
-        self._application = PatchApplication(
-            layout,
-            self.profile,
-            serial,
-            self._store,
-            Acquisition(self.profile, source, CodeScale(code_bits), baseline_ohm),
-            self._tpdos,
-            self._emcy,
-            self._now,
-        )
-        self._describe(serial)
-        self._connect()
+        self.profile = PatchProfile.from_layout(layout) if profile is None else profile
+        acquisition = Acquisition(self.profile, source, CodeScale(self.profile.code_bits), baseline_ohm)
+        self._patch: PatchApplication
 
-    # --- what drives it
+        def application(services: Services) -> PatchApplication:
+            self._patch = PatchApplication(layout, self.profile, serial, acquisition, services)
+            return self._patch
+
+        super().__init__(
+            node_id, self.profile.objects(), application, send=send, serial=serial, catch_up_ns=catch_up_ns
+        )
 
     @property
     def scans_sent(self) -> int:
@@ -119,236 +66,4 @@ class PatchNode:
     @property
     def overruns(self) -> int:
         """Scans skipped because two others were still to be sent."""
-        return self._application.overruns
-
-    def power_on(self, t_ns: int) -> None:
-        """Start up: tare if there is no baseline, send the boot-up message, become PRE-OPERATIONAL."""
-        self._now_ns = t_ns
-        self._application.power_on(t_ns)
-        self._reset(_EVERYTHING, t_ns)
-
-    def power_off(self) -> None:
-        """Fall silent at once. Nothing but the baseline survives."""
-        self._enter(NmtState.INITIALISING, self._now_ns)
-
-    def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """A classic frame with an 11-bit identifier was received. Remote frames are not answered."""
-        handler = self._handlers.get(can_id)
-        if handler is not None and not remote and self.nmt_state is not NmtState.INITIALISING:
-            self._now_ns = t_ns
-            handler(data, t_ns)
-
-    def next_deadline_ns(self) -> int | None:
-        """When :meth:`on_timer` is to be called; None while there is nothing to wait for."""
-        if self.nmt_state is NmtState.INITIALISING:
-            return None
-        deadline_ns = min(
-            self._tpdos.deadline_ns,
-            self._heartbeat.deadline_ns,
-            self._application.deadline_ns,
-            self._emcy.deadline_ns,
-            self._consumer.deadline_ns,
-            self._sdo.deadline_ns,
-        )
-        return None if deadline_ns == NO_DEADLINE_NS else deadline_ns
-
-    def on_timer(self, t_ns: int) -> None:
-        """Do what is due at ``t_ns``; too early or too often does no harm."""
-        if self.nmt_state is NmtState.INITIALISING:
-            return
-        self._now_ns = t_ns
-        if self._heartbeat.beat(t_ns):
-            self._send(od.heartbeat_cob_id(self.node_id), bytes((self.nmt_state,)))
-        self._application.on_timer(t_ns)
-        self._tpdos.on_timer(t_ns)
-        self._emcy.on_timer(t_ns)
-        if t_ns >= self._sdo.deadline_ns:
-            self._answer(self._sdo.on_timer(t_ns))
-        if t_ns >= self._consumer.deadline_ns:
-            for node_id in self._consumer.missed(t_ns):
-                self._emcy.happened(EmcyCode.HEARTBEAT, bytes((node_id,)), t_ns)
-            self._communication_failed(t_ns)
-
-    def _now(self) -> int:
-        return self._now_ns
-
-    # --- states
-
-    def _on_nmt(self, data: bytes, t_ns: int) -> None:
-        command = parse(data, self.node_id)
-        match command:
-            case None:
-                return
-            case NmtCommand.RESET_NODE:
-                self._reset(_EVERYTHING, t_ns)
-            case NmtCommand.RESET_COMMUNICATION:
-                self._reset(_COMMUNICATION, t_ns)
-            case _:
-                self._enter(AFTER_COMMAND[command], t_ns)
-
-    def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        self._enter(NmtState.INITIALISING, t_ns)
-        self._store.restore(*objects)
-        self._emcy.reset()
-        self._wrong_sync_length = None
-        self._tpdos.restore()
-        self._application.reset()
-        self._reload()
-        self._reload_heartbeat()
-        self._send(od.heartbeat_cob_id(self.node_id), bytes((NmtState.INITIALISING,)))  # the boot-up message
-        self._enter(NmtState.PRE_OPERATIONAL, t_ns)
-
-    def _enter(self, state: NmtState, t_ns: int) -> None:
-        if state is self.nmt_state:
-            return
-        was, self.nmt_state = self.nmt_state, state
-        self._pending_command = None
-        if not state.communicates:
-            self._sdo.reset()
-        if state is NmtState.OPERATIONAL:
-            self._tpdos.start(t_ns)
-        elif was is NmtState.OPERATIONAL:
-            self._tpdos.stop()
-        self._application.enter(operational=state is NmtState.OPERATIONAL)
-        self._let_emcy_out()
-
-    def _communication_failed(self, t_ns: int) -> None:
-        """Error behaviour, 0x1029: 0 pre-operational, 1 nothing, 2 stopped."""
-        behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
-        if behaviour == 2:
-            self._enter(NmtState.STOPPED, t_ns)
-        elif behaviour == 0 and self.nmt_state is NmtState.OPERATIONAL:
-            self._enter(NmtState.PRE_OPERATIONAL, t_ns)
-
-    # --- services
-
-    def _on_sdo(self, data: bytes, t_ns: int) -> None:
-        if self.nmt_state.communicates:
-            self._answer(self._sdo.on_request(data, t_ns))
-
-    def _answer(self, response: bytes | None) -> None:
-        if response is not None:
-            self._send(od.sdo_response_cob_id(self.node_id), response)
-
-    def _on_sync(self, data: bytes, t_ns: int) -> None:
-        if not self.nmt_state.communicates:
-            return
-        counted = self._store.integer(od.SYNC_COUNTER_OVERFLOW) > 0
-        if len(data) != counted:
-            if len(data) != self._wrong_sync_length:  # once, not with every SYNC
-                self._wrong_sync_length = len(data)
-                self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(data), counted)), t_ns)
-            return
-        self._wrong_sync_length = None
-        if self.nmt_state is not NmtState.OPERATIONAL:
-            return
-        if self._pending_command is not None:
-            pending, self._pending_command = self._pending_command, None
-            self._execute(pending)
-        counter = data[0] if counted else None
-        self._application.on_sync(counter, self._tpdos.on_sync(counter, t_ns), t_ns)
-
-    def _on_command(self, data: bytes, t_ns: int) -> None:
-        if self.nmt_state is not NmtState.OPERATIONAL:
-            return
-        wanted = self._command.size
-        if len(data) < wanted:
-            self._emcy.present(EmcyCode.PDO_NOT_PROCESSED, bytes((1, len(data), wanted)), t_ns)
-            return
-        self._emcy.over(EmcyCode.PDO_NOT_PROCESSED, t_ns)
-        if len(data) > wanted:
-            self._emcy.happened(EmcyCode.PDO_LENGTH_EXCEEDED, bytes((1, len(data), wanted)), t_ns)
-        if self._command.event_driven:
-            self._execute(data)
-        else:
-            self._pending_command = data
-
-    def _execute(self, data: bytes) -> None:
-        """Write the objects mapped into RPDO1. One that refuses its value does not keep the others from
-        theirs: process data have no way to answer."""
-        at = 0
-        for index, subindex in self._command.mapping:
-            size = self._store.find(index, subindex).data_type.bits // 8
-            with contextlib.suppress(Refused):
-                self._store.write(index, subindex, data[at : at + size])
-            at += size
-
-    def _on_heartbeat(self, node_id: int, data: bytes, t_ns: int) -> None:
-        if len(data) == 1:
-            self._consumer.on_heartbeat(node_id, t_ns)
-
-    def _send_emcy(self, message: bytes) -> None:
-        self._send(self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK, message)
-
-    # --- object dictionary
-
-    def _describe(self, serial: int) -> None:
-        """Values that only this device knows."""
-        self._store.put(od.IDENTITY, od.IDENTITY_SERIAL, serial)
-        self._store.put(od.HARDWARE_VERSION, 0, HARDWARE_VERSION)
-        self._store.put(od.SOFTWARE_VERSION, 0, importlib.metadata.version("skinnode"))
-
-    def _connect(self) -> None:
-        store = self._store
-        store.bind(od.ERROR_REGISTER, lambda _: bytes((self._emcy.register,)))
-        store.bind(od.ERROR_FIELD, self._emcy.read_history, count=True)
-        store.guard(od.ERROR_FIELD, _only_zero)
-        store.watch(od.ERROR_FIELD, lambda _: self._emcy.clear_history())
-        for index in (od.STORE, od.RESTORE):
-            # Nothing is kept over a power cycle yet: 0 says so, and commands are refused as CiA 301 wants it.
-            store.bind(index, lambda _: bytes(4))
-            store.guard(index, _cannot_store)
-        store.guard(od.COB_ID_SYNC, _guard_sync)
-        store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_sync_counter)
-        store.guard(od.COB_ID_EMCY, lambda _, value: check_cob_id(value, store.integer(od.COB_ID_EMCY)))
-        for index in (od.COB_ID_SYNC, od.HEARTBEAT_CONSUMER, od.RPDO1_PARAMETER, od.RPDO1_MAPPING):
-            store.watch(index, lambda _: self._reload())
-        for index in (od.COB_ID_EMCY, od.EMCY_INHIBIT_TIME):
-            store.watch(index, lambda _: self._let_emcy_out())
-        store.watch(od.HEARTBEAT_PRODUCER, lambda _: self._reload_heartbeat())
-
-    def _reload(self) -> None:
-        """Listen to the COB-IDs that the object dictionary names."""
-        self._command, self._pending_command = self._rpdo.read(), None
-        self._consumer.reload()
-        handlers: dict[int, Handler] = {
-            od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
-            for node_id in self._consumer.node_ids
-        }
-        if self._command.enabled:
-            handlers[self._command.cob_id] = self._on_command
-        # Last, so that no configuration can take the node its SYNC, SDO and NMT.
-        handlers[self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK] = self._on_sync
-        handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
-        handlers[od.NMT_COB_ID] = self._on_nmt
-        self._handlers = handlers
-
-    def _reload_heartbeat(self) -> None:
-        self._heartbeat.set_period(self._store.integer(od.HEARTBEAT_PRODUCER), self._now_ns)
-
-    def _let_emcy_out(self) -> None:
-        disabled = self._store.integer(od.COB_ID_EMCY) & INVALID_BIT
-        self._emcy.enabled = self.nmt_state.communicates and not disabled
-        self._emcy.inhibit_ns = self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
-        self._emcy.on_timer(self._now_ns)
-
-    def _guard_sync_counter(self, _: int, value: int) -> None:
-        if value == 1:  # 0, or 2 to 240
-            raise Refused(AbortCode.INVALID_VALUE)
-        if self._store.integer(od.CYCLE_PERIOD):
-            raise Refused(AbortCode.DEVICE_STATE)
-
-
-def _guard_sync(_: int, value: int) -> None:
-    if value & (_SYNC_PRODUCER_BIT | INVALID_BIT):  # this node only consumes SYNC; bit 31 means nothing here
-        raise Refused(AbortCode.INVALID_VALUE)
-    check_cob_id(value, INVALID_BIT)
-
-
-def _only_zero(_: int, value: int) -> None:
-    if value:
-        raise Refused(AbortCode.INVALID_VALUE)
-
-
-def _cannot_store(_subindex: int, _value: int) -> None:
-    raise Refused(AbortCode.CANNOT_STORE)
+        return self._patch.overruns

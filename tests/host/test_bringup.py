@@ -6,6 +6,7 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,7 +42,7 @@ Tamper = Callable[[int, bytes], bytes]
 
 
 def node(
-    port: CanPort, node_id: int, layout: PatchLayout = LAYOUT, tamper: Tamper | None = None, **options: int
+    port: CanPort, node_id: int, layout: PatchLayout = LAYOUT, tamper: Tamper | None = None, **options: Any
 ) -> PatchNode:
     """The real node; ``tamper`` may change what it sends."""
 
@@ -204,7 +205,8 @@ def test_size_differs(make_hand: Callable[..., HandConfig]) -> None:
 
 
 def test_code_width_differs(make_hand: Callable[..., HandConfig]) -> None:
-    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, code_bits=24))) == (
+    wide = PatchProfile.from_layout(LAYOUT, 24)
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, profile=wide))) == (
         "node 5: patch 'p0' on can0: code bits: got 24, allowed: 16 as in the hand file"
     )
 

@@ -11,8 +11,9 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes, eds
 
+from skinnode.model.layout import PatchLayout
 from skinnode.wire.coordinates import pack_coordinates
-from skinnode.wire.profile import eds_text
+from skinnode.wire.profile import PatchProfile, eds_text
 
 COMPUTED = {0x1010, 0x1011}  # says 0, cannot store, whatever the EDS of the finished device promises
 
@@ -44,8 +45,8 @@ def upload(desk, index: int, subindex: int) -> bytes | int:
 
 
 @pytest.mark.parametrize("code_bits", [16, 24])
-def test_every_object_of_the_eds_is_there(make: Callable, code_bits: int) -> None:
-    desk = make(code_bits=code_bits)
+def test_every_object_of_the_eds_is_there(make: Callable, layout: PatchLayout, code_bits: int) -> None:
+    desk = make(profile=PatchProfile.from_layout(layout, code_bits))
     dictionary = eds.import_eds(io.StringIO(eds_text(desk.node.profile)), 4)
     asked = 0
     for variable in variables(dictionary):

@@ -11,6 +11,7 @@ import pytest
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.wire.codec import CodeScale, encode
+from skinnode.wire.profile import PatchProfile
 
 CHUNK, SUMMARY, EMCY = 0x184, 0x284, 0x084
 STEPS = 65532  # 2**16 - 4
@@ -65,8 +66,8 @@ def test_codes_and_baseline_can_be_read_back(operational, rest_ohm) -> None:
     assert desk.read(0x2011, 3) == 4
 
 
-def test_24_bit_codes_are_two_a_chunk(make: Callable, rest_ohm) -> None:
-    desk = make(code_bits=24)
+def test_24_bit_codes_are_two_a_chunk(make: Callable, layout: PatchLayout, rest_ohm) -> None:
+    desk = make(profile=PatchProfile.from_layout(layout, 24))
     desk.start()
     frames = scan(desk, "")
     assert len(frames) == 7

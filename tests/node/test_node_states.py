@@ -301,7 +301,6 @@ class _Flat:
         ({"node_id": 0}, "node_id: got 0, must be 1 to 127"),
         ({"node_id": 128}, "node_id: got 128, must be 1 to 127"),
         ({"serial": 1 << 32}, "serial: got 4294967296"),
-        ({"code_bits": 12}, "code_bits: got 12, allowed: 16 or 24"),
         ({"baseline_ohm": np.ones((6, 2))}, r"baseline_ohm: got shape \(6, 2\), must be \(2, 6\)"),
         ({"baseline_ohm": -np.ones((2, 6))}, "baseline_ohm: got -1.0, must not be negative"),
     ],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import re
 import signal
 import subprocess
@@ -104,10 +103,9 @@ def process(command: list[str]) -> Iterator[Process]:
 
 
 @pytest.fixture
-def multicast(tmp_path: Path) -> tuple[Path, BusConfig]:
-    """A hand on a multicast group of its own."""
-    group = f"239.74.{random.randrange(256)}.{random.randrange(256)}"
-    bus = BusConfig(interface="udp_multicast", channel=group)
+def shared(tmp_path: Path, crossing_bus: BusConfig) -> tuple[Path, BusConfig]:
+    """A hand on a bus that crosses processes."""
+    bus = crossing_bus
     try:
         with CanPort(bus) as port, CanPort(bus) as other:
             port.send(0x7FF, b"")
@@ -127,8 +125,8 @@ def heartbeats(bus: BusConfig) -> dict[int, int]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_two_processes_on_one_bus(multicast: tuple[Path, BusConfig], number: int) -> None:
-    path, bus = multicast
+def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -> None:
+    path, bus = shared
     with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path), "--json"]) as host:
         assert host.says('"elapsed_s"')
         assert eventually(lambda: sum('"elapsed_s"' in line for line in host.lines) >= 2)
@@ -145,16 +143,16 @@ def test_two_processes_on_one_bus(multicast: tuple[Path, BusConfig], number: int
         assert (status, errors) == (0, "")
 
 
-def test_interrupted_while_it_waits_for_nodes(multicast: tuple[Path, BusConfig]) -> None:
-    path, bus = multicast
+def test_interrupted_while_it_waits_for_nodes(shared: tuple[Path, BusConfig]) -> None:
+    path, bus = shared
     with CanPort(bus) as listener, process([*HOST, str(path)]) as host:
         while listener.recv(PATIENCE_S) is None:  # its first question
             pass
         assert host.end(signal.SIGINT) == (0, "")
 
 
-def test_wrong_length_is_one_line_and_status_2(multicast: tuple[Path, BusConfig]) -> None:
-    path, bus = multicast
+def test_wrong_length_is_one_line_and_status_2(shared: tuple[Path, BusConfig]) -> None:
+    path, bus = shared
     with process([*SIMULATOR, str(path)]), process([*HOST, str(path)]) as host:
         assert host.says("operational on can0")
         with CanPort(bus) as stranger:
@@ -167,8 +165,8 @@ def test_wrong_length_is_one_line_and_status_2(multicast: tuple[Path, BusConfig]
     assert host.lines[-1] == "nodes are pre-operational"
 
 
-def test_patches_that_vanish_are_named_and_status_1(multicast: tuple[Path, BusConfig]) -> None:
-    path, _ = multicast
+def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfig]) -> None:
+    path, _ = shared
     with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path)]) as host:
         assert host.says("thumb operational")
         simulator.end(signal.SIGKILL)

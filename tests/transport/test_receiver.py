@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-import uuid
 from collections.abc import Iterator
 
 import pytest
@@ -77,11 +76,8 @@ def test_capacity() -> None:
         Receiver(Script(0), capacity=0)
 
 
-@pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
-def test_on_a_bus(interface: str, multicast_group: str) -> None:
-    channel = multicast_group if interface == "udp_multicast" else uuid.uuid4().hex
-    config = BusConfig(interface=interface, channel=channel)
-    with CanPort(config) as ours, CanPort(config) as theirs, Receiver(theirs) as receiver:
+def test_on_a_bus(any_bus: BusConfig) -> None:
+    with CanPort(any_bus) as ours, CanPort(any_bus) as theirs, Receiver(theirs) as receiver:
         for number in range(200):
             ours.send(number, b"12345678")
         frames: list[Frame] = []

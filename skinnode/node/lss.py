@@ -1,0 +1,251 @@
+"""Layer setting services, the slave's side (CiA 305 v3.0): who gets which node-ID and bit rate, and who is
+there.
+
+Bytes in, bytes out: no bus and no clock. What a service brings about outside (storing, another bit rate) is
+a callback; whether the node is to boot is asked of :attr:`LssSlave.may_boot`. Requests are served in every
+NMT state, and are all a node without a node-ID serves.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Collection
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+LSS_REQUEST_COB_ID: Final = 0x7E5
+"""Master to slaves."""
+LSS_RESPONSE_COB_ID: Final = 0x7E4
+"""Slave to master."""
+
+NOT_CONFIGURED: Final = 0xFF
+"""The node-ID of a node that has none."""
+
+BIT_RATES_BPS: Final = {
+    0: 1_000_000,
+    1: 800_000,
+    2: 500_000,
+    3: 250_000,
+    4: 125_000,
+    6: 50_000,
+    7: 20_000,
+    8: 10_000,
+}
+"""Table 0 of the bit timing service: 5 is reserved, 9 would be automatic detection."""
+
+_CIA_301_TABLE: Final = 0
+
+_DONE, _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 0, 1, 1, 2
+"""Error codes of the configuration services; 1 has its meaning from the service."""
+
+
+class LssCommand(IntEnum):
+    """Command specifiers; an answer repeats its request's where it has none of its own."""
+
+    SWITCH_GLOBAL = 0x04
+    CONFIGURE_NODE_ID = 0x11
+    CONFIGURE_BIT_TIMING = 0x13
+    ACTIVATE_BIT_TIMING = 0x15
+    STORE = 0x17
+    SELECT_VENDOR = 0x40
+    SELECT_SERIAL = 0x43
+    SELECTED = 0x44
+    IDENTIFY_VENDOR = 0x46
+    IDENTIFY_SERIAL_HIGH = 0x4B
+    IDENTIFY_NOT_CONFIGURED = 0x4C
+    IDENTIFIED = 0x4F
+    IDENTIFIED_NOT_CONFIGURED = 0x50
+    FASTSCAN = 0x51
+    INQUIRE_VENDOR = 0x5A
+    INQUIRE_SERIAL = 0x5D
+    INQUIRE_NODE_ID = 0x5E
+
+
+class LssState(IntEnum):
+    """States of the slave; the value is the mode of the global switch."""
+
+    WAITING = 0
+    CONFIGURATION = 1
+
+
+class LssAddress(NamedTuple):
+    """The identity object, 0x1018, in its order. Unique to a device in the world."""
+
+    vendor_id: int
+    product_code: int
+    revision_number: int
+    serial_number: int
+
+
+# What each frame of a switch selective and of an identify asks of which part of the address.
+_QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
+    0x40: (0, operator.eq),
+    0x41: (1, operator.eq),
+    0x42: (2, operator.eq),
+    0x43: (3, operator.eq),
+    0x46: (0, operator.eq),
+    0x47: (1, operator.eq),
+    0x48: (2, operator.ge),
+    0x49: (2, operator.le),
+    0x4A: (3, operator.ge),
+    0x4B: (3, operator.le),
+}
+_FIRST_QUESTIONS: Final = (LssCommand.SELECT_VENDOR, LssCommand.IDENTIFY_VENDOR)
+
+_RESET_SCAN: Final = 0x80  # as the bit to check: everybody answers and begins at the vendor-ID
+
+
+class LssSlave:
+    """One slave.
+
+    Args:
+        address: its identity.
+        node_id: 1 to 127, or :data:`NOT_CONFIGURED`.
+        bit_rates_bps: those it can be set to; none where the bit rate is not its own to change.
+        bit_rate_bps: the one configured before; None if none was.
+        store: keeps the pending node-ID and bit rate over a power cycle and raises OSError if that fails;
+            None where nothing can be kept.
+        activate: begins the change to the pending bit rate; takes it and the delay in ms, see
+            :meth:`on_request`.
+    """
+
+    def __init__(
+        self,
+        address: LssAddress,
+        node_id: int,
+        *,
+        bit_rates_bps: Collection[int] = (),
+        bit_rate_bps: int | None = None,
+        store: Callable[[int, int | None], None] | None = None,
+        activate: Callable[[int | None, int], None] | None = None,
+    ) -> None:
+        self._address = address
+        self._bit_rates_bps = frozenset(bit_rates_bps)
+        self._store, self._activate = store, activate
+        self.state = LssState.WAITING
+        self.node_id = node_id
+        """The active node-ID."""
+        self.pending_node_id = node_id
+        """The one from the next reset of communication on."""
+        self.pending_bit_rate_bps = bit_rate_bps
+        self._next_question = 0
+        self._scan_part = 0
+
+    @property
+    def configured(self) -> bool:
+        """Whether there is a node-ID; without one a node serves LSS and nothing else."""
+        return self.node_id != NOT_CONFIGURED
+
+    @property
+    def may_boot(self) -> bool:
+        """Whether a node without a node-ID has been given one and let go: it is to boot by itself."""
+        return (
+            not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
+        )
+
+    def reset_communication(self) -> None:
+        """NMT reset: the pending node-ID becomes the active one."""
+        self.node_id = self.pending_node_id
+        self._enter(LssState.WAITING)
+        self._scan_part = 0
+
+    def on_request(self, data: bytes) -> bytes | None:
+        """Serve a frame of the master; returns the answer, if there is one.
+
+        Frames that are not of 8 bytes, not of this protocol, or not for the present state, are ignored as the
+        standard wants it: they may be meant for other slaves.
+
+        After *activate bit timing* the node falls silent at once, changes its bit rate one delay later and
+        may speak again after another: time for the slowest on the bus to have changed.
+        """
+        if len(data) != 8:
+            return None
+        command, value = data[0], int.from_bytes(data[1:5], "little")
+        if command == LssCommand.SWITCH_GLOBAL:
+            if data[1] in (LssState.WAITING, LssState.CONFIGURATION):
+                self._enter(LssState(data[1]))
+            return None
+        if LssCommand.IDENTIFY_VENDOR <= command <= LssCommand.IDENTIFY_SERIAL_HIGH:
+            agreed = self._agrees(command, value) and command == LssCommand.IDENTIFY_SERIAL_HIGH
+            return _frame(LssCommand.IDENTIFIED) if agreed else None
+        if command == LssCommand.IDENTIFY_NOT_CONFIGURED:
+            return _frame(LssCommand.IDENTIFIED_NOT_CONFIGURED) if self._seeks_node_id else None
+        if self.state is LssState.CONFIGURATION:
+            return self._configure(command, data)
+        if LssCommand.SELECT_VENDOR <= command <= LssCommand.SELECT_SERIAL:
+            if self._agrees(command, value) and command == LssCommand.SELECT_SERIAL:
+                self._enter(LssState.CONFIGURATION)
+                return _frame(LssCommand.SELECTED)
+        elif command == LssCommand.FASTSCAN and self._seeks_node_id:
+            return self._fastscan(value, *data[5:])
+        return None
+
+    @property
+    def _seeks_node_id(self) -> bool:
+        return not self.configured and self.pending_node_id == NOT_CONFIGURED
+
+    def _enter(self, state: LssState) -> None:
+        self.state = state
+        self._next_question = 0
+
+    def _agrees(self, command: int, value: int) -> bool:
+        """Whether this question and all before it, asked in their order, were answered with yes."""
+        part, holds = _QUESTIONS[command]
+        in_turn = command in _FIRST_QUESTIONS or command == self._next_question
+        agreed = in_turn and holds(self._address[part], value)
+        self._next_question = command + 1 if agreed else 0
+        return agreed
+
+    def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
+        """One question of the search: are the bits of the address from ``bit`` up those of ``value``? Silence
+        means no, so that many slaves can be asked at once."""
+        if bit == _RESET_SCAN:
+            self._scan_part = 0
+        else:
+            if bit > 31 or part > 3 or next_part > 3 or part != self._scan_part:
+                return None
+            if (self._address[part] ^ value) >> bit:
+                return None
+            self._scan_part = next_part
+            if bit == 0 and next_part < part:  # all four parts agree: this one is found
+                self._enter(LssState.CONFIGURATION)
+        return _frame(LssCommand.IDENTIFIED)
+
+    def _configure(self, command: int, data: bytes) -> bytes | None:
+        match command:
+            case LssCommand.CONFIGURE_NODE_ID:
+                node_id = data[1]
+                if not (1 <= node_id <= 127 or node_id == NOT_CONFIGURED):
+                    return _frame(command, _OUT_OF_RANGE)
+                self.pending_node_id = node_id
+                return _frame(command, _DONE)
+            case LssCommand.CONFIGURE_BIT_TIMING:
+                bit_rate_bps = BIT_RATES_BPS.get(data[2]) if data[1] == _CIA_301_TABLE else None
+                if bit_rate_bps not in self._bit_rates_bps:
+                    return _frame(command, _OUT_OF_RANGE)
+                self.pending_bit_rate_bps = bit_rate_bps
+                return _frame(command, _DONE)
+            case LssCommand.ACTIVATE_BIT_TIMING:
+                if self._activate is not None:
+                    self._activate(self.pending_bit_rate_bps, int.from_bytes(data[1:3], "little"))
+                return None
+            case LssCommand.STORE:
+                return _frame(command, self._stored())
+            case LssCommand.INQUIRE_NODE_ID:
+                return _frame(command, self.node_id)
+        if LssCommand.INQUIRE_VENDOR <= command <= LssCommand.INQUIRE_SERIAL:
+            return _frame(command, self._address[command - LssCommand.INQUIRE_VENDOR])
+        return None
+
+    def _stored(self) -> int:
+        if self._store is None:
+            return _CANNOT_STORE
+        try:
+            self._store(self.pending_node_id, self.pending_bit_rate_bps)
+        except OSError:
+            return _STORE_FAILED
+        return _DONE
+
+
+def _frame(command: int, value: int = 0) -> bytes:
+    return bytes((command,)) + value.to_bytes(4, "little") + bytes(3)

@@ -94,6 +94,12 @@ class Acquisition:
         self.baseline_ohm[row, column] = value_ohm
         self.forget_sent()
 
+    def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:
+        """Set every R0 to that of ``values_ohm``, (U, K)."""
+        self.baseline_ohm = values_ohm
+        self.tared = True
+        self.forget_sent()
+
     def forget_sent(self) -> None:
         """Make the next scan a full one: nobody is known to have what was sent before."""
         self._sent = None

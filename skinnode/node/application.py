@@ -1,6 +1,6 @@
 """What a node is for: scans of the patch, at SYNC, by its own timer or on command; tare; wire faults.
 
-Connects the manufacturer's objects (0x2000 to 0x2300) with the acquisition behind them and the TPDO engine
+Connects the manufacturer's objects (0x2000 to 0x2301) with the acquisition behind them and the TPDO engine
 before them. The communication around it is in :mod:`skinnode.node.device`.
 """
 
@@ -163,6 +163,18 @@ class PatchApplication:
         store.bind(od.LOWER_WIRE_FAULTS, lambda sub: _fault_word(acquisition.faults.masks[2:], sub))
         for row in range(self._profile.rows):
             self._connect_row(row)
+        length = 4 * self._profile.n_codes
+        store.bind_domain(od.BASELINE_DOMAIN, length, self._read_baseline, self._write_baseline)
+
+    def _read_baseline(self, _: int) -> bytes:
+        return self._acquisition.baseline_ohm.astype("<f4").tobytes()
+
+    def _write_baseline(self, data: bytes) -> None:
+        values = np.frombuffer(data, dtype="<f4").reshape(self._profile.rows, self._profile.columns)
+        if not ((values > 0) & np.isfinite(values)).all():
+            raise Refused(AbortCode.INVALID_VALUE)
+        self._acquisition.set_baselines(values.astype(np.float32))
+        self._baseline_changed = True
 
     def _connect_row(self, row: int) -> None:
         store, acquisition, width = self._store, self._acquisition, self._profile.code_bits // 8

@@ -112,7 +112,7 @@ class CanopenDevice:
         self._send = send
         self._now_ns = 0
         self._store = ObjectStore(objects, node_id)
-        self._sdo = SdoServer(self._store)
+        self._sdo = SdoServer(self._store, self._send_sdo)
         self._emcy = EmcyProducer(self._send_emcy)
         self._heartbeat = HeartbeatProducer()
         self._consumer = HeartbeatConsumer(self._store)
@@ -170,8 +170,7 @@ class CanopenDevice:
         self._application.on_timer(t_ns)
         self._tpdos.on_timer(t_ns)
         self._emcy.on_timer(t_ns)
-        if t_ns >= self._sdo.deadline_ns:
-            self._answer(self._sdo.on_timer(t_ns))
+        self._sdo.on_timer(t_ns)
         if t_ns >= self._consumer.deadline_ns:
             for node_id in self._consumer.missed(t_ns):
                 self._emcy.happened(EmcyCode.HEARTBEAT, bytes((node_id,)), t_ns)
@@ -232,11 +231,10 @@ class CanopenDevice:
 
     def _on_sdo(self, data: bytes, t_ns: int) -> None:
         if self.nmt_state.communicates:
-            self._answer(self._sdo.on_request(data, t_ns))
+            self._sdo.on_request(data, t_ns)
 
-    def _answer(self, response: bytes | None) -> None:
-        if response is not None:
-            self._send(od.sdo_response_cob_id(self.node_id), response)
+    def _send_sdo(self, response: bytes) -> None:
+        self._send(od.sdo_response_cob_id(self.node_id), response)
 
     def _on_sync(self, data: bytes, t_ns: int) -> None:
         if not self.nmt_state.communicates:

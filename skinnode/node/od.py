@@ -3,21 +3,21 @@
 Declarations come from :mod:`skinnode.wire.profile`, the same that the EDS files are generated from. Values
 are the bytes that travel (little-endian), so that an SDO answer and a PDO are slices and a joined list. An
 object may be computed when it is read (:meth:`ObjectStore.bind`), may refuse a value
-(:meth:`ObjectStore.guard`) and may act on one that was accepted (:meth:`ObjectStore.watch`); a refused write
-changes nothing.
+(:meth:`ObjectStore.guard`) and may act on one that was accepted (:meth:`ObjectStore.watch`); a DOMAIN may be
+kept by somebody else (:meth:`ObjectStore.bind_domain`). A refused write changes nothing.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.wire.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Longest value of an object without a fixed size that a client may write."""
+"""Memory there is for a value whose length nothing limits."""
 
 Reader = Callable[[int], bytes]
 """Sub-index to value; may refuse."""
@@ -25,6 +25,26 @@ Guard = Callable[[int, int], None]
 """Sub-index and proposed value (the bit pattern of a REAL32); raises Refused."""
 Watcher = Callable[[int], None]
 """Called with the sub-index that has just been written."""
+DomainWriter = Callable[[bytes], None]
+"""Takes a whole value, or refuses it and changes nothing."""
+
+
+class Lengths(NamedTuple):
+    """Bytes that a client may write to an object."""
+
+    least: int
+    most: int
+
+    def check(self, length: int) -> None:
+        """Refuse a value of another length."""
+        self.check_not_above(length)
+        if length < self.least:
+            raise Refused(AbortCode.TOO_SHORT)
+
+    def check_not_above(self, length: int) -> None:
+        """Refuse what is too long already."""
+        if length > self.most:
+            raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
 
 
 def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
@@ -54,6 +74,7 @@ class ObjectStore:
         self._readers: dict[tuple[int, int], Reader] = {}
         self._guards: dict[int, Guard] = {}
         self._watchers: dict[int, Watcher] = {}
+        self._domains: dict[int, tuple[Lengths, DomainWriter]] = {}
 
     def _at_start(self, entry: Entry) -> bytes:
         value = entry.value_at_start(self._node_id)
@@ -66,6 +87,12 @@ class ObjectStore:
         for key in self._entries:
             if key[0] == index and (key[1] or whole):
                 self._readers[key] = reader
+
+    def bind_domain(self, index: int, length: int, reader: Reader, writer: DomainWriter) -> None:
+        """Let ``reader`` and ``writer`` keep the value of a writable DOMAIN, which always has ``length``
+        bytes."""
+        self._readers[index, 0] = reader
+        self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
         """Let ``guard`` refuse values written to ``index``."""
@@ -82,12 +109,15 @@ class ObjectStore:
             raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
         return entry
 
-    def writable(self, index: int, subindex: int) -> Entry:
-        """The declaration of an object that may be written; refuses any other."""
+    def lengths(self, index: int, subindex: int) -> Lengths:
+        """Bytes that may be written to an object; refuses one that may not be written."""
         entry = self.find(index, subindex)
         if entry.access in ("ro", "const"):
             raise Refused(AbortCode.READ_ONLY)
-        return entry
+        if index in self._domains:
+            return self._domains[index][0]
+        size = entry.data_type.bits // 8
+        return Lengths(size, size) if size else Lengths(0, MAX_BYTES)
 
     def read(self, index: int, subindex: int) -> bytes:
         """A client's upload."""
@@ -97,13 +127,19 @@ class ObjectStore:
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """A client's download: checked against declaration and guard, stored, then announced."""
-        entry = self.writable(index, subindex)
-        size = entry.data_type.bits // 8
-        if len(data) > (size or MAX_BYTES):
-            raise Refused(AbortCode.TOO_LONG)
-        if len(data) < size:
-            raise Refused(AbortCode.TOO_SHORT)
-        value = int.from_bytes(data, "little") if size else 0
+        self.lengths(index, subindex).check(len(data))
+        if index in self._domains:
+            self._domains[index][1](data)
+        else:
+            self._check(index, subindex, data)
+            self._values[index, subindex] = data
+        watcher = self._watchers.get(index)
+        if watcher is not None:
+            watcher(subindex)
+
+    def _check(self, index: int, subindex: int, data: bytes) -> None:
+        entry = self._entries[index, subindex]
+        value = int.from_bytes(data, "little") if entry.data_type.bits else 0
         if entry.high is not None and value > entry.high:
             raise Refused(AbortCode.VALUE_TOO_HIGH)
         if entry.low is not None and value < entry.low:
@@ -111,10 +147,6 @@ class ObjectStore:
         guard = self._guards.get(index)
         if guard is not None:
             guard(subindex, value)
-        self._values[index, subindex] = data
-        watcher = self._watchers.get(index)
-        if watcher is not None:
-            watcher(subindex)
 
     def raw(self, index: int, subindex: int) -> bytes:
         """The bytes of an object, computed if it is bound."""

@@ -132,6 +132,8 @@ BASELINE: Final = 0x2200
 """+ r: R0 of upper wire r in ohm, one sub-index a column; 0 where there is none yet."""
 COORDINATES: Final = 0x2300
 """DOMAIN: see :func:`skinnode.wire.coordinates.pack_coordinates`."""
+BASELINE_DOMAIN: Final = 0x2301
+"""DOMAIN: R0 of all wire pairs, U·K REAL32 in ohm, upper wire by upper wire; written whole or not at all."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 STORE_SIGNATURE: Final = int.from_bytes(b"save", "little")

@@ -242,6 +242,7 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
             for r in range(profile.rows)
         ),
         var(od.COORDINATES, "Electrode coordinates", DataType.DOMAIN, "ro"),
+        var(od.BASELINE_DOMAIN, "Baseline of all wires", DataType.DOMAIN, "rw"),
     )
 
 

@@ -10,6 +10,7 @@ ABORTS = {
     "toggle": "00 00 03 05",
     "timeout": "00 00 04 05",
     "command": "01 00 04 05",
+    "block size": "02 00 04 05",
     "access": "00 00 01 06",
     "write only": "01 00 01 06",
     "read only": "02 00 01 06",
@@ -122,17 +123,36 @@ def test_download_in_two_segments_toggles(desk) -> None:
         ("23 21 20 04 00 00 00 01", "store"),  # not the signature "tare"
         ("23 00 22 01 00 00 00 00", "value"),  # R0 = 0
         ("23 00 22 01 00 00 c0 7f", "value"),  # R0 = NaN
-        ("a0 08 10 00 00 00 00 00", "command"),  # block upload
-        ("c2 17 10 00 02 00 00 00", "command"),  # block download
+        ("40 18 10 ff 00 00 00 00", "no sub-index"),  # 0xFF, the structure, is not offered
+        ("40 00 22 ff 00 00 00 00", "no sub-index"),
+        ("2f 00 22 00 05 00 00 00", "read only"),  # sub-index 0 of an array
+        ("40 05 00 00 00 00 00 00", "no object"),  # dummy entries are for PDO mappings alone
+        ("2f 05 00 00 01 00 00 00", "no object"),
+        ("23 01 23 00 00 00 7a 44", "too short"),  # the baseline is written whole
+        ("21 01 23 00 2f 00 00 00", "too short"),
+        ("21 01 23 00 31 00 00 00", "too long"),
+        ("a4 ff 1f 00 7f 00 00 00", "no object"),
+        ("a4 18 10 05 7f 00 00 00", "no sub-index"),
+        ("a4 08 10 00 00 00 00 00", "block size"),
+        ("a4 08 10 00 80 00 00 00", "block size"),
+        ("c6 00 23 00 08 00 00 00", "read only"),
+        ("c6 17 10 00 03 00 00 00", "too long"),
+        ("c6 17 10 00 01 00 00 00", "too short"),
+        ("c6 ff 1f 00 01 00 00 00", "no object"),
         ("e0 08 10 00 00 00 00 00", "command"),
+        ("81 08 10 00 00 00 00 00", "command"),
         ("60 00 00 00 00 00 00 00", "command"),  # a segment of no transfer
         ("00 00 00 00 00 00 00 00", "command"),
+        ("a1 00 00 00 00 00 00 00", "command"),  # the rest of a block transfer of no transfer
+        ("a2 7f 7f 00 00 00 00 00", "command"),
+        ("a3 00 00 00 00 00 00 00", "command"),
+        ("c1 00 00 00 00 00 00 00", "command"),
     ],
 )
 def test_abort_codes(desk, request_: str, abort: str) -> None:
     asked = bytes.fromhex(request_)
-    segment = asked[0] >> 5 in (0, 3)  # names no object
-    where = bytes(3) if segment else asked[1:4]
+    goes_on = asked[0] in (0x00, 0x60, 0xA1, 0xA2, 0xA3, 0xC1)  # names no object
+    where = bytes(3) if goes_on else asked[1:4]
     assert desk.frame(0x604, request_) == [(0x584, f"80 {where.hex(' ')} {ABORTS[abort]}")]
 
 

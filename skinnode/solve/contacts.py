@@ -11,14 +11,14 @@ those that press significantly, and not much less than the strongest, form conta
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skinnode.jit import njit
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.linear import Index
 from skinnode.solve.prior import ElasticPrior
 
 if TYPE_CHECKING:
@@ -39,90 +39,141 @@ class ContactFinder:
     def __init__(self, prior: ElasticPrior, layout: PatchLayout) -> None:
         self._prior = prior
         self._own = prior.own_cells().ravel()
+        self._own_frame = prior.frame[self._own]
         self._electrodes = layout.upper_m.shape
+        cells = prior.shape[0] * prior.shape[1]
+        near = np.pad(np.arange(cells).reshape(prior.shape), 1, constant_values=-1)
         rows, columns = prior.shape
-        box = np.zeros((rows, columns, rows, columns))
-        for i in range(rows):
-            for j in range(columns):
-                box[i, j, max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = 1.0
-        self._box = np.zeros((rows * columns, 3 * rows * columns))
-        self._box[:, 2::3] = box.reshape(rows * columns, -1)
-
+        box = np.stack([near[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=-1)
+        self._near: Index = box.reshape(cells, 9)  # a cell and its neighbours, −1 beyond the lattice
+        self._region, self._label, self._stack = np.empty((3, cells), np.int64)
         self._made_by = -1
-        self._box_std = np.full(rows * columns, np.nan)
+        self._box_std = np.full(cells, np.nan)
 
     def find(self, estimator: Estimator) -> tuple[Float, tuple[Contact, ...]]:
         """(U, N, 3) forces on the cells of the electrodes, N, and the contacts, the strongest first."""
         q = estimator.loads()
-        force = np.einsum("qt,qti->qi", q * self._prior.load_n, self._prior.frame)
-        pressing = -np.einsum("bq,q->b", self._box, q.ravel())
+        force = np.einsum("qt,qti->qi", q[self._own] * self._prior.load_n, self._own_frame)
+        pressing = -np.append(q[:, 2], 0.0)[self._near].sum(axis=1)
         strong = np.flatnonzero(pressing > RELEVANT * max(float(pressing.max()), 0.0))
-        seed = np.zeros(len(pressing), bool)
-        seed[strong] = pressing[strong] > SIGNIFICANT * self._deviations(strong, estimator)
+        seed = strong[pressing[strong] > SIGNIFICANT * self._deviations(strong, estimator)]
+        count = _number_regions(self._near, seed, self._label, self._region, self._stack)
         found = [
             contact
-            for region in _regions(seed.reshape(self._prior.shape))
-            if (contact := self._contact(region, q, estimator)) is not None
+            for number in range(1, count + 1)
+            if (contact := self._contact(np.flatnonzero(self._region == number), q, estimator)) is not None
         ]
         found.sort(key=lambda contact: -contact.normal_force_n)
-        return force[self._own].reshape(self._electrodes), tuple(found)
+        return force.reshape(self._electrodes), tuple(found)
 
-    def _deviations(self, boxes: NDArray[np.int64], estimator: Estimator) -> Float:
+    def warm_up(self, estimator: Estimator) -> None:
+        """Compile what a contact needs."""
+        self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), estimator)
+
+    def _deviations(self, boxes: Index, estimator: Estimator) -> Float:
         """(B,) deviations of these sums; each is worked out once for a set of factors."""
         if self._made_by != estimator.factors:
             self._made_by = estimator.factors
             self._box_std[:] = np.nan
         new = boxes[np.isnan(self._box_std[boxes])]
         if new.size:
-            self._box_std[new] = estimator.load_std(self._box[new])
+            near = self._near[new]
+            self._box_std[new] = estimator.load_std(3 * np.maximum(near, 0) + 2, (near >= 0).astype(float))
         return self._box_std[boxes]
 
-    def _contact(self, region: NDArray[np.int64], q: Float, estimator: Estimator) -> Contact | None:
+    def _contact(self, region: Index, q: Float, estimator: Estimator) -> Contact | None:
         """The contact on the cells ``region``."""
-        load = self._prior.load_n
-        pressure = -q[region, 2] * load[2]
-        force = float(pressure.sum())
+        loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
+        centroid, shear = np.empty((2, 3))
+        force, spread = _sum_region(
+            region, q, self._prior.load_n, self._prior.cell_m, centroid, shear, loads, weights
+        )
         if not force > 0:
             return None
-        place = self._prior.cell_m[region]
-        centroid = (pressure[:, None] * place).sum(axis=0) / force
-        away = place - centroid
-        spread = (away**2).sum(axis=1)
-        mean = float((pressure * spread).sum() / force)
-        area = math.pi * HERTZ_SPREAD * max(mean, 0.0)
-        weights = np.zeros((7, 3 * len(q)))  # force, centroid, mean r², shear: by the delta method
-        weights[0, 3 * region + 2] = load[2]
-        weights[1:4, 3 * region + 2] = away.T * (load[2] / force)
-        weights[4, 3 * region + 2] = (spread - mean) * (load[2] / force)
-        weights[5, 3 * region] = load[0]
-        weights[6, 3 * region + 1] = load[1]
-        std = estimator.load_std(weights)
+        std = estimator.load_std(loads, weights)
         return Contact(
             centroid_m=centroid,
             centroid_std_m=std[1:4],
-            area_m2=area,
+            area_m2=math.pi * HERTZ_SPREAD * max(spread, 0.0),
             area_std_m2=math.pi * HERTZ_SPREAD * float(std[4]),
             normal_force_n=force,
             normal_force_std_n=float(std[0]),
-            shear_force_n=q[region, :2].sum(axis=0) * load[:2],
+            shear_force_n=shear[:2],
             shear_force_std_n=std[5:],
         )
 
 
-def _regions(seed: NDArray[np.bool_]) -> Iterator[NDArray[np.int64]]:
-    """Cells of each connected group of ``seed`` and their neighbours; a cell belongs to one group only."""
-    rows, columns = seed.shape
-    left = {(int(i), int(j)) for i, j in np.argwhere(seed)}
-    taken: set[tuple[int, int]] = set()
-    while left:
-        group, border = set(), [min(left)]
-        while border:
-            cell = border.pop()
-            if cell in left:
-                left.discard(cell)
-                group.add(cell)
-                border.extend((cell[0] + i, cell[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1))
-        grown = {(c[0] + i, c[1] + j) for c in group for i in (-1, 0, 1) for j in (-1, 0, 1)}
-        region = {c for c in grown - taken if 0 <= c[0] < rows and 0 <= c[1] < columns}
-        taken |= region
-        yield np.array(sorted(i * columns + j for i, j in region))
+@njit
+def _number_regions(near: Index, seed: Index, label: Index, region: Index, stack: Index) -> int:
+    """Number the connected groups of the cells ``seed`` from 1 on into ``label`` (Q,), 0 elsewhere, and their
+    cells and neighbours into ``region`` (Q,), a cell between two groups to the first; how many there are.
+
+    ``stack`` (Q,) is scratch.
+    """
+    label[:], region[:] = 0, 0
+    for cell in seed:
+        label[cell] = -1
+    count = 0
+    for first in seed:
+        if label[first] > 0:
+            continue
+        count += 1
+        label[first], stack[0], top = count, first, 1
+        while top > 0:
+            top -= 1
+            for i in near[stack[top]]:
+                if i < 0:
+                    continue
+                if region[i] == 0:
+                    region[i] = count
+                if label[i] < 0:
+                    label[i], stack[top] = count, i
+                    top += 1
+    return count
+
+
+@njit
+def _sum_region(
+    region: Index,
+    q: Float,
+    load: Float,
+    place: Float,
+    centroid: Float,
+    shear: Float,
+    loads: Index,
+    weights: Float,
+) -> tuple[float, float]:
+    """Normal force, N, and mean r² of the pressure, m², on the cells ``region`` (n,); ``centroid`` (3,) and
+    ``shear`` (3,) force with them.
+
+    ``loads`` and ``weights`` (7, n) say how force, centroid, mean r² and shear change with the loads, to
+    first order (delta method). All but the force are undefined where that is not positive.
+    """
+    force, mean = 0.0, 0.0
+    for t in range(3):
+        centroid[t], shear[t] = 0.0, 0.0
+    for cell in region:
+        force -= q[cell, 2] * load[2]
+    if not force > 0.0:
+        return force, mean
+    for cell in region:
+        for t in range(3):
+            centroid[t] -= q[cell, 2] * load[2] * place[cell, t] / force
+            shear[t] += q[cell, t] * load[t]
+    for c in range(region.size):
+        cell = region[c]
+        spread = 0.0
+        for t in range(3):
+            away = place[cell, t] - centroid[t]
+            weights[1 + t, c] = away * load[2] / force
+            spread += away * away
+        weights[4, c] = spread
+        mean -= q[cell, 2] * load[2] * spread / force
+    for c in range(region.size):
+        weights[0, c] = load[2]
+        weights[4, c] = (weights[4, c] - mean) * load[2] / force
+        weights[5, c], weights[6, c] = load[0], load[1]
+        for f in range(5):
+            loads[f, c] = 3 * region[c] + 2
+        loads[5, c], loads[6, c] = 3 * region[c], 3 * region[c] + 1
+    return force, mean

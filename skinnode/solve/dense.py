@@ -180,6 +180,20 @@ def multiply(a: Float, b: Float, c: Float) -> None:
 
 
 @njit
+def multiply_vector(a: Float, v: Float, out: Float) -> None:
+    """``out`` (m,) = ``a`` (m, n) · ``v`` (n,)."""
+    n = v.size
+    for i in range(out.size):
+        row = a[i]
+        even, odd = splat(0.0), splat(0.0)
+        for k in range(0, n, TILE):
+            right, left, more = k + LANES, n - k, n - k - LANES
+            even = fma(load(row, k, left), load(v, k, left), even)
+            odd = fma(load(row, right, more), load(v, right, more), odd)
+        out[i] = total(even + odd)
+
+
+@njit
 def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
     """``c`` (m, n) = ``a`` (m, k) · ``b``ᵀ with ``b`` (n, k); ``work`` (k, n) is scratch.
 

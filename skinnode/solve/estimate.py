@@ -14,6 +14,7 @@ three, and a narrow contact no longer sticks out of the reported deviation.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from time import perf_counter
@@ -28,6 +29,7 @@ from skinnode.solve.dense import (
     cholesky,
     inverse_diagonal,
     multiply,
+    multiply_vector,
     solve_lower,
     solve_lower_transposed_vector,
     solve_lower_vector,
@@ -85,6 +87,11 @@ class Data:
     d: Float
     """(p,) prior variances of the nuisances."""
 
+    @functools.cached_property
+    def count(self) -> Index:
+        """(U,) resistances there are of each wire."""
+        return np.asarray(np.count_nonzero(self.weight, axis=1))
+
 
 class Estimator:
     """State and buffers of one patch: displacement, nuisances, scale of the prior and the last factors.
@@ -116,12 +123,14 @@ class Estimator:
         """s², pitch²."""
         self.share = np.ones(len(self._blur))
         """(Q,) variance of the loads of a cell over s²; their mean is 1."""
-        self.gamma = 0.0
-        """Number of directions in the space of the data that the data determine, not the prior."""
+        self._gamma: float | None = None
         self.members: Index = np.arange(0)
         """Wires whose equations are in the factors."""
         self._factored: tuple[Float, float] | None = None
-        self._stiffness: Float | None = None  # (3Q,) k of each load by the factors at hand
+        self._whitened_loads = np.empty((len(self._b.v), self._response.shape[1]))
+        self._stiffness = np.empty(self._response.shape[1])
+        self._told = False  # whether the last two belong to the factors at hand
+        self._loads: tuple[Float, Float] | None = None  # displacement, loads; by the prior at hand
         self.evaluations = self.factorisations = 0
         self.factors = 0
         """Number of the factors at hand."""
@@ -148,22 +157,28 @@ class Estimator:
         self._covariance[:] = self._uniform
         self._root[:] = self._uniform
         cholesky(self._root, len(self._root))
-        self._factored = None
+        self._factored = self._loads = None
 
     def loads(self) -> Float:
         """(Q, 3) mean of the loads given the displacement, in units of the prior's."""
-        z = self.free_displacement()
+        moved = self.free_displacement()
+        if self._loads is not None and np.array_equal(self._loads[0], moved):
+            return self._loads[1]
+        z, q = moved.copy(), np.empty(self._response.shape[1])
         solve_lower_vector(self._root, z, z.size)
         solve_lower_transposed_vector(self._root, z, z.size)
-        q = np.einsum("jq,j->q", self._response, z).reshape(-1, 3)
-        return np.asarray(q * self.share[:, None])
+        multiply_vector(self._response_t, z, q)
+        self._loads = moved, q.reshape(-1, 3) * self.share[:, None]
+        return self._loads[1]
 
     def expected(self, least: float) -> Float:
         """(Q,) variances of the loads of the cells that the loads found speak for, half the way from those at
         hand, or neighbours would take turns; at least ``least``, pitch²."""
         found = self._evidence()
         floor = LOCAL_FLOOR * float(found.mean()) + least
-        return np.asarray(0.5 * (np.einsum("qp,p->q", self._blur, found) + floor + self.scale2 * self.share))
+        spread = np.empty_like(found)
+        multiply_vector(self._blur, found, spread)
+        return np.asarray(0.5 * (spread + floor + self.scale2 * self.share))
 
     def localise(self, variance: Float) -> bool:
         """Expect loads of these variances; False where hardly any would have to be expected elsewhere."""
@@ -177,7 +192,7 @@ class Estimator:
         self._covariance[np.diag_indices_from(self._covariance)] += SLACK**2
         self._root[:] = self._covariance
         cholesky(self._root, len(self._root))
-        self._factored = None
+        self._factored = self._loads = None
         return True
 
     def _evidence(self) -> Float:
@@ -188,64 +203,61 @@ class Estimator:
         a unit of it adds to χ² (Tipping and Faul, Fast marginal likelihood maximisation for sparse Bayesian
         models, 2003).
         """
-        own = np.repeat(self.scale2 * self.share, 3)
-        if self._stiffness is None:
-            told = self._whiten(self._response)
-            self._stiffness = np.maximum(np.einsum("mq,mq->q", told, told), 1e-300)
-        k = self._stiffness
-        alone = self.loads().ravel() / (own * k)
-        noise = np.maximum(1.0 / k - own, 0.0)
-        found = np.where(alone**2 > LOCAL_SIGNIFICANT * noise, alone**2 - noise, 0.0)
-        return np.asarray(found.reshape(-1, 3).max(axis=1))
+        found = np.empty(len(self.share))
+        self._whiten_loads()
+        kernels.loads_found(self.loads(), self.scale2 * self.share, self._stiffness, LOCAL_SIGNIFICANT, found)
+        return found
 
-    def _whiten(self, moved: Float) -> Float:
-        """L⁻¹ J of the displacements ``moved`` (U f, F), by the factors at hand."""
+    def _whiten_loads(self) -> Float:
+        """(m, 3Q) L⁻¹ J G by the factors at hand; k of each load with it."""
         b, f, rows = self._b, self._free.size, self._rows
-        told = np.empty((self.members.size * rows, moved.shape[1]))
-        for i, u in enumerate(self.members.tolist()):
-            block = slice(i * rows, (i + 1) * rows)
-            multiply(b.jacobian[block], moved[u * f : (u + 1) * f], told[block])
-        solve_lower(b.innovation, told, *told.shape)
+        told = self._whitened_loads[: self.members.size * rows]
+        if not self._told:
+            self._told = True
+            for i, u in enumerate(self.members.tolist()):
+                block = slice(i * rows, (i + 1) * rows)
+                multiply(b.jacobian[block], self._response[u * f : (u + 1) * f], told[block])
+            solve_lower(b.innovation, told, *told.shape)
+            self._stiffness[:] = np.maximum(np.einsum("mq,mq->q", told, told), 1e-300)
         return told
 
-    def load_std(self, weights: Float) -> Float:
-        """(F,) deviations of the sums ``weights`` (F, 3Q) of the loads, by the factors at hand."""
-        share = np.repeat(self.share, 3)
-        moved = np.empty((self._response.shape[0], len(weights)))
-        multiply(self._response, np.ascontiguousarray((weights * share).T), moved)
-        told = self._whiten(moved)
-        prior = np.einsum("fq,fq,q->f", weights, weights, share)
-        variance = self.scale2 * (prior - self.scale2 * np.einsum("mf,mf->f", told, told))
+    def load_std(self, loads: Index, weights: Float) -> Float:
+        """(F,) deviations, by the factors at hand, of sums of the ``loads`` (F, n), numbers below 3Q, with
+        ``weights`` (F, n)."""
+        shared = weights * self.share[loads // 3]
+        square = np.empty(len(weights))
+        kernels.load_squares(self._whiten_loads(), loads, shared, square)
+        variance = self.scale2 * ((weights * shared).sum(axis=1) - self.scale2 * square)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def residuals(self, data: Data, moved: Float | None = None) -> Float:
         """(U, K) r − H g at the displacement at hand, or another; what noise there is has deviation 1."""
-        b = self._b
-        x = self._problem.rest + (self.moved if moved is None else moved)
-        kernels.residuals(x, self._problem.lower, data.a, data.weight, b.r)
-        return np.asarray(b.r - np.einsum("ukp,p->uk", data.h, self.g))
+        self._square(data, self._every, self.moved if moved is None else moved, self.g)
+        return self._b.r.copy()
 
     def surprise(self, data: Data, moved: Float) -> tuple[Float, Float, Float]:
         """How badly a displacement explains the frame: (U,) χ² of each wire, (U,) by how many deviations a
-        single coordinate is off at most, and (U, f) by how much each would be, pitches.
+        single coordinate is off at most, and (U, f) by how much each would be, were it the only one, pitches.
 
         χ² alone overlooks what moves one electrode by 7 deviations.
         """
         self._linearise(data, moved)
-        r = np.ascontiguousarray(self._b.r - np.einsum("ukp,p->uk", data.h, self.g))
-        move, top = np.empty((len(r), self._free.size)), np.empty(len(r))
-        kernels.single_moves(self._free, self._b.jt, r, move, top)
-        return (r**2).sum(axis=1), top, move
+        total, top = np.empty((2, len(self.moved)))
+        move = np.empty((len(top), self._free.size))
+        kernels.surprises(self._free, data.h, self.g, self._b.jt, self._b.r, total, top, move)
+        return total, top, move
 
     def objective(self, data: Data, moved: Float | None = None, g: Float | None = None) -> float:
         """What a solve minimises, χ² and the prior's part, at the field at hand or another; with equal
         factors."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
-        b = self._b
-        x = self._problem.rest + moved
-        kernels.residuals(x, self._problem.lower, data.a, data.weight, b.r)
-        r = (b.r - np.einsum("ukp,p->uk", data.h, g))[self.members]
-        return float((r**2).sum() + self.roughness(moved) / self.scale2 + (g**2 / data.d).sum())
+        square = self._square(data, self.members, moved, g)
+        return square + self.roughness(moved) / self.scale2 + float((g**2 / data.d).sum())
+
+    def _square(self, data: Data, members: Index, moved: Float, g: Float) -> float:
+        """Σ (r − H g)² of these wires."""
+        x, b = self._problem.rest + moved, self._b
+        return kernels.residuals(members, x, self._problem.lower, data.a, data.weight, data.h, g, b.r)
 
     def track(self, data: Data, members: Index) -> bool:
         """Solve from the displacement at hand; False where that leads nowhere near."""
@@ -300,6 +312,15 @@ class Estimator:
         excess = float((self._b.r[members] ** 2).sum()) - float(np.count_nonzero(data.weight[members]))
         return excess / trace if trace > 0 else 0.0
 
+    @property
+    def gamma(self) -> float:
+        """Number of directions in the space of the data that the data determine, not the prior."""
+        if self._gamma is None:
+            b, m = self._b, self.members.size * self._rows
+            inverse_diagonal(b.innovation, b.work, b.v, m)
+            self._gamma = m - float(b.v[:m].sum())
+        return self._gamma
+
     def evidence_scale(self, weight: float, scale2: float) -> float:
         """The next s² of MacKay's fixed point (Neural Computation 4, 415, 1992), under a prior worth
         ``weight`` directions at ``scale2``."""
@@ -353,7 +374,7 @@ class Estimator:
         m = members.size * self._rows
         self.factorisations += 1
         self.factors += 1
-        self._stiffness = None
+        self._told = False
         if not cholesky(b.innovation, m):
             return math.inf
         before = self.moved.copy()
@@ -389,8 +410,9 @@ class Estimator:
         self.moved[:], self.g[:] = moved + share * way[0], g + share * way[1]
 
     def _measure(self, data: Data) -> None:
-        """Deviations and γ by the factors at hand."""
+        """Deviations by the factors at hand."""
         b, m = self._b, self.members.size * self._rows
+        self._gamma = None
         b.whitened[:m] = b.gain[:m]
         columns = b.whitened.shape[1]
         solve_lower(b.innovation, b.whitened, m, columns)
@@ -398,8 +420,6 @@ class Estimator:
         prior = self.scale2 * np.diagonal(self._covariance)
         variance = np.maximum(prior - np.einsum("mj,mj->j", v, v), 0.0)
         self.std[:] = np.sqrt(variance * (1.0 + PRIOR_DOUBT * variance / prior)).reshape(self.std.shape)
-        inverse_diagonal(b.innovation, b.work, b.v, m)
-        self.gamma = m - float(b.v[:m].sum())
 
     def _settle(self, data: Data) -> bool:
         """Chord steps to the maximum; where they do not settle, the better of the fields before and after."""
@@ -417,13 +437,11 @@ class Estimator:
         before = math.inf
         for _ in range(CHORDS):
             self._linearise(data, self.moved, self.members)
-            kernels.chord_step(
+            size, top = kernels.chord_step(
                 self.members, self._free, self._covariance, self.scale2, data.h, data.d, self.moved, self.g,
                 self._correction, b,
             )  # fmt: skip
             step = self._correction
-            size = math.sqrt(float(np.mean(step[: self.std.size] ** 2)))
-            top = float(np.abs(step[: self.std.size]).max())
             if not (top <= self._reach and size < math.inf):
                 return False
             self.moved[:, self._free] += step[: self.std.size].reshape(wires, -1)

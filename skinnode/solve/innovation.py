@@ -108,29 +108,75 @@ def linearise(members: Index, x: Float, lower: Float, a: Float, weight: Float, r
 
 
 @njit
-def residuals(x: Float, lower: Float, a: Float, weight: Float, r: Float) -> None:
-    """r = w (a F − 1) alone."""
-    for u in range(x.shape[0]):
+def residuals(
+    members: Index, x: Float, lower: Float, a: Float, weight: Float, h: Float, g: Float, r: Float
+) -> float:
+    """r − H g with r = w (a F − 1) of the wires ``members`` (P,) into ``r`` (U, K); the sum of squares."""
+    square = 0.0
+    for i in range(members.size):
+        u = members[i]
         r_u, a_u, w_u = r[u], a[u], weight[u]
         potential(x[u], lower, r_u)
         for k in range(r_u.size):
             r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+        for q in range(g.size):
+            for k in range(r_u.size):
+                r_u[k] -= h[u, k, q] * g[q]
+        square += dot(r_u, r_u)
+    return square
 
 
 @njit
-def single_moves(free: Index, jt: Float, r: Float, move: Float, top: Float) -> None:
-    """By how much each coordinate alone would be off, Jᵢᵀ r / ‖Jᵢ‖², into ``move`` (U, f), and the largest of
-    a wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
+def surprises(
+    free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
+) -> None:
+    """r − H g in place of ``r`` (U, K), and how badly that fits: χ² of each wire into ``square_sum`` (U,); by
+    how much each coordinate alone would be off, |Jᵢᵀ r| / ‖Jᵢ‖², into ``move`` (U, f); and the largest of a
+    wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
     for u in range(jt.shape[0]):
+        r_u = r[u]
+        for q in range(g.size):
+            for k in range(r_u.size):
+                r_u[k] -= h[u, k, q] * g[q]
+        square_sum[u] = dot(r_u, r_u)
         top[u] = 0.0
         for i in range(free.size):
             row = jt[u, free[i]]
             square = dot(row, row)
             move[u, i] = 0.0
             if square > 0.0:
-                along = dot(row, r[u])
+                along = abs(dot(row, r_u))
                 move[u, i] = along / square
-                top[u] = max(top[u], abs(along) / math.sqrt(square))
+                top[u] = max(top[u], along / math.sqrt(square))
+
+
+@njit
+def load_squares(told: Float, loads: Index, weights: Float, out: Float) -> None:
+    """‖L⁻¹ J G w‖² of the sums w with ``weights`` (F, n) of the ``loads`` (F, n) into ``out`` (F,); ``told``
+    (m, 3Q) is L⁻¹ J G."""
+    for f in range(out.size):
+        out[f] = 0.0
+    for i in range(told.shape[0]):
+        row = told[i]
+        for f in range(out.size):
+            value, column, weight = 0.0, loads[f], weights[f]
+            for c in range(weight.size):
+                value += weight[c] * row[column[c]]
+            out[f] += value * value
+
+
+@njit
+def loads_found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> None:
+    """Squares of the loads ``q`` (Q, 3), freed from their own prior variances ``own`` (Q,), into ``found``
+    (Q,): of a cell the largest that is significant, else 0; ``stiffness`` (3Q,)."""
+    for cell in range(found.size):
+        found[cell] = 0.0
+        for i in range(3):
+            k = stiffness[3 * cell + i]
+            alone = q[cell, i] / (own[cell] * k)
+            noise = max(1.0 / k - own[cell], 0.0)
+            if alone * alone > significant * noise:
+                found[cell] = max(found[cell], alone * alone - noise)
 
 
 @njit_part
@@ -253,8 +299,9 @@ def chord_step(
     g: Float,
     step: Float,
     b: Buffers,
-) -> None:
-    """The chord step with the factors at hand: from r and Jᵀ at ``x`` in ``b`` to ``step`` (U f + p,)."""
+) -> tuple[float, float]:
+    """The chord step with the factors at hand: from r and Jᵀ at ``x`` in ``b`` to ``step`` (U f + p,); RMS
+    and largest of its U f coordinates."""
     f, p = free.size, g.size
     equations = b.r.shape[1]
     rows = b.jacobian.shape[0] // x.shape[0]
@@ -301,3 +348,8 @@ def chord_step(
         for k in range(m):
             total += b.nuisance[k, q] * b.v[k]
         step[n + q] += d[q] * total
+    square, top = 0.0, 0.0
+    for j in range(n):
+        square += step[j] * step[j]
+        top = max(top, abs(step[j]))
+    return math.sqrt(square / n), top

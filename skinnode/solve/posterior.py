@@ -171,6 +171,9 @@ class Posterior:
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
+        self._estimator.gamma  # noqa: B018  # asked for where nothing touches
+        if self._contacts is not None:
+            self._contacts.warm_up(self._estimator)
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
@@ -299,9 +302,9 @@ class Posterior:
         """(U,) wires whose residuals are beyond noise of variance ``noises``; (U, f) how far each coordinate
         seems to have moved, were it the only one; (U,) χ²."""
         total, sharpest, move = self._estimator.surprise(data, moved)
-        limit = self._quiet[np.count_nonzero(data.weight, axis=1)]
+        limit = self._quiet[data.count]
         stirred = (total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises))
-        return stirred, np.abs(move), total
+        return stirred, move, total
 
     def _touched(self, data: Data) -> Index:
         """Wires whose resistances are not those at rest; one in the last solve stays a little longer."""
@@ -309,7 +312,7 @@ class Posterior:
         touched, _, total = self._stirred(data, at_rest)
         stay = np.zeros(len(total), bool)
         stay[self._members] = True
-        touched |= stay & (total > np.count_nonzero(data.weight, axis=1))
+        touched |= stay & (total > data.count)
         if touched.any():
             touched |= self._kept > 0
         return np.flatnonzero(touched)
@@ -328,7 +331,7 @@ class Posterior:
         wanted = touched if self._hold and touched.size else self._wires
         seen, usable = usable, usable.copy()
         for _ in range(LEFT_OUT + 3):
-            members = wanted[np.count_nonzero(data.weight[wanted], axis=1) > 0]
+            members = wanted[data.count[wanted] > 0]
             if not self._converge(data, members):
                 lost = [u for u in members.tolist() if not self._converge(data, np.array([u]))]
                 if not lost or len(lost) > min(LEFT_OUT, len(a) - 1):
@@ -340,15 +343,15 @@ class Posterior:
             if not np.isfinite(estimator.moved).all():
                 return self._give_up(Status.NON_FINITE)
             stirred, _, total = self._stirred(data, estimator.moved)
-            left = np.setdiff1d(self._wires, wanted)
-            surprised = left[stirred[left]]
+            stirred[wanted] = False
+            surprised = np.flatnonzero(stirred)
             if surprised.size:  # moved, and not as the others say, or stayed where they say it moved
                 self._kept[surprised] = KEPT
                 wanted = np.union1d(wanted, surprised)
                 continue
             if self._strained(data, BELIEVABLE):
                 return self._give_up(Status.INCONSISTENT)
-            excess = total / self._impossible[np.count_nonzero(data.weight, axis=1)]
+            excess = total / self._impossible[data.count]
             if (excess <= 1.0).all():
                 break
             worst = int(np.argmax(excess))

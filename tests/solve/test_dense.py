@@ -109,6 +109,9 @@ def test_products(m, k, n, seed):
     dense.multiply_transposed(a, np.ascontiguousarray(b.T), again, np.empty((k, n)))
     assert (np.abs(c - a @ b) <= 2 * k * EPS * (np.abs(a) @ np.abs(b))).all()
     np.testing.assert_array_equal(again, c)
+    v, one = rng.normal(size=k), np.full(m, np.nan)
+    dense.multiply_vector(a, v, one)
+    assert (np.abs(one - a @ v) <= 2 * k * EPS * (np.abs(a) @ np.abs(v))).all()
 
 
 def test_no_split_of_the_work_changes_a_bit():

@@ -1,0 +1,86 @@
+"""``skinnode conformance``: hold a CANopen node against the standard, case by case."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from skinnode.conformance import Report
+
+
+def conformance(
+    node_id: Annotated[int | None, typer.Option(min=1, max=127, help="The node.", metavar="N")] = None,
+    interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",
+    channel: Annotated[str, typer.Option(help="Channel of the interface.", metavar="NAME")] = "can0",
+    bitrate: Annotated[int, typer.Option(help="Bits per second.", metavar="BPS")] = 1_000_000,
+    eds: Annotated[
+        Path | None,
+        typer.Option(help="Its data sheet; not needed for a patch of this project.", metavar="FILE"),
+    ] = None,
+    only: Annotated[
+        str, typer.Option(help="Areas and cases, with commas: SDO,PDO-03.", metavar="NAMES")
+    ] = "",
+    junit: Annotated[Path | None, typer.Option(help="Write JUnit XML to this file.", metavar="FILE")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write an HTML report.", metavar="FILE")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write all results and frames.", metavar="FILE")
+    ] = None,
+    list_cases: Annotated[
+        bool, typer.Option("--list", help="Print ids, titles and clauses, and end.")
+    ] = False,
+) -> None:
+    """Test a node against CiA 301, 127 cases in raw frames, a line each.
+
+    It RESETS the node many times, starts and stops it, remaps its PDOs, stores
+    and restores its parameters, and puts back at the end what it changed: the
+    configuration is read first, and stored again where it differs from the
+    defaults. For a bus without another master, and a machine that may stand.
+
+    Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
+    """
+    from skinnode.cli._files import require_writable
+    from skinnode.conformance import connect, parse_eds, run_cases, select
+    from skinnode.conformance.report import list_lines, result_line, summary_line
+    from skinnode.errors import ConfigError
+    from skinnode.model.config import BusConfig
+    from skinnode.transport import CanPort
+
+    cases = select(only.split(",") if only else ())
+    if list_cases:
+        typer.echo("\n".join(list_lines(cases)))
+        return
+    if node_id is None:
+        raise ConfigError("--node-id", None, "1 to 127")
+    for option, file in (("--junit", junit), ("--html", html), ("--json", json_file)):
+        if file is not None:
+            require_writable(option, file)
+    sheet = parse_eds(eds.read_text(encoding="latin-1"), str(eds)) if eds is not None else None
+    bus = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate)
+    with CanPort(bus) as port:
+        dut = connect(port, node_id, sheet)
+        report = run_cases(dut, cases, lambda result: typer.echo(result_line(result)))
+    for problem in report.problems:
+        typer.echo(f"note: {problem}")
+    typer.echo(summary_line(report))
+    _write(report, f"node {node_id} on {interface} {channel}", junit, html, json_file)
+    if report.failed:
+        raise typer.Exit(1)
+
+
+def _write(report: Report, title: str, junit: Path | None, html: Path | None, json_file: Path | None) -> None:
+    import datetime
+    import json
+
+    from skinnode.cli._files import write_text
+    from skinnode.conformance.html import as_html
+    from skinnode.conformance.report import as_json, as_junit
+
+    if junit is not None:
+        write_text("--junit", junit, as_junit(report))
+    if html is not None:
+        write_text("--html", html, as_html(report, title, datetime.datetime.now().astimezone()))
+    if json_file is not None:
+        write_text("--json", json_file, json.dumps(as_json(report), indent=2) + "\n")

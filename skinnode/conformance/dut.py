@@ -1,0 +1,130 @@
+"""The device under test, as far as a bus lets one see it."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from skinnode.conformance.bus import QUIET_S, Failed, Tester, describe
+from skinnode.conformance.case import NotApplicable
+from skinnode.conformance.eds import Eds, EdsEntry
+from skinnode.conformance.sdo import SdoClient
+from skinnode.errors import NodeTimeout
+
+START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
+"""NMT commands."""
+
+STATES: Final = {0: "initialising", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
+
+BOOT_S: Final = 5.0
+"""How long a device may take to start up."""
+
+_ASK_EACH_S: Final = 0.25
+
+HEARTBEAT: Final = 0x1017
+GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
+STORE, RESTORE = 0x1010, 0x1011
+
+
+class Dut:
+    """Node ``node_id`` and what its EDS promises."""
+
+    def __init__(self, bus: Tester, node_id: int, eds: Eds) -> None:
+        self.bus, self.node_id, self.eds = bus, node_id, eds
+        self.sdo = SdoClient(bus, node_id)
+        self.stored = False
+        """Whether parameters were stored or restored since this was last looked at."""
+        self.up = False
+        """Whether the node came up after the last reset."""
+
+    @property
+    def error_control_id(self) -> int:
+        return 0x700 + self.node_id
+
+    @property
+    def emcy_id(self) -> int:
+        return 0x80 + self.node_id
+
+    # --- network management
+
+    def nmt(self, command: int) -> None:
+        """Command this node alone."""
+        self.bus.send(0x000, bytes((command, self.node_id)))
+
+    def reset(self, command: int = RESET_NODE) -> None:
+        """Reset and await the boot-up message. Raises Failed where none comes, or another than it should."""
+        self.bus.clear()
+        self.nmt(command)
+        frame = self.bus.expect(self.error_control_id, "the boot-up message", BOOT_S)
+        if frame.data != b"\0":
+            raise Failed(f"the boot-up message 0x{self.error_control_id:03X} [1] 00", describe(frame))
+
+    def prepare(self) -> None:
+        """Reset the node to PRE-OPERATIONAL. A boot-up message that is missing is for other cases to find:
+        a node that answers is ready. Raises NodeTimeout where it stays silent."""
+        self.bus.clear()
+        self.nmt(RESET_NODE)
+        self.up = False
+        end_s = time.monotonic() + BOOT_S
+        while time.monotonic() < end_s:
+            boot = self.bus.take(self.error_control_id, _ASK_EACH_S, lambda frame: frame.data == b"\0")
+            if boot is not None:
+                self.up = True
+                return
+            self.sdo.send(b"\x40\x00\x10\x00")
+            if self.bus.take(self.sdo.answer_id, _ASK_EACH_S) is not None:
+                self.up = True
+                return
+        raise NodeTimeout(self.node_id, f"no boot-up message and no answer within {BOOT_S:g} s of a reset")
+
+    def operational(self) -> None:
+        self.nmt(START)
+
+    # --- error control
+
+    def start_heartbeat(self, period_ms: int = 20) -> None:
+        """Have the node say its state; NotApplicable where it has no heartbeat."""
+        self.need(HEARTBEAT)
+        self.sdo.write_integer(HEARTBEAT, 0, period_ms, 2)
+
+    def expect_state(self, state: int, what: str) -> None:
+        """The next heartbeat must carry ``state``; :meth:`start_heartbeat` comes before. A heartbeat on its
+        way
+        from before is allowed for."""
+        frames = [
+            self.bus.expect(
+                self.error_control_id, f"a heartbeat {what}", match=lambda frame: len(frame.data) == 1
+            )
+            for _ in range(2)
+        ]
+        got = frames[-1].data[0]
+        if got != state:
+            raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
+
+    def guard(self, what: str) -> int | None:
+        """Ask for the state by a remote frame; the byte of the answer, None for none."""
+        self.bus.pending(self.error_control_id)
+        self.bus.send(self.error_control_id, remote=True)
+        frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
+        if frame is not None and len(frame.data) != 1:
+            raise Failed(f"one byte to a remote frame, {what}", describe(frame))
+        return None if frame is None else frame.data[0]
+
+    # --- object dictionary
+
+    def need(self, index: int, subindex: int = 0) -> EdsEntry:
+        """The entry of the EDS; NotApplicable where it has none."""
+        entry = self.eds.find(index, subindex)
+        if entry is None:
+            raise NotApplicable(f"the EDS has no object 0x{index:04X}:{subindex:02X}")
+        return entry
+
+    def store(self, subindex: int, signature: bytes = b"save") -> None:
+        """Store parameters (0x1010). What is stored is made good after the case."""
+        self.stored = True
+        self.sdo.write(STORE, subindex, signature)
+
+    def restore(self, subindex: int) -> None:
+        """Restore default parameters (0x1011), valid from the next reset on."""
+        self.stored = True
+        self.sdo.write(RESTORE, subindex, b"load")

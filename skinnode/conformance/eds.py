@@ -1,0 +1,239 @@
+"""What the electronic data sheet of a device (CiA 306) promises: a reader for testing.
+
+Reads with :mod:`configparser` alone, so that what it finds owes nothing to the writer of this project nor to
+the canopen library. What contradicts itself is kept for case EDS-01 to report (:func:`contradictions`); what
+cannot be read at all raises ProfileError.
+"""
+
+from __future__ import annotations
+
+import configparser
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.errors import ProfileError
+
+SIZES: Final = {
+    0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
+    0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
+}  # fmt: skip
+"""Bytes of a value by its data type (CiA 301 v4.2.0, table 44); types not listed vary in length."""
+
+_VARIABLE: Final = (0x09, 0x0A, 0x0B, 0x0F)
+SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
+UNSIGNED: Final = (0x05, 0x06, 0x07, 0x16, 0x18, 0x19, 0x1A, 0x1B)
+_REAL: Final = {0x08: "<f", 0x11: "<d"}
+_TEXT: Final = 0x09
+ACCESS: Final = ("ro", "wo", "rw", "rwr", "rww", "const")
+_READABLE: Final = ("ro", "rw", "rwr", "rww", "const")
+_WRITABLE: Final = ("wo", "rw", "rwr", "rww")
+
+_SECTION: Final = re.compile(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?")
+_VAR, _ARRAY, _RECORD, _DOMAIN = 0x7, 0x8, 0x9, 0x2
+
+
+@dataclass(frozen=True, slots=True)
+class EdsEntry:
+    """One value of the object dictionary."""
+
+    index: int
+    subindex: int
+    name: str
+    data_type: int
+    access: str
+    default: str
+    """As the file has it; empty for none."""
+    low: int | None
+    high: int | None
+    mappable: bool
+    flags: int
+    """ObjFlags: bit 0 refuse write on download, bit 1 refuse read on scan."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of a value; 0 where it varies."""
+        return SIZES.get(self.data_type, 0)
+
+    @property
+    def readable(self) -> bool:
+        return self.access in _READABLE
+
+    @property
+    def writable(self) -> bool:
+        return self.access in _WRITABLE
+
+    @property
+    def into_rpdo(self) -> bool:
+        """May be received: written, and not declared as process input."""
+        return self.mappable and self.access in ("wo", "rww", "rw")
+
+    @property
+    def into_tpdo(self) -> bool:
+        """May be transmitted: read, and not declared as process output."""
+        return self.mappable and self.access in ("ro", "rwr", "rw", "const")
+
+    @property
+    def mapping(self) -> int:
+        """As a PDO mapping parameter names it."""
+        return self.index << 16 | self.subindex << 8 | 8 * self.size
+
+    def default_bytes(self, node_id: int) -> bytes | None:
+        """The default as it travels; None where the file has none or the length varies without a text."""
+        if not self.default:
+            return None
+        if self.data_type == _TEXT:
+            return self.default.encode("latin-1")
+        if not self.size:
+            return None
+        if self.data_type in _REAL and not self.default.lower().startswith("0x"):
+            return struct.pack(_REAL[self.data_type], float(self.default))
+        value = number(self.default, node_id)
+        return (value & (1 << 8 * self.size) - 1).to_bytes(self.size, "little")
+
+    def __str__(self) -> str:
+        return f"0x{self.index:04X}:{self.subindex:02X} ({self.name})"
+
+
+@dataclass(frozen=True, slots=True)
+class Eds:
+    """An EDS: head, and entries by index and sub-index in ascending order."""
+
+    source: str
+    """Where it comes from, for messages."""
+    device: Mapping[str, str]
+    """Section DeviceInfo, keys in lower case."""
+    dummies: frozenset[int]
+    """Data types that may be mapped as dummy entries."""
+    entries: Mapping[tuple[int, int], EdsEntry]
+    contradictions: tuple[str, ...]
+    """What the file says against itself."""
+
+    def find(self, index: int, subindex: int = 0) -> EdsEntry | None:
+        return self.entries.get((index, subindex))
+
+    def has(self, index: int) -> bool:
+        """Whether there is an object of that index."""
+        return any(key[0] == index for key in self.entries)
+
+    def between(self, first: int, last: int) -> Iterator[EdsEntry]:
+        """Entries of the indices from ``first`` to ``last``."""
+        return (entry for key, entry in self.entries.items() if first <= key[0] <= last)
+
+    def indices(self, first: int, last: int) -> list[int]:
+        """Objects from ``first`` to ``last``."""
+        return sorted({index for index, _ in self.entries if first <= index <= last})
+
+
+def number(text: str, node_id: int = 0) -> int:
+    """A number of an EDS: decimal, 0x…, octal with a leading zero, or $NODEID+…. Raises ValueError."""
+    total = 0
+    for part in text.replace(" ", "").split("+"):
+        if part.upper() == "$NODEID":
+            total += node_id
+        elif re.fullmatch(r"0[0-7]+", part):
+            total += int(part, 8)
+        else:
+            total += int(part, 0)
+    return total
+
+
+def parse_eds(text: str, source: str) -> Eds:
+    """Read an EDS or DCF. Raises ProfileError where it is none."""
+    parser = configparser.ConfigParser(
+        interpolation=None, strict=False, comment_prefixes=(";",), delimiters=("=",), allow_no_value=True
+    )
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        raise ProfileError("--eds", " ".join(str(error).split()), "an EDS (CiA 306)", where=source) from error
+    sections = {name.lower(): {k: v or "" for k, v in parser.items(name)} for name in parser.sections()}
+    if "deviceinfo" not in sections or "1000" not in sections:
+        raise ProfileError("--eds", "no section DeviceInfo or 1000", "an EDS (CiA 306)", where=source)
+    found: list[str] = []
+    entries: dict[tuple[int, int], EdsEntry] = {}
+    for title in sorted(sections, key=_order):
+        match = _SECTION.fullmatch(title)
+        if match is None:
+            continue
+        index, subindex = int(match[1], 16), match[2]
+        try:
+            if subindex is not None:
+                _add(entries, index, int(subindex, 16), sections[title])
+            else:
+                _object(entries, index, sections[title], found)
+        except (ValueError, KeyError) as error:
+            found.append(f"[{title}]: {error}")
+    found += _listed(sections, {index for index, _ in entries})
+    dummies = sections.get("dummyusage", {})
+    return Eds(
+        source=source,
+        device=sections["deviceinfo"],
+        dummies=frozenset(
+            kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")
+        ),
+        entries=dict(sorted(entries.items())),
+        contradictions=tuple(found),
+    )
+
+
+def _order(title: str) -> tuple[int, str]:
+    """Objects before their sub-objects."""
+    return len(title), title
+
+
+def _object(
+    entries: dict[tuple[int, int], EdsEntry], index: int, options: Mapping[str, str], found: list[str]
+) -> None:
+    kind = number(options.get("objecttype") or "7")
+    if kind in (_VAR, _DOMAIN):
+        _add(entries, index, 0, options)
+        return
+    if kind not in (_ARRAY, _RECORD):
+        found.append(f"[{index:04X}]: object type 0x{kind:X}, must be 2, 7, 8 or 9")
+    compact = number(options.get("compactsubobj") or "0")
+    if compact:  # sub-objects alike, not written one by one
+        count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
+        _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
+        for subindex in range(1, compact + 1):
+            _add(entries, index, subindex, options)
+
+
+def _add(
+    entries: dict[tuple[int, int], EdsEntry], index: int, subindex: int, options: Mapping[str, str]
+) -> None:
+    low, high = options.get("lowlimit"), options.get("highlimit")
+    data_type = number(options["datatype"])
+    entries[index, subindex] = EdsEntry(
+        index,
+        subindex,
+        options.get("parametername", ""),
+        data_type,
+        options["accesstype"].strip().lower(),
+        options.get("defaultvalue", "").strip(),
+        number(low) if low and data_type not in _REAL else None,
+        number(high) if high and data_type not in _REAL else None,
+        bool(number(options.get("pdomapping") or "0")),
+        number(options.get("objflags") or "0"),
+    )
+
+
+def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
+    """Objects listed but not described, described but not listed, and lists that are miscounted."""
+    listed: set[int] = set()
+    for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
+        options = sections.get(name, {})
+        items = {number(value) for key, value in options.items() if key.isdecimal()}
+        count = number(options.get("supportedobjects") or "0")
+        if count != len(items):
+            yield f"[{name}]: SupportedObjects={count}, but {len(items)} are listed"
+        listed |= items
+    for index in sorted(listed ^ described):
+        yield f"0x{index:04X} is {'listed' if index in listed else 'described'} only"
+    for title, options in sections.items():
+        if _SECTION.fullmatch(title) and "sub" not in title and options.get("subnumber"):
+            subs = sum(1 for other in sections if other.startswith(f"{title}sub"))
+            if not options.get("compactsubobj") and subs != number(options["subnumber"]):
+                yield f"[{title}]: SubNumber={options['subnumber']}, but {subs} are described"

@@ -1,0 +1,132 @@
+"""Runs cases against a node: each from a fresh reset, each bounded in time, the configuration put back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.conformance.bus import Failed, Tester
+from skinnode.conformance.case import Case, NotApplicable, Result, Verdict
+from skinnode.conformance.configuration import read_configuration, write_back
+from skinnode.conformance.dut import Dut
+from skinnode.conformance.eds import Eds, parse_eds
+from skinnode.conformance.sdo import SdoClient
+from skinnode.errors import BusError, ConfigError, NodeTimeout
+from skinnode.transport import CanPort
+from skinnode.wire import indices as od
+from skinnode.wire.profile import PatchProfile, eds_name, eds_text
+
+SILENT_CASES: Final = 3
+"""Cases in a row before which the node does not come up; the others are then not run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """All results of a run, and what it could not put back."""
+
+    results: tuple[Result, ...]
+    problems: tuple[str, ...]
+    eds: str
+    """Where the EDS came from."""
+
+    @property
+    def failed(self) -> int:
+        return self.count(Verdict.FAILED)
+
+    def count(self, verdict: Verdict) -> int:
+        return sum(result.verdict is verdict for result in self.results)
+
+
+def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
+    """Reset the node and say what it is. Without an EDS it has to be a patch of this project, whose EDS
+    follows
+    from its descriptor (0x2000). Raises NodeTimeout where nobody answers, ConfigError without an EDS."""
+    bus = Tester(port)
+    Dut(bus, node_id, _NO_EDS).prepare()
+    return Dut(bus, node_id, eds if eds is not None else _own_eds(SdoClient(bus, node_id)))
+
+
+_NO_EDS: Final = Eds("", {}, frozenset(), {}, ())
+
+
+def _own_eds(sdo: SdoClient) -> Eds:
+    try:
+        product = sdo.integer(od.IDENTITY, od.IDENTITY_PRODUCT)
+        if product == od.PRODUCT_CODE:
+            sizes = (od.ROWS, od.COLUMNS, od.UPPER_ELECTRODES, od.LOWER_ELECTRODES, od.CODE_BITS)
+            patch = PatchProfile(*(sdo.integer(od.DESCRIPTOR, size) for size in sizes))
+            return parse_eds(eds_text(patch), f"{eds_name(patch)}, generated")
+    except Failed as failure:
+        raise ConfigError(
+            "--eds", "nothing", f"the device's EDS, for its identity is unknown: {failure}"
+        ) from None
+    raise ConfigError(
+        "--eds", "nothing", f"the EDS of the device, for product code 0x{product:08X} is not ours"
+    )
+
+
+def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
+    """Run ``cases`` one after the other and call ``say`` with each result. Raises BusError where the
+    interface fails; whatever the node does ends in a result. The node is left reset, with the configuration
+    it had."""
+    results: list[Result] = []
+    problems: list[str] = []
+    before = read_configuration(dut)
+    silent = 0
+    try:
+        for case in cases:
+            if silent == SILENT_CASES:
+                why = f"not run: the node has not come up for {SILENT_CASES} cases"
+                result = Result(case, Verdict.FAILED, why)
+            else:
+                result = run_case(dut, case)
+                silent = 0 if dut.up else silent + 1
+            results.append(result)
+            say(result)
+            problems += _put_back(dut, before)
+    finally:
+        problems += _put_back(dut, before)
+    if silent < SILENT_CASES:
+        _reset(dut)
+    return Report(tuple(results), tuple(problems), dut.eds.source)
+
+
+def run_case(dut: Dut, case: Case) -> Result:
+    """Reset the node and run one case."""
+    begun_s = time.monotonic()
+    verdict, why = Verdict.PASSED, ""
+    dut.bus.begin()
+    try:
+        dut.prepare()
+        case.run(dut)
+    except NotApplicable as reason:
+        verdict, why = Verdict.NOT_APPLICABLE, str(reason)
+    except (Failed, NodeTimeout) as failure:
+        verdict, why = Verdict.FAILED, str(failure)
+    except BusError:
+        raise
+    except (
+        Exception
+    ) as error:  # an answer that a case did not reckon with: the node's fault, not the run's end
+        verdict, why = Verdict.FAILED, f"answers that make no sense ({type(error).__name__}: {error})"
+    return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
+
+
+def _put_back(dut: Dut, before: dict[tuple[int, int], bytes]) -> list[str]:
+    if not dut.stored:
+        return []
+    dut.stored = False
+    try:
+        dut.prepare()
+        return write_back(dut, before)
+    except (Failed, NodeTimeout) as failure:
+        return [f"the configuration could not be put back: {failure}"]
+
+
+def _reset(dut: Dut) -> None:
+    try:
+        dut.prepare()
+    except NodeTimeout:
+        return

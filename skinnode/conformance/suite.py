@@ -1,0 +1,28 @@
+"""All cases in their order, and how to choose among them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from skinnode.conformance.case import Case
+from skinnode.conformance.cases import AREAS
+from skinnode.errors import ConfigError
+
+CASES: Final[tuple[Case, ...]] = tuple(
+    item for area in AREAS for item in vars(area).values() if isinstance(item, Case)
+)
+"""127 in the order of the plan they can be held against."""
+
+
+def select(names: Sequence[str]) -> tuple[Case, ...]:
+    """The cases of the areas and ids named, in their own order; all for no names. Raises ConfigError for a
+    name that is neither."""
+    if not names:
+        return CASES
+    wanted = {name.strip().upper() for name in names if name.strip()}
+    known = {case.id for case in CASES} | {case.area for case in CASES}
+    for name in sorted(wanted - known):
+        areas = ", ".join(dict.fromkeys(case.area for case in CASES))
+        raise ConfigError("--only", name, f"an area ({areas}) or a case such as SDO-07")
+    return tuple(case for case in CASES if case.id in wanted or case.area in wanted)

@@ -1,0 +1,53 @@
+"""A patch on a virtual bus, and the tester beside it."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from skinnode.conformance import Dut, connect
+from skinnode.model.config import BusConfig
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.node import NodeRunner, PatchNode
+from skinnode.transport import CanPort
+
+NODE_ID = 4
+
+
+class Source:
+    """A patch at rest."""
+
+    def __init__(self, layout: PatchLayout) -> None:
+        self._ohm = resistance_ohm(layout, layout.upper_m)
+
+    def read(self, t_ns: int) -> Float:
+        return self._ohm
+
+
+@contextmanager
+def patch_on(channel: str, wrap: Callable[[CanPort], CanPort] = lambda port: port) -> Iterator[PatchNode]:
+    """A running patch of 2 × 6 wires; ``wrap`` may stand between it and its bus."""
+    layout = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=6)
+    with CanPort(BusConfig(channel=channel)) as bare:
+        port = wrap(bare)
+        node = PatchNode(NODE_ID, layout, Source(layout), send=port.send)
+        with NodeRunner(port, [node]):
+            yield node
+
+
+@contextmanager
+def bench_on(channel: str) -> Iterator[Dut]:
+    """The tester, connected to the patch."""
+    with CanPort(BusConfig(channel=channel)) as port:
+        yield connect(port, NODE_ID)
+
+
+@pytest.fixture(scope="session")
+def dut() -> Iterator[Dut]:
+    channel = f"conformance-{uuid.uuid4().hex[:8]}"
+    with patch_on(channel), bench_on(channel) as found:
+        yield found

@@ -1,5 +1,5 @@
-"""One endpoint on a CAN bus, whatever the interface. With :mod:`skinnode.transport.receiver` the only user of
-python-can at run time: everything it raises leaves here as one line of :class:`~skinnode.errors.BusError`.
+"""One endpoint on a CAN bus, whatever the interface. The only user of python-can at run time: everything it
+raises leaves here as one line of :class:`~skinnode.errors.BusError`.
 
 Times are of the host's monotonic clock. Where the interface stamps frames with the wall clock (virtual,
 udp_multicast, socketcan) the age of the stamp is kept, so that a frame that waited in a queue is not dated
@@ -8,6 +8,7 @@ late.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import socket
@@ -15,11 +16,13 @@ import threading
 import time
 import uuid
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import can
 
 from skinnode.errors import BusError
+from skinnode.transport.frame import Frame
+from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader
 
 if TYPE_CHECKING:
     from skinnode.model.config import BusConfig
@@ -40,6 +43,7 @@ _OLDEST_STAMP_S: Final = 10.0
 """A stamp older than this, or of the future, is not of this machine's wall clock: the time of reading
 counts."""
 
+_SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
@@ -47,18 +51,6 @@ _VIRTUAL: Final = "virtual"
 # python-can's loggers warn on stderr where a program has set up no logging, also of what BusError says
 # already.
 logging.getLogger("can").addHandler(logging.NullHandler())
-
-
-class Frame(NamedTuple):
-    """A frame off the bus. ``t_ns`` is monotonic; ``data`` is empty for a remote frame."""
-
-    can_id: int
-    data: bytes
-    t_ns: int
-    remote: bool = False
-    error: bool = False
-    extended: bool = False
-    fd: bool = False
 
 
 class _Message(can.Message):
@@ -100,6 +92,7 @@ class CanPort:
         self._counting = threading.Lock()  # sent is counted by several threads; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
         self._bus = self._open()
+        self._reader = self._socket_reader() if config.interface == _SOCKETCAN else None
         # Frames sent to a multicast group come back, and every member has the same address and port. The one
         # field that tells them apart is the channel, which python-can sends along and nobody reads.
         self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
@@ -124,9 +117,13 @@ class CanPort:
             raise BusError(
                 f"{self._where}: does not open ({_why(error)}), allowed: {_channel_hint(config)}"
             ) from error
-        if config.interface in (_MULTICAST, "socketcan"):
+        if config.interface in (_MULTICAST, _SOCKETCAN):
             _tune_socket(bus.fileno())
         return bus
+
+    def _socket_reader(self) -> SocketReader:
+        bus: Any = self._bus  # python-can's SocketcanBus
+        return SocketReader(bus.socket)
 
     @property
     def sent(self) -> int:
@@ -152,6 +149,11 @@ class CanPort:
     def malformed(self) -> int:
         """Packets of the multicast group that were no CAN frame."""
         return self._malformed
+
+    @property
+    def dropped(self) -> int:
+        """Frames that the kernel had no room for; 0 on interfaces other than socketcan, which do not tell."""
+        return 0 if self._reader is None else self._reader.dropped
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a classic frame with an 11-bit identifier. ``data`` is up to 8 bytes.
@@ -183,15 +185,32 @@ class CanPort:
     def recv(self, timeout_s: float) -> Frame | None:
         """The next frame, or None after ``timeout_s``. Raises BusError if the interface fails or is
         closed."""
+        batch = self.recv_batch(timeout_s, 1)
+        return batch[0] if batch else None
+
+    def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
+        """Frames that wait, at most ``most``, and on interfaces other than socketcan one; waits up to
+        ``timeout_s`` for the first. Raises BusError if the interface fails or is closed."""
+        if self._reader is None:
+            return self._recv_message(timeout_s)
+        try:
+            frames = self._reader.read(timeout_s, most)
+        except (OSError, ValueError) as error:  # ValueError: the socket was closed
+            self._errors += 1
+            raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
+        self._received += len(frames)
+        return frames
+
+    def _recv_message(self, timeout_s: float) -> list[Frame]:
         end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         while True:
             try:
                 message = self._bus.recv(timeout_s)
                 if message is None:
-                    return None
+                    return []
                 if self._tag is None or message.channel != self._tag:
                     self._received += 1
-                    return _frame(message)
+                    return [_frame(message)]
             except (can.CanError, OSError, ValueError) as error:
                 if self._closed or not _is_garbage(error):
                     self._errors += 1
@@ -230,10 +249,19 @@ def _tune_socket(fileno: int) -> None:
         # joined: two buses on two groups would be one.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+            _discard_waiting(duplicate)
         elif duplicate.family == socket.AF_INET6:
             duplicate.setsockopt(socket.IPPROTO_IPV6, _IPV6_MULTICAST_ALL, 0)
+            _discard_waiting(duplicate)
     finally:
         duplicate.close()
+
+
+def _discard_waiting(sock: socket.socket) -> None:
+    """Forget what came while the socket still heard other groups."""
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            sock.recv(1, socket.MSG_DONTWAIT)
 
 
 def _frame(message: can.Message) -> Frame:

@@ -10,7 +10,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from skinnode.errors import BusError
-from skinnode.transport.port import CanPort, Frame
+from skinnode.transport.frame import Frame
+from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
 """Two seconds of a full bus at 1 Mbit/s (8,000 frames/s): longer than any pause a host survives otherwise."""
@@ -42,7 +43,7 @@ class Receiver:
 
     @property
     def dropped(self) -> int:
-        """Frames that found the queue full."""
+        """Frames that found the queue full. What the kernel dropped is counted by the port."""
         return self._dropped
 
     @property
@@ -83,17 +84,15 @@ class Receiver:
         self.close()
 
     def _run(self) -> None:
-        receive, put, size = self._port.recv, self._queue.put, self._queue.qsize
+        receive, put, size = self._port.recv_batch, self._queue.put, self._queue.qsize
         stopped, capacity = self._stop.is_set, self._capacity
         try:
             while not stopped():
-                frame = receive(_POLL_S)
-                if frame is None:
-                    continue
-                if size() < capacity:
+                frames = receive(_POLL_S)
+                room = capacity - size()
+                for frame in frames[:room]:
                     put(frame)
-                else:
-                    self._dropped += 1
+                self._dropped += max(0, len(frames) - room)
         except BusError as error:
             self._error = error
             put(None)

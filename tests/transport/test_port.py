@@ -112,8 +112,9 @@ def test_time_is_that_of_arrival_not_of_reading(open_port) -> None:
 def test_clock_of_another_machine_is_not_believed(config: BusConfig, open_port, monkeypatch) -> None:
     ours, theirs = open_port(), open_port()
     ours.send(1, b"")
-    real = time.time
+    real, real_ns = time.time, time.time_ns
     monkeypatch.setattr(port_module.time, "time", lambda: real() + 1e6)
+    monkeypatch.setattr(port_module.time, "time_ns", lambda: real_ns() + 10**15)
     before_ns = time.monotonic_ns()
     assert before_ns <= receive(theirs).t_ns <= time.monotonic_ns()
 
@@ -196,6 +197,29 @@ def test_two_multicast_groups_are_two_buses(multicast_group: str) -> None:
         ours.send(1, b"")
         assert receive(theirs).can_id == 1
         assert other.recv(0.1) is None
+
+
+def test_a_port_that_opens_hears_nothing_of_a_busy_group_that_is_not_its_own(multicast_group: str) -> None:
+    """python-can joins the group before anybody can tell the kernel to hand over no other."""
+    busy = BusConfig(interface="udp_multicast", channel=multicast_group.replace("239.74.", "239.75."))
+    quiet = BusConfig(interface="udp_multicast", channel=multicast_group)
+    done = threading.Event()
+
+    def babble(port: CanPort) -> None:
+        while not done.is_set():
+            port.send(0x111, b"")
+            time.sleep(20e-6)
+
+    with CanPort(busy) as port, CanPort(busy):
+        thread = threading.Thread(target=babble, args=[port])
+        thread.start()
+        try:
+            for _ in range(40):
+                with CanPort(quiet) as ours:
+                    assert ours.recv(0.001) is None
+        finally:
+            done.set()
+            thread.join()
 
 
 def test_garbage_in_the_multicast_group_is_counted_and_skipped(multicast_group: str) -> None:

@@ -29,15 +29,17 @@ class Script:
         self.count = count
         self.played = threading.Event()
 
-    def recv(self, timeout_s: float) -> Frame | None:
+    def recv_batch(self, timeout_s: float) -> list[Frame]:
         if self.left:
-            self.left -= 1
-            return Frame(self.count - self.left - 1, b"", 0)
+            batch = min(self.left, 7)
+            self.left -= batch
+            first = self.count - self.left - batch
+            return [Frame(first + i, b"", 0) for i in range(batch)]
         self.played.set()
         if self.error is not None:
             raise self.error
         time.sleep(min(timeout_s, 0.005))
-        return None
+        return []
 
 
 def test_order_and_batches() -> None:

@@ -9,7 +9,6 @@ test does so with numbers. No frame whatever raises out of it; an error of the a
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.metadata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,11 +17,13 @@ from typing import Final, Protocol
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
-from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from skinnode.node.error_control import ErrorControl
 from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, PdoRecords, check_cob_id
+from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.node.sdo import SdoServer
+from skinnode.node.time_of_day import TimeConsumer
 from skinnode.node.tpdo import TpdoEngine
 from skinnode.wire import indices as od
 from skinnode.wire.dictionary import Object
@@ -113,9 +114,19 @@ class CanopenDevice:
         self._now_ns = 0
         self._store = ObjectStore(objects, node_id)
         self._sdo = SdoServer(self._store, self._send_sdo)
-        self._emcy = EmcyProducer(self._send_emcy)
-        self._heartbeat = HeartbeatProducer()
-        self._consumer = HeartbeatConsumer(self._store)
+        self._rejected = RejectedFrames(self._store)
+        self._emcy = EmcyProducer(self._store, send)
+        self._error_control = ErrorControl(
+            node_id,
+            self._store,
+            self._emcy,
+            self._rejected,
+            send,
+            self._now,
+            self._reload,
+            self._communication_failed,
+        )
+        self._time = TimeConsumer(self._store, self._now)
         tpdos = sum(od.TPDO1_PARAMETER <= item.index < od.TPDO1_PARAMETER + od.MAX_PDOS for item in objects)
         self._tpdos = TpdoEngine(self._store, tpdos, send, self._now, catch_up_ns)
         self._rpdo = PdoRecords(self._store, od.RPDO1_PARAMETER, od.RPDO1_MAPPING, transmits=False)
@@ -140,10 +151,16 @@ class CanopenDevice:
         self._enter(NmtState.INITIALISING, self._now_ns)
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """A classic frame with an 11-bit identifier was received. Remote frames are not answered."""
+        """A classic frame with an 11-bit identifier was received; ``data`` of a remote frame says nothing."""
+        if self.nmt_state is NmtState.INITIALISING:
+            return
+        self._now_ns = t_ns
+        if remote:
+            if can_id == od.heartbeat_cob_id(self.node_id):
+                self._error_control.on_request(self.nmt_state, t_ns)
+            return
         handler = self._handlers.get(can_id)
-        if handler is not None and not remote and self.nmt_state is not NmtState.INITIALISING:
-            self._now_ns = t_ns
+        if handler is not None:
             handler(data, t_ns)
 
     def next_deadline_ns(self) -> int | None:
@@ -152,10 +169,9 @@ class CanopenDevice:
             return None
         deadline_ns = min(
             self._tpdos.deadline_ns,
-            self._heartbeat.deadline_ns,
+            self._error_control.deadline_ns,
             self._application.deadline_ns,
             self._emcy.deadline_ns,
-            self._consumer.deadline_ns,
             self._sdo.deadline_ns,
         )
         return None if deadline_ns == NO_DEADLINE_NS else deadline_ns
@@ -165,16 +181,11 @@ class CanopenDevice:
         if self.nmt_state is NmtState.INITIALISING:
             return
         self._now_ns = t_ns
-        if self._heartbeat.beat(t_ns):
-            self._send(od.heartbeat_cob_id(self.node_id), bytes((self.nmt_state,)))
+        self._error_control.on_timer(self.nmt_state, t_ns)
         self._application.on_timer(t_ns)
         self._tpdos.on_timer(t_ns)
         self._emcy.on_timer(t_ns)
         self._sdo.on_timer(t_ns)
-        if t_ns >= self._consumer.deadline_ns:
-            for node_id in self._consumer.missed(t_ns):
-                self._emcy.happened(EmcyCode.HEARTBEAT, bytes((node_id,)), t_ns)
-            self._communication_failed(t_ns)
 
     def _now(self) -> int:
         return self._now_ns
@@ -182,7 +193,11 @@ class CanopenDevice:
     # --- states
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
-        command = parse(data, self.node_id)
+        try:
+            command = parse(data, self.node_id)
+        except ValueError:
+            self._rejected.count(Rejected.NMT)
+            return
         match command:
             case None:
                 return
@@ -196,13 +211,16 @@ class CanopenDevice:
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
         self._enter(NmtState.INITIALISING, t_ns)
         self._store.restore(*objects)
+        if objects == _EVERYTHING:
+            self._rejected.reset()
+            self._time.reset()
         self._emcy.reset()
+        self._error_control.reset()
         self._wrong_sync_length = None
         self._tpdos.restore()
         self._application.reset()
         self._reload()
-        self._reload_heartbeat()
-        self._send(od.heartbeat_cob_id(self.node_id), bytes((NmtState.INITIALISING,)))  # the boot-up message
+        self._error_control.boot_up(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
@@ -217,10 +235,11 @@ class CanopenDevice:
         elif was is NmtState.OPERATIONAL:
             self._tpdos.stop()
         self._application.enter(operational=state is NmtState.OPERATIONAL)
-        self._let_emcy_out()
+        self._emcy.allow(state.communicates, t_ns)
 
     def _communication_failed(self, t_ns: int) -> None:
-        """Error behaviour, 0x1029: 0 pre-operational, 1 nothing, 2 stopped."""
+        """Heartbeat or guarding failed, or the bus. Error behaviour, 0x1029: 0 pre-operational, 1 nothing,
+        2 stopped."""
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:
             self._enter(NmtState.STOPPED, t_ns)
@@ -230,8 +249,12 @@ class CanopenDevice:
     # --- services
 
     def _on_sdo(self, data: bytes, t_ns: int) -> None:
-        if self.nmt_state.communicates:
+        if not self.nmt_state.communicates:
+            return
+        if len(data) == 8:
             self._sdo.on_request(data, t_ns)
+        else:
+            self._rejected.count(Rejected.SDO)
 
     def _send_sdo(self, response: bytes) -> None:
         self._send(od.sdo_response_cob_id(self.node_id), response)
@@ -241,6 +264,7 @@ class CanopenDevice:
             return
         counted = self._store.integer(od.SYNC_COUNTER_OVERFLOW) > 0
         if len(data) != counted:
+            self._rejected.count(Rejected.SYNC)
             if len(data) != self._wrong_sync_length:  # once, not with every SYNC
                 self._wrong_sync_length = len(data)
                 self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(data), counted)), t_ns)
@@ -259,6 +283,7 @@ class CanopenDevice:
             return
         wanted = self._command.size
         if len(data) < wanted:
+            self._rejected.count(Rejected.RPDO)
             self._emcy.present(EmcyCode.PDO_NOT_PROCESSED, bytes((1, len(data), wanted)), t_ns)
             return
         self._emcy.over(EmcyCode.PDO_NOT_PROCESSED, t_ns)
@@ -279,12 +304,9 @@ class CanopenDevice:
                 self._store.write(index, subindex, data[at : at + size])
             at += size
 
-    def _on_heartbeat(self, node_id: int, data: bytes, t_ns: int) -> None:
-        if len(data) == 1:
-            self._consumer.on_heartbeat(node_id, t_ns)
-
-    def _send_emcy(self, message: bytes) -> None:
-        self._send(self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK, message)
+    def _on_time(self, data: bytes, t_ns: int) -> None:
+        if self.nmt_state.communicates and not self._time.on_time(data, t_ns):
+            self._rejected.count(Rejected.TIME)
 
     # --- object dictionary
 
@@ -296,47 +318,28 @@ class CanopenDevice:
 
     def _connect(self) -> None:
         store = self._store
-        store.bind(od.ERROR_REGISTER, lambda _: bytes((self._emcy.register,)))
-        store.bind(od.ERROR_FIELD, self._emcy.read_history, count=True)
-        store.guard(od.ERROR_FIELD, _only_zero)
-        store.watch(od.ERROR_FIELD, lambda _: self._emcy.clear_history())
         for index in (od.STORE, od.RESTORE):
             # Nothing is kept over a power cycle yet: 0 says so, and commands are refused as CiA 301 wants it.
             store.bind(index, lambda _: bytes(4))
             store.guard(index, _cannot_store)
         store.guard(od.COB_ID_SYNC, _guard_sync)
         store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_sync_counter)
-        store.guard(od.COB_ID_EMCY, lambda _, value: check_cob_id(value, store.integer(od.COB_ID_EMCY)))
-        for index in (od.COB_ID_SYNC, od.HEARTBEAT_CONSUMER, od.RPDO1_PARAMETER, od.RPDO1_MAPPING):
+        for index in (od.COB_ID_SYNC, od.COB_ID_TIME, od.RPDO1_PARAMETER, od.RPDO1_MAPPING):
             store.watch(index, lambda _: self._reload())
-        for index in (od.COB_ID_EMCY, od.EMCY_INHIBIT_TIME):
-            store.watch(index, lambda _: self._let_emcy_out())
-        store.watch(od.HEARTBEAT_PRODUCER, lambda _: self._reload_heartbeat())
 
     def _reload(self) -> None:
         """Listen to the COB-IDs that the object dictionary names."""
         self._command, self._pending_command = self._rpdo.read(), None
-        self._consumer.reload()
-        handlers: dict[int, Handler] = {
-            od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
-            for node_id in self._consumer.node_ids
-        }
+        handlers: dict[int, Handler] = self._error_control.handlers()
         if self._command.enabled:
             handlers[self._command.cob_id] = self._on_command
+        if self._time.cob_id is not None:
+            handlers[self._time.cob_id] = self._on_time
         # Last, so that no configuration can take the node its SYNC, SDO and NMT.
         handlers[self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
         self._handlers = handlers
-
-    def _reload_heartbeat(self) -> None:
-        self._heartbeat.set_period(self._store.integer(od.HEARTBEAT_PRODUCER), self._now_ns)
-
-    def _let_emcy_out(self) -> None:
-        disabled = self._store.integer(od.COB_ID_EMCY) & INVALID_BIT
-        self._emcy.enabled = self.nmt_state.communicates and not disabled
-        self._emcy.inhibit_ns = self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
-        self._emcy.on_timer(self._now_ns)
 
     def _guard_sync_counter(self, _: int, value: int) -> None:
         if value == 1:  # 0, or 2 to 240
@@ -349,11 +352,6 @@ def _guard_sync(_: int, value: int) -> None:
     if value & (_SYNC_PRODUCER_BIT | INVALID_BIT):  # this node only consumes SYNC; bit 31 means nothing here
         raise Refused(AbortCode.INVALID_VALUE)
     check_cob_id(value, INVALID_BIT)
-
-
-def _only_zero(_: int, value: int) -> None:
-    if value:
-        raise Refused(AbortCode.INVALID_VALUE)
 
 
 def _cannot_store(_subindex: int, _value: int) -> None:

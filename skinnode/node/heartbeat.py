@@ -1,13 +1,21 @@
-"""Heartbeats: sent by this node (0x1017) and expected from others (0x1016). CiA 301 v4.2, 7.2.8.3.2."""
+"""Heartbeats: sent by this node (0x1017) and expected from others (0x1016). CiA 301 v4.2, 7.2.8.3.2.2."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.nmt import NmtState
 from skinnode.node.od import ObjectStore
 from skinnode.wire import indices as od
+
+_LAST_NODE: Final = 127
+_BOOTED: Final = 1
+"""Second byte of an emergency's detail: the monitored node was not silent, but started anew."""
 
 
 class HeartbeatProducer:
@@ -17,10 +25,16 @@ class HeartbeatProducer:
         self.period_ns = 0
         self.deadline_ns = NO_DEADLINE_NS
 
-    def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Beat every ``period_ms``, first one period from now; 0 ends it."""
+    def boot_up(self, period_ms: int, t_ns: int) -> None:
+        """The boot-up message, sent at ``t_ns``, is the first heartbeat."""
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
+
+    def set_period(self, period_ms: int, t_ns: int) -> None:
+        """Beat every ``period_ms`` from now on, so that no consumer waits for longer than it used to; 0 ends
+        it."""
+        self.period_ns = period_ms * 1_000_000
+        self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
 
     def beat(self, t_ns: int) -> bool:
         """Whether a heartbeat is due at ``t_ns``; the next one is then planned."""
@@ -33,7 +47,7 @@ class HeartbeatProducer:
 
 
 @dataclass(slots=True)
-class _Expected:
+class _Monitored:
     node_id: int
     within_ns: int
     deadline_ns: int = NO_DEADLINE_NS
@@ -41,11 +55,14 @@ class _Expected:
 
 
 class HeartbeatConsumer:
-    """Watches the nodes of object 0x1016."""
+    """Watches the nodes of object 0x1016.
 
-    def __init__(self, store: ObjectStore) -> None:
-        self._store = store
-        self._expected: dict[int, _Expected] = {}
+    ``failed`` is called with the time when heartbeats were missed, after their EMCY.
+    """
+
+    def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
+        self._store, self._emcy, self._failed = store, emcy, failed
+        self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
         """When the next heartbeat is missed."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
@@ -53,39 +70,61 @@ class HeartbeatConsumer:
     @property
     def node_ids(self) -> list[int]:
         """Who is listened to."""
-        return list(self._expected)
+        return list(self._monitored)
 
-    def reload(self) -> None:
-        """Take over what was written to 0x1016. Monitoring begins anew."""
+    def reset(self) -> None:
+        """Take over 0x1016 as it is after a reset: nobody has been heard yet."""
+        self._monitored = {}
+        self.on_written(0)
+
+    def on_written(self, t_ns: int) -> None:
+        """Take over what was written to 0x1016: the monitoring of a changed entry begins anew."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
-        expected = [_Expected(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
-        self._expected = {item.node_id: item for item in expected if item.node_id and item.within_ns}
+        wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
+        before, self._monitored = self._monitored, {}
+        for item in wanted:
+            if 0 < item.node_id <= _LAST_NODE and item.within_ns:
+                old = before.get(item.node_id)
+                same = old is not None and old.within_ns == item.within_ns
+                self._monitored[item.node_id] = old if old is not None and same else item
+        for node_id, old in before.items():
+            if self._monitored.get(node_id) is not old:
+                self._emcy.over(EmcyCode.HEARTBEAT, t_ns, node_id)
         self._plan()
 
-    def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """A node is alive."""
-        item = self._expected.get(node_id)
-        if item is not None:
-            item.deadline_ns = t_ns + item.within_ns
-            self._plan()
-
-    def missed(self, t_ns: int) -> list[int]:
-        """Nodes whose heartbeat has just been missed. They are listened to again from their next one on."""
-        late = [item for item in self._expected.values() if t_ns >= item.deadline_ns]
-        for item in late:
-            item.deadline_ns = NO_DEADLINE_NS
+    def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
+        """A monitored node says in which state it is. A boot-up starts no monitoring, since it does not say
+        that heartbeats will follow; of a node that beat before it tells that it restarted."""
+        item = self._monitored[node_id]
+        if state == NmtState.INITIALISING:
+            if item.deadline_ns == NO_DEADLINE_NS:
+                return
+            self._emcy.happened(EmcyCode.HEARTBEAT, bytes((node_id, _BOOTED)), t_ns)
+        item.deadline_ns = t_ns + item.within_ns
+        self._emcy.over(EmcyCode.HEARTBEAT, t_ns, node_id)
         self._plan()
-        return [item.node_id for item in late]
+
+    def on_timer(self, t_ns: int) -> None:
+        """Tell whose heartbeat has just been missed: once, until it is heard again."""
+        if t_ns < self.deadline_ns:
+            return
+        for item in self._monitored.values():
+            if t_ns >= item.deadline_ns:
+                item.deadline_ns = NO_DEADLINE_NS
+                self._emcy.present(EmcyCode.HEARTBEAT, bytes((item.node_id,)), t_ns, item.node_id)
+        self._plan()
+        self._failed(t_ns)
 
     def _plan(self) -> None:
-        self.deadline_ns = min([item.deadline_ns for item in self._expected.values()], default=NO_DEADLINE_NS)
+        self.deadline_ns = min(
+            [item.deadline_ns for item in self._monitored.values()], default=NO_DEADLINE_NS
+        )
 
     def _guard(self, subindex: int, value: int) -> None:
-        if subindex == 0:
-            return
-        node_id, time_ms = value >> 16, value & 0xFFFF
-        if node_id > 127:
+        """An entry without a time, or with a node-ID that no node has, is not used."""
+        if value >> 24:
             raise Refused(AbortCode.INVALID_VALUE)
+        node_id, time_ms = value >> 16, value & 0xFFFF
         others = (i for i in range(1, od.HEARTBEAT_CONSUMERS + 1) if i != subindex)
         taken = {self._store.integer(od.HEARTBEAT_CONSUMER, i) for i in others}
         if node_id and time_ms and any(word >> 16 == node_id and word & 0xFFFF for word in taken):

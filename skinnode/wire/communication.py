@@ -48,7 +48,7 @@ def communication_objects(
 
 
 def _device_objects() -> tuple[Object, ...]:
-    no_errors = Entry(od.ERROR_FIELD, 0, "Number of errors", _U8, "rw", 0, high=od.ERROR_FIELD_LENGTH)
+    no_errors = Entry(od.ERROR_FIELD, 0, "Number of errors", _U8, "rw", 0)
     error_fields = [f"Standard error field {i}" for i in range(1, od.ERROR_FIELD_LENGTH + 1)]
     consumers = [f"Consumer heartbeat time {i}" for i in range(1, od.HEARTBEAT_CONSUMERS + 1)]
     save = [f"Save {group} parameters" for group in _GROUPS]

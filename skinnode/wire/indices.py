@@ -123,9 +123,13 @@ SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
+TIME_OF_DAY: Final = 0x2022
+TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
 """Masks of 32 wires: sub-index 2i+1 open, 2i+2 shorted, for the wires from 32 i on."""
+REJECTED_FRAMES: Final = 0x2040
+"""Counters: see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
 """+ r: the last codes of upper wire r, one sub-index a column."""
 BASELINE: Final = 0x2200

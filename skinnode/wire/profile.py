@@ -195,6 +195,22 @@ def _acquisition_record() -> Object:
     )
 
 
+def _time_record() -> Object:
+    return record(
+        od.TIME_OF_DAY,
+        "Time of day",
+        (
+            Entry(od.TIME_OF_DAY, od.TIME_DAYS, "Days since 1984-01-01", _U16, "ro", 0, mappable=True),
+            Entry(od.TIME_OF_DAY, od.TIME_MS, "Milliseconds after midnight", _U32, "ro", 0, mappable=True),
+            Entry(od.TIME_OF_DAY, od.TIME_MESSAGES, "TIME messages", _U32, "ro", 0),
+            Entry(od.TIME_OF_DAY, od.TIME_DEVICE_US, "Device time us of the last TIME", _U32, "ro", 0),
+        ),
+    )
+
+
+_REJECTED = ("NMT", "SYNC", "TIME", "Heartbeat", "SDO", "RPDO", "Error control of the own node-ID")
+
+
 def _wire_faults(index: int, name: str, wires: int) -> Object:
     labels = [f"{kind} from wire {first}" for first in range(0, wires, 32) for kind in ("Open", "Shorted")]
     return array(index, name, labels, _U32, "ro", 0)
@@ -231,8 +247,10 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
         _summary_record(),
         _send_policy_record(),
         _acquisition_record(),
+        _time_record(),
         _wire_faults(od.UPPER_WIRE_FAULTS, "Faults of upper wires", profile.rows),
         _wire_faults(od.LOWER_WIRE_FAULTS, "Faults of lower wires", profile.columns),
+        array(od.REJECTED_FRAMES, "Rejected frames", _REJECTED, _U32, "ro", 0),
         *(
             array(od.CODES + r, f"Codes of upper wire {r}", columns, profile.code_type, "ro", 0)
             for r in range(profile.rows)

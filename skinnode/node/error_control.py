@@ -1,0 +1,98 @@
+"""Error control of a node: boot-up, heartbeat, guarding, heartbeats of others (CiA 301 v4.2, 7.2.8.3).
+
+A node beats or is guarded, never both: with a producer heartbeat time (0x1017) guarding is not served.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+from skinnode.node.clock import Clock
+from skinnode.node.emcy import EmcyProducer
+from skinnode.node.guarding import Guarding
+from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from skinnode.node.nmt import NmtState
+from skinnode.node.od import ObjectStore
+from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.wire import indices as od
+
+Handler = Callable[[bytes, int], None]
+
+
+class ErrorControl:
+    """``send`` takes COB-ID and payload; ``now`` is the time of the event being handled; ``listen`` is called
+    when :meth:`handlers` has changed, ``failed`` with the time of a heartbeat or life guarding event."""
+
+    def __init__(
+        self,
+        node_id: int,
+        store: ObjectStore,
+        emcy: EmcyProducer,
+        rejected: RejectedFrames,
+        send: Callable[[int, bytes], None],
+        now: Clock,
+        listen: Callable[[], None],
+        failed: Callable[[int], None],
+    ) -> None:
+        self._cob_id = od.heartbeat_cob_id(node_id)
+        self._store, self._rejected, self._send, self._now = store, rejected, send, now
+        self._listen = listen
+        self._producer = HeartbeatProducer()
+        self._guarding = Guarding(store, emcy, failed)
+        self._consumer = HeartbeatConsumer(store, emcy, failed)
+        store.watch(od.HEARTBEAT_PRODUCER, lambda _: self._on_period())
+        store.watch(od.HEARTBEAT_CONSUMER, lambda _: self._on_consumers())
+        for index in (od.GUARD_TIME, od.LIFE_TIME_FACTOR):
+            store.watch(index, lambda _: self._guarding.on_written(now()))
+
+    @property
+    def deadline_ns(self) -> int:
+        """When :meth:`on_timer` has something to do."""
+        return min(self._producer.deadline_ns, self._guarding.deadline_ns, self._consumer.deadline_ns)
+
+    def handlers(self) -> dict[int, Handler]:
+        """What is listened to: data frames by COB-ID."""
+        handlers: dict[int, Handler] = {
+            od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
+            for node_id in self._consumer.node_ids
+        }
+        handlers[self._cob_id] = lambda _data, _t_ns: self._rejected.count(Rejected.OWN_ERROR_CONTROL)
+        return handlers
+
+    def reset(self) -> None:
+        """The node is being reset: nobody guards it, and nobody has been heard."""
+        self._guarding.reset()
+        self._consumer.reset()
+
+    def boot_up(self, t_ns: int) -> None:
+        """Tell that the node is there; heartbeats follow if 0x1017 says so."""
+        self._producer.boot_up(self._store.integer(od.HEARTBEAT_PRODUCER), t_ns)
+        self._send(self._cob_id, bytes((NmtState.INITIALISING,)))
+
+    def on_request(self, state: NmtState, t_ns: int) -> None:
+        """A remote frame asked for the state."""
+        if not self._producer.period_ns:
+            self._send(self._cob_id, self._guarding.answer(state, t_ns))
+
+    def on_timer(self, state: NmtState, t_ns: int) -> None:
+        """Do what is due."""
+        if self._producer.beat(t_ns):
+            self._send(self._cob_id, bytes((state,)))
+        self._guarding.on_timer(t_ns)
+        self._consumer.on_timer(t_ns)
+
+    def _on_period(self) -> None:
+        self._producer.set_period(self._store.integer(od.HEARTBEAT_PRODUCER), self._now())
+        if self._producer.period_ns:
+            self._guarding.end(self._now())
+
+    def _on_consumers(self) -> None:
+        self._consumer.on_written(self._now())
+        self._listen()
+
+    def _on_heartbeat(self, node_id: int, data: bytes, t_ns: int) -> None:
+        if len(data) == 1:
+            self._consumer.on_heartbeat(node_id, data[0], t_ns)
+        else:
+            self._rejected.count(Rejected.HEARTBEAT)

@@ -1,0 +1,144 @@
+"""NMT and boot-up: what a manager sees of a node (CiA 301 v4.2, 7.2.8 and 7.3.2), frames by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from skinnode.node import NmtState, PatchNode
+
+
+def test_boot_up_is_one_zero_byte(make: Callable) -> None:
+    desk = make()
+    desk.node.power_off()
+    desk.power_on()
+    assert desk.take() == [(0x704, "00")]
+    assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+
+
+def test_silent_before_power_on_and_after_power_off(layout) -> None:
+    sent: list[int] = []
+    node = PatchNode(4, layout, _Flat(layout), send=lambda can_id, _: sent.append(can_id))
+    node.on_frame(0x604, bytes.fromhex("4000100000000000"), 0)
+    node.on_timer(10)
+    assert sent == []
+    assert node.next_deadline_ns() is None
+    node.power_on(20)
+    node.on_frame(0x604, bytes.fromhex("2b17100001000000"), 20)
+    node.power_off()
+    del sent[:]
+    node.on_frame(0x604, bytes.fromhex("4000100000000000"), 30)
+    node.on_frame(0x000, bytes((1, 0)), 30)
+    node.on_timer(10_000_000)
+    assert sent == []
+    assert node.next_deadline_ns() is None
+
+
+@pytest.mark.parametrize("address", ["00", "04"])
+def test_transitions(desk, address: str) -> None:
+    for command, state in (
+        ("01", NmtState.OPERATIONAL),
+        ("02", NmtState.STOPPED),
+        ("80", NmtState.PRE_OPERATIONAL),
+        ("02", NmtState.STOPPED),
+        ("01", NmtState.OPERATIONAL),
+        ("80", NmtState.PRE_OPERATIONAL),
+    ):
+        assert desk.frame(0, f"{command} {address}") == []
+        assert desk.node.nmt_state is state
+
+
+@pytest.mark.parametrize("data", ["", "01", "01 05", "01 04 00", "03 04", "ff 00", "01 00 00 00 00 00 00 00"])
+def test_frames_that_are_no_command_of_ours(desk, data: str) -> None:
+    assert desk.frame(0, data) == []
+    assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+
+
+def test_stopped_serves_nothing_but_nmt_and_heartbeat(operational) -> None:
+    desk = operational
+    desk.write(0x1017, 0, 10, 2)
+    desk.frame(0, "02 00")
+    assert desk.frame(0x604, "40 00 10 00 00 00 00 00") == []
+    assert desk.frame(0x80, "01") == []
+    desk.run(15)
+    assert desk.take() == [(0x704, "04")] * 2
+    desk.frame(0, "01 00")
+    assert desk.sdo("40 00 10 00 00 00 00 00") == "43 00 10 00 00 00 00 00"
+
+
+def test_stopping_ends_a_transfer(desk) -> None:
+    desk.sdo("40 08 10 00 00 00 00 00")
+    desk.frame(0, "02 00")
+    desk.frame(0, "80 00")
+    assert desk.sdo("60 00 00 00 00 00 00 00").startswith("80")
+
+
+def test_pre_operational_takes_no_scan(desk) -> None:
+    reads = desk.source.reads
+    assert desk.frame(0x80) == []
+    desk.run(500)
+    assert desk.take() == []
+    assert desk.source.reads == reads
+
+
+def test_reset_communication_keeps_the_application(operational) -> None:
+    desk = operational
+    desk.write(0x2020, 2, 77, 2)
+    desk.write(0x1017, 0, 10, 2)
+    assert desk.frame(0, "82 04") == [(0x704, "00")]
+    assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+    assert desk.read(0x1017, 0) == 0
+    assert desk.read(0x1019, 0) == 0
+    assert desk.read(0x1018, 2) == 0x534B494E
+    assert desk.read(0x2020, 2) == 77
+    desk.run(100)
+    assert desk.take() == []
+
+
+def test_reset_communication_restores_the_pdos(operational) -> None:
+    desk = operational
+    desk.write(0x1800, 1, 0x80000184, 4)
+    desk.write(0x1801, 1, 0x80000284, 4)
+    desk.write(0x1801, 1, 0x2C4, 4)
+    desk.write(0x1005, 0, 0x90, 4)
+    desk.frame(0, "82 00")
+    desk.start()
+    desk.node.on_frame(0x80, b"", desk.t_ns)
+    desk.run(20)
+    assert [can_id for can_id, _ in desk.take()] == [0x184] * 4 + [0x284]
+
+
+def test_reset_node_resets_the_application_but_not_the_baseline(operational) -> None:
+    desk = operational
+    desk.write(0x2020, 2, 77, 2)
+    desk.write(0x2200, 1, 0x447A0000, 4)  # 1000 ohm
+    assert desk.frame(0, "81 00") == [(0x704, "00")]
+    assert desk.read(0x2020, 2) == 2
+    assert desk.read(0x2200, 1) == 0x447A0000
+    assert desk.read(0x2000, 10) == desk.layout.layout_hash
+
+
+class _Flat:
+    def __init__(self, layout) -> None:
+        self.ohm = np.full(layout.shape, 1000.0)
+
+    def read(self, t_ns: int) -> np.ndarray:
+        return self.ohm
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"node_id": 0}, "node_id: got 0, must be 1 to 127"),
+        ({"node_id": 128}, "node_id: got 128, must be 1 to 127"),
+        ({"serial": 1 << 32}, "serial: got 4294967296"),
+        ({"baseline_ohm": np.ones((6, 2))}, r"baseline_ohm: got shape \(6, 2\), must be \(2, 6\)"),
+        ({"baseline_ohm": -np.ones((2, 6))}, "baseline_ohm: got -1.0, must not be negative"),
+    ],
+)
+def test_arguments_out_of_range(layout, options: dict, message: str) -> None:
+    options = {"node_id": 4, **options}
+    with pytest.raises(ValueError, match=message):
+        PatchNode(options.pop("node_id"), layout, _Flat(layout), send=lambda *_: None, **options)

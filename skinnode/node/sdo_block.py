@@ -1,8 +1,8 @@
 """SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
 
-CAN may deliver a frame twice, when the very last bit of its end is disturbed, and nothing in a block says to
-which one it belongs. A frame that equals the one before it, where the protocol knows no reason for another,
-is therefore taken for the same one.
+CAN delivers a frame twice when the very last bit of its end is disturbed (ISO 11898-1), and nothing in a
+frame says which block it belongs to: an acknowledgement taken for one of the next block would leave segments
+out. A frame that equals the one before is therefore ignored, where the protocol knows no reason for another.
 """
 
 from __future__ import annotations
@@ -25,9 +25,14 @@ SEGMENT_NS: Final = 500_000
 250 kbit/s carries, so that the node's PDOs, in the same queue, do not wait behind hundreds of segments; a
 block takes 64 ms, where clients wait 300 ms (canopen library) and longer for it. Doubled for the rest of a
 transfer whenever the bus takes no more."""
+SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
+"""A quarter of 125 kbit/s: what keeps the bus from taking more than that has nothing to do with the pace."""
 SEGMENTS_AT_ONCE: Final = 6
 """Most segments sent in one turn, to make up for a thread that wakes late (2 ms by default): little more than
 half of the queue of a Linux CAN interface, which is 10 frames long."""
+TWICE_NS: Final = 3_000_000
+"""Two of the longest frames at 125 kbit/s and the error frame between: how far apart one frame that is
+delivered twice can be. A client that means its second acknowledgement has seen more segments since."""
 
 _LAST: Final = 0x80
 _SEQUENCE: Final = 0x7F
@@ -76,7 +81,7 @@ class BlockUpload(Transfer):
         self._sent = 0  # segments of the present block
         self._pace_ns = SEGMENT_NS
         self._waits_for = _Upload.START
-        self._previous = b""
+        self._previous, self._previous_ns = b"", t_ns
         # A CRC is agreed on where both sides offer it. Clients are known that expect one, not asked for,
         # from a server that says it could.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, index, subindex, len(data)))
@@ -85,9 +90,10 @@ class BlockUpload(Transfer):
         return request[0] >> 5 == 5 and request[0] & 3 != 0
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        if request == self._previous and self._waits_for is not _Upload.ACKNOWLEDGEMENT:
+        twice = request == self._previous and t_ns - self._previous_ns < TWICE_NS
+        if twice and self._waits_for is not _Upload.ACKNOWLEDGEMENT:
             return False
-        self._previous = request
+        self._previous, self._previous_ns = request, t_ns
         match request[0] & 3, self._waits_for:
             case _Client.START, _Upload.START:
                 self._start_block(t_ns)
@@ -123,7 +129,7 @@ class BlockUpload(Transfer):
         try:
             self._channel.send(bytes((head,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
         except BusError:  # the segment has not gone and is sent again
-            self._pace_ns *= 2
+            self._pace_ns = min(2 * self._pace_ns, SLOWEST_SEGMENT_NS)
             raise
         self._sent += 1
         if last or self._sent == self._block_size:
@@ -165,15 +171,15 @@ class BlockDownload(Transfer):
 
     def wants(self, request: bytes) -> bool:
         """Whatever comes while blocks do is a segment."""
-        return self._last is None or request[0] & 0xE3 == 0xC1 or request == self._previous
+        return self._last is None or _is_end(request) or request == self._previous
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
+        if self._last is not None and _is_end(request):  # the last segment may look the same
+            self._end(request, self._last)
+            return True
         if request == self._previous:
             return False
         self._previous = b""
-        if self._last is not None:
-            self._end(request, self._last)
-            return True
         number, last = request[0] & _SEQUENCE, request[0] & _LAST
         if number == 0:
             raise Refused(AbortCode.INVALID_SEQUENCE)
@@ -198,6 +204,10 @@ class BlockDownload(Transfer):
             raise Refused(AbortCode.CRC)
         self._incoming.store()
         self._channel.send(b"\xa1".ljust(8, b"\0"))
+
+
+def _is_end(request: bytes) -> bool:
+    return request[0] & 0xE3 == 0xC1
 
 
 def _checked(block_size: int) -> int:

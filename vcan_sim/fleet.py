@@ -48,7 +48,11 @@ class Fleet:
     def __init__(self, hand: HandConfig, *, interface: str | None = None, channel: str | None = None) -> None:
         self.hand = hand.on(interface, channel)
         self._stations = {
-            patch.name: _Station(patch, SimulatedPatch(Scene(patch.layout.build(), hand.simulation, number)))
+            patch.name: _Station(
+                patch,
+                PatchProfile.from_config(patch, hand.bus(patch.bus)),
+                SimulatedPatch(Scene(patch.layout.build(), hand.simulation, number)),
+            )
             for number, patch in enumerate(hand.patches)
         }
         self._runners: list[NodeRunner] = []
@@ -111,8 +115,9 @@ class Fleet:
 class _Station:
     """A node, its analogue front end, and a count of what it sends."""
 
-    def __init__(self, config: PatchConfig, source: SimulatedPatch) -> None:
+    def __init__(self, config: PatchConfig, profile: PatchProfile, source: SimulatedPatch) -> None:
         self.source = source
+        self._profile = profile
         self._config = config
         self._node: PatchNode | None = None
         self._frames = self._pdos = 0
@@ -135,7 +140,7 @@ class _Station:
             source,
             send=counted,
             serial=config.node_id if config.serial is None else config.serial,
-            profile=PatchProfile.from_layout(source.scene.layout, config.code_bits),
+            profile=self._profile,
         )
         self._node = node
         return node

@@ -55,8 +55,16 @@ def _own_eds(sdo: SdoClient) -> Eds:
     try:
         product = sdo.integer(od.IDENTITY, od.IDENTITY_PRODUCT)
         if product == od.PRODUCT_CODE:
-            sizes = (od.ROWS, od.COLUMNS, od.UPPER_ELECTRODES, od.LOWER_ELECTRODES, od.CODE_BITS)
-            patch = PatchProfile(*(sdo.integer(od.DESCRIPTOR, size) for size in sizes))
+            sizes = (
+                od.ROWS,
+                od.COLUMNS,
+                od.UPPER_ELECTRODES,
+                od.LOWER_ELECTRODES,
+                od.CODE_BITS,
+                od.PDO_BYTES,
+            )
+            rows, columns, upper, lower, bits, pdo_bytes = (sdo.integer(od.DESCRIPTOR, sub) for sub in sizes)
+            patch = PatchProfile(rows, columns, upper, lower, bits, bus="classic" if pdo_bytes == 8 else "fd")
             return parse_eds(eds_text(patch), f"{eds_name(patch)}, generated")
     except Failed as failure:
         raise ConfigError(

@@ -69,13 +69,14 @@ class Bringer:
     abandoned: Callable[[], bool]
     on_answer: Callable[[PatchConfig], None]
 
-    def bring_up(self, patch: PatchConfig, layout: PatchLayout, remote: RemoteOd) -> NodeFacts:
+    def bring_up(
+        self, patch: PatchConfig, layout: PatchLayout, profile: PatchProfile, remote: RemoteOd
+    ) -> NodeFacts:
         """Wait for the node, check who it is, configure it; it ends up pre-operational.
 
         Raises NodeTimeout where it does not answer in time, NodeError where it is not the patch of the file
         or does not keep its configuration, SdoAbort where it refuses.
         """
-        profile = PatchProfile.from_layout(layout, patch.code_bits)
         self._wait_for(patch, remote)
         self.on_answer(patch)
         serial = self._identify(patch, remote)
@@ -131,6 +132,7 @@ class Bringer:
             (od.UPPER_ELECTRODES, "electrodes of an upper wire", profile.upper_electrodes),
             (od.LOWER_ELECTRODES, "electrodes of a lower wire", profile.lower_electrodes),
             (od.CODE_BITS, "code bits", profile.code_bits),
+            (od.PDO_BYTES, "bytes of a PDO", profile.pdo_bytes),
         ):
             got = remote.read(od.DESCRIPTOR, subindex, "u8")
             if got != wanted:

@@ -137,7 +137,7 @@ class Host:
         hand = hand.on(interface, channel)
         for patch in hand.patches:
             if patch.eds is not None:
-                check_eds(patch.eds, PatchProfile.from_layout(patch.layout.build(), patch.code_bits))
+                check_eds(patch.eds, PatchProfile.from_config(patch, hand.bus(patch.bus)))
         names = tuple(patch.name for patch in hand.patches)
         publisher = Publisher(names)
         with contextlib.ExitStack() as stack:
@@ -268,7 +268,8 @@ def _bring_up(
     def bring_up(patch: PatchConfig) -> NodeFacts:
         link = links[patch.bus]
         bringer = Bringer(link.send, hand.sync, boot_deadline_s, abandoned, answered.append)
-        return bringer.bring_up(patch, patch.layout.build(), link.remote_od(patch.node_id))
+        profile, remote = PatchProfile.from_config(patch, hand.bus(patch.bus)), link.remote_od(patch.node_id)
+        return bringer.bring_up(patch, patch.layout.build(), profile, remote)
 
     with ThreadPoolExecutor(min(len(hand.patches), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
         try:

@@ -41,7 +41,7 @@ class BusStats:
     foreign: int
     """Data frames of a COB-ID that the hand file does not explain."""
     ignored: int
-    """Remote, error, extended and CAN FD frames."""
+    """Remote, error and extended frames; on a bus without ``fd`` also CAN FD frames."""
     dropped: int
     """Frames that found the receive queue full."""
     malformed: int
@@ -69,7 +69,7 @@ class BusLink:
         self._pollers: tuple[Callable[[int], None], ...] = ()
         self._complained: set[int] = set()
         self._foreign = self._ignored = self._malformed = self._received = 0
-        self._meter = BusLoad(config.bitrate_bps)
+        self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._marks: deque[tuple[int, int]] = deque([(time.monotonic_ns(), 0)], maxlen=_MARKS)
         self._load = 0.0
@@ -161,11 +161,11 @@ class BusLink:
         """One batch of frames to their handlers."""
         batch = self._receiver.get_batch(_WAIT_S)
         for frame in batch:
-            if frame.remote or frame.error or frame.extended or frame.fd:
+            if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
                 self._ignored += 1
                 continue
             self._received += 1
-            self._meter.add(frame.can_id, frame.data)
+            self._meter.add(frame.can_id, frame.data, fd=frame.fd)
             handler = self._handlers.get(frame.can_id)
             if handler is None:
                 self._foreign += 1

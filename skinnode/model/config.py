@@ -82,6 +82,12 @@ class BusConfig(_Table):
         Field(ge=10_000, le=1_000_000),
         _Allowed("an integer from 10000 to 1000000, as classic CAN has it"),
     ] = 1_000_000
+    fd: bool = False
+    """PDOs of the patches on this bus travel in CAN FD frames with bit-rate switch."""
+    data_bitrate_bps: Annotated[
+        int, Field(ge=10_000, le=8_000_000), _Allowed("an integer from 10000 to 8000000")
+    ] = 5_000_000
+    """Of CAN FD frames, from ESI to the CRC delimiter."""
 
 
 class LayoutConfig(_Table):
@@ -145,11 +151,13 @@ class PatchConfig(_Table):
             raise ValueError(f"the path of an EDS file; there is no file {path}")
         return path
 
-    @property
-    def frames_per_scan(self) -> int:
-        """Chunks of a full scan (3 codes of 16 bits or 2 of 24 in one) and the summary."""
-        codes_per_chunk = 3 if self.code_bits == 16 else 2
-        return -(-self.layout.n_codes // codes_per_chunk) + 1
+    def chunks_per_scan(self, *, fd: bool) -> int:
+        """Frames of a full scan without the summary: 3 codes of 16 bits or 2 of 24 in one, over CAN FD up to
+        30 or 20 of one upper wire."""
+        if not fd:
+            return -(-self.layout.n_codes // (3 if self.code_bits == 16 else 2))
+        rows = self.layout.upper_wires
+        return rows * -(-self.layout.n_codes // rows // (30 if self.code_bits == 16 else 20))
 
 
 class SyncConfig(_Table):
@@ -244,9 +252,13 @@ class HandConfig(_Table):
 
     def bus_load(self, name: str) -> float:
         """Load of the bus if every frame of every scan is sent and takes as long as it can, 1 is full."""
-        frames = sum(patch.frames_per_scan for patch in self.patches_on(name))
-        bits = frames * _worst_case_bits(8) + _worst_case_bits(1)  # and the SYNC with its counter
-        return bits / (self.sync.period_s * self.bus(name).bitrate_bps)
+        bus, patches = self.bus(name), self.patches_on(name)
+        chunk_s = _longest_fd_frame_s(bus) if bus.fd else _worst_case_bits(8) / bus.bitrate_bps
+        chunks = sum(patch.chunks_per_scan(fd=bus.fd) for patch in patches)
+        rest = len(patches) * _worst_case_bits(8) + _worst_case_bits(
+            1
+        )  # summaries, the SYNC with its counter
+        return (chunks * chunk_s + rest / bus.bitrate_bps) / self.sync.period_s
 
     @model_validator(mode="after")
     def _cross_checks(self) -> HandConfig:
@@ -257,7 +269,7 @@ class HandConfig(_Table):
         for i, patch in enumerate(self.patches):
             if patch.bus not in names:
                 raise ConfigError(f"patches[{i}].bus", patch.bus, f"a bus of this file: {', '.join(names)}")
-            if patch.frames_per_scan > 257:  # the chunk index is a byte
+            if not self.bus(patch.bus).fd and patch.chunks_per_scan(fd=False) > 256:  # their index is a byte
                 most = 256 * (3 if patch.code_bits == 16 else 2)
                 allowed = f"at most {most} wire pairs at {patch.code_bits} bits"
                 raise ConfigError(f"patches[{i}].layout", patch.layout.n_codes, allowed)
@@ -315,6 +327,13 @@ def _worst_case_bits(length: int) -> int:
     inter-frame space (Davis et al. 2007, eq. 1)."""
     stuffed = 34 + 8 * length
     return stuffed + 13 + (stuffed - 1) // 4
+
+
+def _longest_fd_frame_s(bus: BusConfig) -> float:
+    """The same of a CAN FD frame of 64 bytes: 29 bits and 3 stuff bits at the nominal bit rate; at that of
+    the data 5 + 512 bits before the CRC field, 33 in it and after, and a stuff bit in 4 of the data (ISO
+    11898-1:2015)."""
+    return (29 + 3) / bus.bitrate_bps + (5 + 512 + 33 + 128) / bus.data_bitrate_bps
 
 
 def _require_unique(table: str, key: str, values: Iterable[object]) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
 from skinnode.node.source import ResistanceSource
-from skinnode.wire.codec import Codes, CodeScale, encode
+from skinnode.wire.codec import Codes, CodeScale, chunk_of_code, encode
 from skinnode.wire.profile import PatchProfile
 
 TARE_READS: Final = 16
@@ -119,12 +119,10 @@ class Acquisition:
         steps = self.scale.steps
         moved = np.abs(self.codes.astype(np.int64) - self._sent) > threshold
         moved |= ((self.codes > steps) | (self._sent > steps)) & (self.codes != self._sent)
-        per_chunk = self._profile.codes_per_chunk
-        padded = np.zeros(self._profile.n_chunks * per_chunk, dtype=np.bool_)
-        padded[: moved.size] = moved.ravel()
-        chunks = padded.reshape(-1, per_chunk).any(axis=1)
-        sent = np.repeat(chunks, per_chunk)[: moved.size].reshape(moved.shape)
-        self._sent = np.where(sent, self.codes, self._sent)
+        places = chunk_of_code(self._profile)
+        chunks = np.zeros(self._profile.n_chunks, dtype=np.bool_)
+        chunks[places[moved]] = True
+        self._sent = np.where(chunks[places], self.codes, self._sent)
         return [int(index) for index in np.flatnonzero(chunks)]
 
 

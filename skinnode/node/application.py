@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Final
 
 import numpy as np
 
@@ -18,18 +17,12 @@ from skinnode.node.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.device import Services
 from skinnode.node.emcy import EmcyCode
+from skinnode.node.od import ObjectStore
 from skinnode.node.tpdo import OutgoingScan
 from skinnode.wire import indices as od
 from skinnode.wire.codec import SendMode, SummaryFlag, pack_scan
 from skinnode.wire.coordinates import pack_coordinates
 from skinnode.wire.profile import PatchProfile
-
-_SUMMARY_FIELDS: Final = {
-    od.SUMMARY_SCAN: slice(0, 1),
-    od.SUMMARY_FLAGS: slice(1, 2),
-    od.SUMMARY_CHUNKS: slice(2, 4),
-    od.SUMMARY_TIME: slice(4, 8),
-}
 
 
 class PatchApplication:
@@ -154,8 +147,9 @@ class PatchApplication:
 
     def _connect(self) -> None:
         store, acquisition, tpdos = self._store, self._acquisition, self._tpdos
-        store.bind(od.CHUNK, self._read_chunk)
-        store.bind(od.SUMMARY, lambda sub: tpdos.summary[_SUMMARY_FIELDS[sub]])
+        chunk, summary = _fields(store, od.CHUNK), _fields(store, od.SUMMARY)
+        store.bind(od.CHUNK, lambda sub: tpdos.chunk[chunk[sub]])
+        store.bind(od.SUMMARY, lambda sub: tpdos.summary[summary[sub]])
         store.watch(od.SEND_POLICY, lambda _: acquisition.forget_sent())
         store.guard(od.ACQUISITION, self._guard_acquisition)
         store.watch(od.ACQUISITION, self._on_acquisition)
@@ -220,12 +214,15 @@ class PatchApplication:
         runs = self._operational and self._period_ns
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
-    def _read_chunk(self, subindex: int) -> bytes:
-        chunk, width = self._tpdos.chunk, self._profile.code_bits // 8
-        if subindex < od.CHUNK_FIRST_CODE:
-            return chunk[subindex - 1 : subindex]
-        at = 2 + (subindex - od.CHUNK_FIRST_CODE) * width
-        return chunk[at : at + width]
+
+def _fields(store: ObjectStore, index: int) -> dict[int, slice]:
+    """Where the sub-objects of a record stand in the payload that carries it whole."""
+    fields, at = {}, 0
+    for subindex in range(1, store.integer(index) + 1):
+        size = store.find(index, subindex).data_type.bits // 8
+        fields[subindex] = slice(at, at + size)
+        at += size
+    return fields
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:

@@ -27,6 +27,7 @@ from skinnode.node.time_of_day import TimeConsumer
 from skinnode.node.tpdo import TpdoEngine
 from skinnode.wire import indices as od
 from skinnode.wire.dictionary import Object
+from skinnode.wire.timing import fd_length
 
 HARDWARE_VERSION: Final = "none"
 """A node in software has no board."""
@@ -287,7 +288,7 @@ class CanopenDevice:
             self._emcy.present(EmcyCode.PDO_NOT_PROCESSED, bytes((1, len(data), wanted)), t_ns)
             return
         self._emcy.over(EmcyCode.PDO_NOT_PROCESSED, t_ns)
-        if len(data) > wanted:
+        if len(data) > fd_length(wanted):  # of a classic frame that is what is wanted itself
             self._emcy.happened(EmcyCode.PDO_LENGTH_EXCEEDED, bytes((1, len(data), wanted)), t_ns)
         if self._command.event_driven:
             self._execute(data)

@@ -15,7 +15,6 @@ from skinnode.wire import indices as od
 INVALID_BIT: Final = 1 << 31
 EXTENDED_BIT: Final = 1 << 29
 COB_ID_MASK: Final = 0x7FF
-MAX_PDO_BYTES: Final = 8
 SYNC_CYCLIC_MAX: Final = 240
 EVENT_TYPES: Final = (254, 255)
 
@@ -71,6 +70,7 @@ class PdoRecords:
     def __init__(self, store: ObjectStore, parameter: int, mapping: int, *, transmits: bool) -> None:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
+        self._most_bytes = store.find(mapping, 0).high or 0  # as many as entries: the smallest is a byte
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
@@ -117,7 +117,7 @@ class PdoRecords:
 
     def _check_mapping(self, count: int) -> None:
         words = (self._store.integer(self._mapping, sub) for sub in range(1, count + 1))
-        if sum(self._mapped_bytes(word) for word in words) > MAX_PDO_BYTES:
+        if sum(self._mapped_bytes(word) for word in words) > self._most_bytes:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:

@@ -41,6 +41,7 @@ class NodeRunner:
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode], *, slack_ns: int = TIMER_SLACK_NS) -> None:
         self._port = port
+        self._fd = port.config.fd
         self._slack_ns = slack_ns
         self.nodes = tuple(nodes)
         if not self.nodes:
@@ -133,7 +134,7 @@ class NodeRunner:
                 first_ns = deadline_ns
         wait_s = min((first_ns + self._slack_ns - clock()) * 1e-9, _IDLE_S)
         frame = self._port.recv(wait_s if wait_s > 0.0 else 0.0)
-        if frame is not None and not (frame.error or frame.extended or frame.fd):
+        if frame is not None and not (frame.error or frame.extended or (frame.fd and not self._fd)):
             for node in nodes:
                 try:
                     node.on_frame(frame.can_id, frame.data, frame.t_ns, frame.remote)

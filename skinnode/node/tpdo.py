@@ -152,8 +152,8 @@ class TpdoEngine:
         self._unsent: deque[bytes] = deque()
         self._carrier: _Tpdo | None = None  # of the chunks of the scan being sent
         self._chunks_sent = 0
-        self.chunk = bytes(8)
-        """The chunk record (0x2010) as last sent."""
+        self.chunk = bytes(64)
+        """The chunk record (0x2010) as last sent, zeros before the first; over CAN FD up to 64 bytes."""
         self.summary = bytes(8)
         """The summary record (0x2011) of the last scan."""
         self.scans_sent = 0

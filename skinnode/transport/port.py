@@ -23,6 +23,7 @@ import can
 from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader
+from skinnode.wire.timing import fd_length
 
 if TYPE_CHECKING:
     from skinnode.model.config import BusConfig
@@ -88,6 +89,7 @@ class CanPort:
     def __init__(self, config: BusConfig) -> None:
         self.config = config
         self._where = f"{config.name}: interface {config.interface!r}, channel {config.channel!r}"
+        self._longest = 64 if config.fd else 8
         self._closed = False
         self._counting = threading.Lock()  # sent is counted by several threads; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
@@ -103,8 +105,10 @@ class CanPort:
         options: dict[str, Any] = {"bitrate": config.bitrate_bps}
         if config.interface == _VIRTUAL:
             options["rx_queue_size"] = VIRTUAL_QUEUE_FRAMES
-        elif config.interface == _MULTICAST:
+        if config.interface == _MULTICAST or config.fd:
             options["fd"] = True
+        if config.fd:
+            options["data_bitrate"] = config.data_bitrate_bps
         if config.interface not in can.VALID_INTERFACES:
             raise BusError(
                 f"{self._where}: no such interface, allowed: {', '.join(sorted(can.VALID_INTERFACES))}"
@@ -156,18 +160,28 @@ class CanPort:
         return 0 if self._reader is None else self._reader.dropped
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Send a classic frame with an 11-bit identifier. ``data`` is up to 8 bytes.
+        """Send a frame with an 11-bit identifier: a classic one with up to 8 bytes of ``data``; with more, on
+        a bus with ``fd``, a CAN FD frame with bit-rate switch, padded with zeros to a length that those have.
 
-        Raises BusError if the interface refuses it; ValueError for an identifier or a length that no such
-        frame has. A full queue of another endpoint of a virtual bus is that endpoint's loss, as on a real
+        Raises BusError if the interface refuses it; ValueError for an identifier or a length that no frame of
+        this bus has. A full queue of another endpoint of a virtual bus is that endpoint's loss, as on a real
         one.
         """
         if not 0 <= can_id <= 0x7FF:
             raise ValueError(f"can_id: got {can_id}, must be 0 to 0x7FF")
-        if len(data) > 8:
-            raise ValueError(f"data: got {len(data)} bytes, must be at most 8")
+        fd = len(data) > 8
+        if fd:
+            if len(data) > self._longest:
+                raise ValueError(f"data: got {len(data)} bytes, must be at most {self._longest}")
+            data = data.ljust(fd_length(len(data)), b"\0")
         message = _Message(
-            arbitration_id=can_id, is_extended_id=False, is_remote_frame=remote, channel=self._tag, data=data
+            arbitration_id=can_id,
+            is_extended_id=False,
+            is_remote_frame=remote,
+            is_fd=fd,
+            bitrate_switch=fd,
+            channel=self._tag,
+            data=data,
         )
         undelivered = 0
         try:

@@ -26,13 +26,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.errors import CodecError, ConfigError
-from skinnode.wire.codec import MISSING, PDO_BYTES, Codes, Summary, SummaryFlag, unpack_scan, unpack_summary
+from skinnode.wire.codec import (
+    MISSING,
+    PDO_BYTES,
+    Codes,
+    Summary,
+    SummaryFlag,
+    chunk_indexer,
+    chunk_of_code,
+    unpack_scan,
+    unpack_summary,
+)
 from skinnode.wire.indices import chunk_cob_id, summary_cob_id
 from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Stands at the chunk indices a patch does not have, so that the hot path needs no bounds check."""
+"""Stands at the chunk numbers a patch does not have, so that the hot path needs no bounds check."""
 _NONE_OPEN: Final = -1  # no counter on the wire is negative
 _NEVER: Final = -1
 
@@ -89,9 +99,9 @@ class AssemblerStats:
     late: int
     """* Of a scan that was published without it, or older."""
     bad_length: int
-    """* Not 8 bytes."""
+    """* Not the length of a chunk, or of a summary."""
     bad_index: int
-    """* A chunk index, or a number of chunks, that the patch does not have."""
+    """* A chunk, or a number of chunks, that the patch does not have."""
     bad_counter: int
     """* A scan counter out of the range of the SYNC counter."""
     resyncs: int
@@ -133,6 +143,8 @@ class ScanAssembler:
                 raise ConfigError(name, time_ns, "more than 0")
         self._profile = profile
         self._n = profile.n_chunks
+        self._chunk_bytes = profile.chunk_bytes
+        self._index_of = chunk_indexer(profile)
         self._steps = (1 << profile.code_bits) - 4
         self._lowest, self._range = (1, counter_overflow) if counter_overflow else (0, 256)
         self._timeout_ns = period_ns * min(3, max(1, (self._range - 1) // 2))
@@ -165,12 +177,12 @@ class ScanAssembler:
 
     def on_chunk(self, data: bytes, t_ns: int) -> Scan | None:
         """Take the payload of a TPDO1 received at ``t_ns``. It is kept, not copied: do not change it."""
-        if len(data) != PDO_BYTES:
-            self._reject_length(chunk_cob_id(self._node_id), data, "chunk")
+        if len(data) != self._chunk_bytes:
+            self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
             return None
         if data[1] != self._counter or t_ns > self._expires_ns:
             return self._on_chunk_of_another_scan(data, t_ns)
-        index = data[0]
+        index = self._index_of(data)
         if self._frames[index] is not None:
             self._on_repeated_chunk(index, data)
             return None
@@ -184,7 +196,7 @@ class ScanAssembler:
     def on_summary(self, data: bytes, t_ns: int) -> Scan | None:
         """Take the payload of a TPDO2 received at ``t_ns``."""
         if len(data) != PDO_BYTES:
-            self._reject_length(summary_cob_id(self._node_id), data, "scan summary")
+            self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
             return None
         summary = unpack_summary(data)
         if summary.chunks > self._n:
@@ -255,7 +267,7 @@ class ScanAssembler:
     # --- frames that are not simply the next of the open scan
 
     def _on_chunk_of_another_scan(self, data: bytes, t_ns: int) -> Scan | None:
-        index = data[0]
+        index = self._index_of(data)
         if index >= self._n:
             self._bad_index += 1
             return None
@@ -283,10 +295,10 @@ class ScanAssembler:
         else:
             self._conflicts += 1
 
-    def _reject_length(self, cob_id: int, data: bytes, what: str) -> None:
+    def _reject_length(self, cob_id: int, data: bytes, length: int, what: str) -> None:
         self._bad_length += 1
         if self._on_reject is not None:
-            self._on_reject(CodecError(cob_id, data, f"{PDO_BYTES} bytes ({what})"))
+            self._on_reject(CodecError(cob_id, data, f"{length} bytes ({what})"))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
         """Whether a frame with this counter, not one of the open scan, begins a new scan; if not, count it.
@@ -314,7 +326,7 @@ class ScanAssembler:
     # --- the life of a scan
 
     def _no_frames(self) -> list[bytes | None]:
-        return [None] * self._n + [_NOT_EXPECTED] * (_CHUNK_INDICES - self._n)
+        return [None] * self._n + [_NOT_EXPECTED] * max(1, _CHUNK_INDICES - self._n)
 
     def _open(self, counter: int, t_ns: int) -> None:
         self._follows = False
@@ -397,12 +409,11 @@ class ScanAssembler:
         if len(known) == self._n:
             codes = unpack_scan(b"".join(known), self._profile)
         else:
-            blank = bytes(PDO_BYTES)
+            blank = bytes(self._chunk_bytes)
             payload = b"".join([blank if frame is None else frame for frame in self._held])
             codes = unpack_scan(payload, self._profile)
             unknown = np.array([frame is None for frame in self._held])
-            per_code = np.repeat(unknown, self._profile.codes_per_chunk)[: self._profile.n_codes]
-            codes[per_code.reshape(codes.shape)] = MISSING
+            codes[unknown[chunk_of_code(self._profile)]] = MISSING
         valid = codes <= self._steps
         codes.setflags(write=False)
         valid.setflags(write=False)

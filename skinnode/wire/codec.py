@@ -9,8 +9,9 @@ from __future__ import annotations
 import enum
 import functools
 import math
+import operator
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -28,6 +29,7 @@ MISSING: Final = 0xFFFF_FFFF
 """Stands where no code was received. Wider than any code, so it is never on the wire and never decodes."""
 
 PDO_BYTES: Final = 8
+"""Of a classic chunk and of every summary."""
 _CODE_BITS: Final = (16, 24)
 
 
@@ -154,7 +156,7 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = 0x180) -> Chunk:
 
 
 def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]:
-    """Payloads of all chunks of a scan, by chunk index. ``codes``: (U, K); ``scan``: its u8 counter.
+    """Payloads of all chunks of a scan, in order. ``codes``: (U, K); ``scan``: its u8 counter.
 
     Raises ValueError for another shape or a code wider than the profile's.
     """
@@ -163,26 +165,66 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
         raise ValueError(f"codes: got shape {array.shape}, must be ({profile.rows}, {profile.columns})")
     if int(array.max()) >> profile.code_bits:
         raise ValueError(f"codes: got {int(array.max())}, must be below {1 << profile.code_bits}")
-    width = profile.code_bits // 8
-    padded = np.zeros(profile.n_chunks * profile.codes_per_chunk, dtype="<u4")
-    padded[: profile.n_codes] = array.ravel()
-    frames = np.empty((profile.n_chunks, PDO_BYTES), dtype=np.uint8)
-    frames[:, 0] = np.arange(profile.n_chunks)
+    width, per, size, n = (
+        profile.code_bits // 8,
+        profile.codes_per_chunk,
+        profile.chunk_bytes,
+        profile.n_chunks,
+    )
+    lines = array.reshape(profile.lines, -1)
+    padded = np.zeros((profile.lines, profile.chunks_per_line * per), dtype="<u4")
+    padded[:, : lines.shape[1]] = lines
+    frames = np.zeros((n, size), dtype=np.uint8)
+    if profile.bus == "classic":
+        frames[:, 0] = np.arange(n)
+    else:
+        wire, part = np.divmod(np.arange(n), profile.chunks_per_line)
+        frames[:, 0] = wire
+        frames[:, 2:4] = (part * per).astype("<u2")[:, None].view(np.uint8)
     frames[:, 1] = scan
-    frames[:, 2:] = padded.view(np.uint8).reshape(-1, 4)[:, :width].reshape(profile.n_chunks, -1)
+    head = profile.chunk_head_bytes
+    frames[:, head : head + per * width] = padded.view(np.uint8).reshape(-1, 4)[:, :width].reshape(n, -1)
     payload = frames.tobytes()
-    return [payload[at : at + PDO_BYTES] for at in range(0, len(payload), PDO_BYTES)]
+    return [payload[at : at + size] for at in range(0, len(payload), size)]
 
 
 def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
     """(U, K) codes from the payloads of all chunks of a scan in ascending order, one after the other."""
-    payload = np.frombuffer(frames, dtype=np.uint8).reshape(profile.n_chunks, PDO_BYTES)
-    width = profile.code_bits // 8
-    narrow = payload[:, 2:].reshape(-1, width)[: profile.n_codes]
+    width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
+    payload = np.frombuffer(frames, dtype=np.uint8).reshape(profile.n_chunks, profile.chunk_bytes)
+    narrow = payload[:, head : head + per * width].reshape(profile.lines, -1, width)
     wide = np.zeros((profile.n_codes, 4), dtype=np.uint8)
-    wide[:, :width] = narrow
+    wide[:, :width] = narrow[:, : profile.n_codes // profile.lines].reshape(-1, width)
     codes: Codes = wide.view("<u4").reshape(profile.rows, profile.columns)
     return codes
+
+
+@functools.lru_cache(maxsize=64)
+def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
+    """(U, K) which chunk of a scan carries each code, counted from 0 in the order they are sent."""
+    lines, per_line = profile.lines, profile.n_codes // profile.lines
+    within = np.arange(per_line) // profile.codes_per_chunk
+    chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
+    chunks = chunks.reshape(profile.rows, profile.columns)
+    chunks.setflags(write=False)
+    return chunks
+
+
+def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
+    """A function from the payload of a chunk to its number, counted as in :func:`chunk_of_code`. Numbers from
+    ``n_chunks`` on are of chunks that the patch does not have. It does not look at the length."""
+    if profile.bus == "classic":
+        return operator.itemgetter(0)
+    rows, columns, n = profile.rows, profile.columns, profile.n_chunks
+    per, per_line = profile.codes_per_chunk, profile.chunks_per_line
+
+    def index(data: bytes) -> int:
+        column = data[2] | data[3] << 8
+        if data[0] >= rows or column >= columns or column % per:
+            return n
+        return data[0] * per_line + column // per
+
+    return index
 
 
 # --- scan summary (TPDO2)

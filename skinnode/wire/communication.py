@@ -35,7 +35,7 @@ def spare_pdo(cob_id: int | None) -> PdoDefault:
 
 
 def communication_objects(
-    rpdos: Sequence[PdoDefault], tpdos: Sequence[PdoDefault], slots: int = od.MAPPING_SLOTS
+    rpdos: Sequence[PdoDefault], tpdos: Sequence[PdoDefault], slots: int
 ) -> tuple[Object, ...]:
     """All of them, by ascending index. ``slots``: entries that a PDO can map."""
     return (

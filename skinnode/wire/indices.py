@@ -106,8 +106,6 @@ PDO_INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID that switches it off."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication parameter."""
-MAPPING_SLOTS: Final = 8
-"""Entries a PDO can map: eight bytes, and the smallest entry is one."""
 ERROR_FIELD_LENGTH: Final = 8
 HEARTBEAT_CONSUMERS: Final = 4
 
@@ -115,8 +113,12 @@ HEARTBEAT_CONSUMERS: Final = 4
 DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
+PDO_BYTES: Final = 12
+"""8, or 64 where PDOs travel over CAN FD."""
 CHUNK: Final = 0x2010
-CHUNK_INDEX, CHUNK_SCAN, CHUNK_FIRST_CODE = 1, 2, 3
+CHUNK_INDEX, CHUNK_SCAN = 1, 2
+"""The codes follow; over CAN FD the index is that of the upper wire, and the first column stands before
+them."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SEND_POLICY: Final = 0x2020

@@ -2,6 +2,11 @@
 
 A patch of U×K codes sends them in *chunks*: TPDO1 carries u8 chunk index, u8 scan counter and 3 codes of
 16 bits (or 2 of 24), codes in row-major order, upper wire first. TPDO2, the *summary*, ends each scan.
+
+PDO over CAN FD: a chunk is a part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30
+codes of 16 bits (or 20 of 24). All chunks of a patch are of one length, that of the mapping padded to the
+next one CAN FD has; a patch of more columns sends each wire in several, as even as they can be.
+
 ``python -m skinnode.wire.profile eds/`` writes the reference EDS files again.
 """
 
@@ -10,7 +15,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
@@ -18,6 +23,10 @@ from skinnode.wire import indices as od
 from skinnode.wire.communication import PdoDefault, communication_objects, spare_pdo
 from skinnode.wire.dictionary import DataType, Entry, Object, array, record, var
 from skinnode.wire.eds import DeviceInfo, render_eds
+from skinnode.wire.timing import fd_length
+
+if TYPE_CHECKING:
+    from skinnode.model.config import BusConfig, PatchConfig
 
 _U8, _U16, _U32, _REAL32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.REAL32
 
@@ -29,7 +38,9 @@ DEFAULT_PERIOD_MS: Final = 80
 DEFAULT_REFRESH_SCANS: Final = 10
 """What a lost scan left unknown is known again within 0.8 s, for a tenth of the full traffic."""
 
-_PAYLOAD_BYTES: Final = 6  # of a chunk's eight, after chunk index and scan counter
+BusType = Literal["classic", "fd"]
+"""Frames that PDOs travel in: CAN 2.0 of up to 8 bytes, or CAN FD of up to 64."""
+
 _MOST_SUBINDICES: Final = 254  # CiA 301: sub-index 255 is reserved
 
 
@@ -54,6 +65,7 @@ class PatchProfile:
     """RPDO1 takes commands, the others are spare."""
     tpdos: int = 4
     """TPDO1 carries chunks, TPDO2 summaries, the others are spare."""
+    bus: BusType = "classic"
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -69,7 +81,9 @@ class PatchProfile:
                 raise ConfigError(name, value, f"{least} to {most}")
         if self.code_bits not in (16, 24):
             raise ConfigError("code_bits", self.code_bits, "16 or 24")
-        if self.n_chunks > 256:
+        if self.bus not in ("classic", "fd"):
+            raise ConfigError("bus", self.bus, "classic or fd")
+        if self.bus == "classic" and self.n_chunks > 256:
             raise ConfigError(
                 "rows × columns",
                 self.n_codes,
@@ -77,11 +91,16 @@ class PatchProfile:
             )
 
     @classmethod
-    def from_layout(cls, layout: PatchLayout, code_bits: int = 16) -> PatchProfile:
+    def from_layout(cls, layout: PatchLayout, code_bits: int = 16, bus: BusType = "classic") -> PatchProfile:
         """The profile of a patch with the electrodes of ``layout``."""
         rows, upper_electrodes = layout.upper_m.shape[:2]
         columns, lower_electrodes = layout.lower_m.shape[:2]
-        return cls(rows, columns, upper_electrodes, lower_electrodes, code_bits)
+        return cls(rows, columns, upper_electrodes, lower_electrodes, code_bits, bus=bus)
+
+    @classmethod
+    def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
+        """The profile that the hand file says a patch on ``bus`` has."""
+        return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
     def n_codes(self) -> int:
@@ -89,14 +108,45 @@ class PatchProfile:
         return self.rows * self.columns
 
     @property
+    def pdo_bytes(self) -> int:
+        """Most bytes of a PDO, and most objects mapped into it: the smallest is a byte."""
+        return 8 if self.bus == "classic" else 64
+
+    @property
+    def chunk_head_bytes(self) -> int:
+        """What comes before the codes of a chunk."""
+        return 2 if self.bus == "classic" else 4
+
+    @property
+    def _most_codes(self) -> int:
+        return (self.pdo_bytes - self.chunk_head_bytes) * 8 // self.code_bits
+
+    @property
+    def lines(self) -> int:
+        """Runs of codes that are cut into chunks: the whole scan, or over CAN FD each upper wire."""
+        return 1 if self.bus == "classic" else self.rows
+
+    @property
+    def chunks_per_line(self) -> int:
+        """The unused codes of the last are sent as 0 and ignored."""
+        return -(-self.n_codes // self.lines // self._most_codes)
+
+    @property
     def codes_per_chunk(self) -> int:
-        """3 of 16 bits, 2 of 24."""
-        return 8 * _PAYLOAD_BYTES // self.code_bits
+        """3 of 16 bits, 2 of 24; over CAN FD up to 30 or 20, an even part of an upper wire."""
+        return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 
     @property
     def n_chunks(self) -> int:
-        """Chunks of a full scan. The unused codes of the last are sent as 0 and ignored."""
-        return -(-self.n_codes // self.codes_per_chunk)
+        """Chunks of a full scan."""
+        return self.lines * self.chunks_per_line
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Length of the frame of a chunk."""
+        if self.bus == "classic":
+            return 8
+        return fd_length(self.chunk_head_bytes + self.codes_per_chunk * self.code_bits // 8)
 
     @property
     def code_type(self) -> DataType:
@@ -110,7 +160,8 @@ class PatchProfile:
 
     def objects(self) -> tuple[Object, ...]:
         """The whole object dictionary, by ascending index."""
-        return (*communication_objects(_rpdos(self), _tpdos(self)), *_manufacturer_objects(self))
+        communication = communication_objects(_rpdos(self), _tpdos(self), self.pdo_bytes)
+        return (*communication, *_manufacturer_objects(self))
 
 
 def _rpdos(profile: PatchProfile) -> list[PdoDefault]:
@@ -134,18 +185,17 @@ def _tpdos(profile: PatchProfile) -> list[PdoDefault]:
 
 
 def _chunk_record(profile: PatchProfile) -> Object:
-    codes = tuple(
-        Entry(od.CHUNK, od.CHUNK_FIRST_CODE + i, f"Code {i + 1}", profile.code_type, "ro", 0, mappable=True)
-        for i in range(profile.codes_per_chunk)
-    )
+    head = [("Chunk index", _U8), ("Chunk scan counter", _U8)]
+    if profile.bus == "fd":
+        head = [("Upper wire", _U8), ("Chunk scan counter", _U8), ("First column", _U16)]
+    codes = [(f"Code {i}", profile.code_type) for i in range(1, profile.codes_per_chunk + 1)]
     return record(
         od.CHUNK,
         "Chunk of a scan",
-        (
-            Entry(od.CHUNK, od.CHUNK_INDEX, "Chunk index", _U8, "ro", 0, mappable=True),
-            Entry(od.CHUNK, od.CHUNK_SCAN, "Chunk scan counter", _U8, "ro", 0, mappable=True),
-            *codes,
-        ),
+        [
+            Entry(od.CHUNK, sub, name, data_type, "ro", 0, mappable=True)
+            for sub, (name, data_type) in enumerate(head + codes, 1)
+        ],
     )
 
 
@@ -235,6 +285,7 @@ def _descriptor_record(profile: PatchProfile) -> Object:
             Entry(od.DESCRIPTOR, od.LAYOUT_ID, "Layout", _U8, "ro"),
             Entry(od.DESCRIPTOR, od.LAYOUT_HASH, "Layout hash", _U32, "ro"),
             Entry(od.DESCRIPTOR, od.SERIAL, "Serial", _U32, "ro"),
+            Entry(od.DESCRIPTOR, od.PDO_BYTES, "Bytes of a PDO", _U8, "const", profile.pdo_bytes),
         ),
     )
 
@@ -266,14 +317,16 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
 
 def eds_name(profile: PatchProfile) -> str:
     """File name of the reference EDS of this wire format."""
-    return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}.eds"
+    variant = "-fd" if profile.bus == "fd" else ""
+    return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}{variant}.eds"
 
 
 def eds_text(profile: PatchProfile) -> str:
     """The electronic data sheet (CiA 306) of a patch; the same bytes for the same profile, always."""
+    variant = ", PDO over CAN FD" if profile.bus == "fd" else ""
     info = DeviceInfo(
         file_name=eds_name(profile),
-        description=f"{profile.rows} x {profile.columns} wires, {profile.code_bits}-bit codes",
+        description=f"{profile.rows} x {profile.columns} wires, {profile.code_bits}-bit codes{variant}",
         vendor_name="skinnode",
         vendor_number=od.VENDOR_ID,
         product_name=od.DEVICE_NAME,
@@ -285,7 +338,12 @@ def eds_text(profile: PatchProfile) -> str:
     return render_eds(info, profile.objects())
 
 
-REFERENCE_PROFILES: Final = (PatchProfile(10, 30, 10, 10, 16), PatchProfile(10, 30, 10, 10, 24))
+REFERENCE_PROFILES: Final = (
+    PatchProfile(10, 30, 10, 10, 16),
+    PatchProfile(10, 30, 10, 10, 24),
+    PatchProfile(10, 30, 10, 10, 16, bus="fd"),
+    PatchProfile(10, 30, 10, 10, 24, bus="fd"),
+)
 """One for each wire format; their EDS are kept in ``eds/``."""
 
 

@@ -1,12 +1,19 @@
-"""How long a classic CAN frame occupies the bus, to the bit (ISO 11898-1), and what load that makes.
+"""How long a CAN frame occupies the bus, to the bit (ISO 11898-1:2015), and what load that makes.
 
-From start of frame to the end of the CRC sequence a stuff bit of the other value follows every five equal
-bits, stuff bits included in the count. The tail of 13 bits is not stuffed: CRC delimiter, ACK slot and
-delimiter, 7 bits end of frame, 3 bits inter-frame space. CRC: polynomial 0x4599, 15 bits, initially 0.
+Classic frames. From start of frame to the end of the CRC sequence a stuff bit of the other value follows
+every five equal bits, stuff bits included in the count. The tail of 13 bits is not stuffed: CRC delimiter,
+ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space. CRC: polynomial 0x4599, 15 bits,
+initially 0.
 
 Both the CRC and the stuffing run bytewise through tables. The head of a frame is filled up on its left to
 whole bytes: with zeros for the CRC, which leave it 0, and with alternating bits that end in a 1 for the
 stuffing, after which the dominant start of frame begins a new run.
+
+CAN FD frames, with an 11-bit identifier and bit-rate switch. Such stuffing ends with the data: in the CRC
+field stand 4 bits that count the stuff bits, 17 bits of CRC (21 beyond 16 bytes of data) and a fixed stuff
+bit before them and after each 4, whatever their values. The bits from ESI to the CRC delimiter are sent at
+the data bit rate; the 17 before them and the 12 after them (ACK slot and delimiter, 7 bits end of frame, 3
+bits inter-frame space) at the nominal one.
 """
 
 from __future__ import annotations
@@ -24,6 +31,9 @@ _CRC_BITS: Final = 15
 _CRC_POLYNOMIAL: Final = 0x4599
 _HEAD_BITS: Final = 19  # SOF, 11 bits identifier, RTR, IDE, r0, 4 bits DLC
 _EXTENDED_HEAD_BITS: Final = 39  # SOF, 11 bits, SRR, IDE, 18 bits, RTR, r1, r0, 4 bits DLC
+FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Bytes that a CAN FD frame can have, by its length code."""
+_FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11 bits identifier, RRS, IDE, FDF, res, BRS; and the tail
 _RUN: Final = 5
 _NO_RUN: Final = 0
 _ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
@@ -84,6 +94,44 @@ def exact_bits(
         stuff += stuffed[at]
         run = next_run[at]
     return n_bits + stuff + TAIL_BITS
+
+
+def fd_length(n_bytes: int) -> int:
+    """The shortest data of a CAN FD frame that holds ``n_bytes``. Raises ValueError for more than 64."""
+    for length in FD_LENGTHS:
+        if n_bytes <= length:
+            return length
+    raise ValueError(f"data: got {n_bytes} bytes, must be at most {FD_LENGTHS[-1]}")
+
+
+def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
+    """Bits of CAN FD frames of one length: (n,) identifiers and (n, length) bytes to (n,) bits at the nominal
+    bit rate, inter-frame space included, and (n,) at the data bit rate.
+
+    Raises ValueError for other shapes, an identifier of more than 11 bits or a length that no frame has.
+    """
+    ids, payload = np.asarray(can_id, np.int64), np.asarray(data, np.uint8)
+    if ids.ndim != 1 or payload.ndim != 2 or len(payload) != len(ids):
+        raise ValueError(f"can_id, data: got shapes {ids.shape}, {payload.shape}, must be (n,), (n, length)")
+    length = payload.shape[1]
+    if length not in FD_LENGTHS or np.any((ids < 0) | (ids > 0x7FF)):
+        raise ValueError(f"can_id, data: got {length} bytes, must be one of {FD_LENGTHS}, and 11-bit numbers")
+    _, next_run, stuffed = _array_tables()
+    # 22 bits up to the length code are two less than three bytes, and the data follow bytewise. FDF, res and
+    # BRS alternate: no stuff bit stands between the first two bytes (nominal) and ESI.
+    head = 0b01 << 22 | ids << 10 | 0b10100000 | FD_LENGTHS.index(length)
+    run = np.full(ids.shape, _NO_RUN, dtype=np.int64)
+    stuff = [np.zeros_like(ids), np.zeros_like(ids)]
+    byte = head
+    for number, byte in enumerate([head >> 16, head >> 8 & 0xFF, head & 0xFF, *payload.T.astype(np.int64)]):
+        at = run << 8 | byte
+        stuff[number > 1] += stuffed[at]
+        run = next_run[at]
+    # A stuff bit due after the last bit is not sent: the first fixed one stands there.
+    stuff[1] -= (run - 1 >> 2) != (byte & 1)
+    crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
+    data_bits = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1  # ESI, DLC, data, count, CRC, delimiter
+    return _FD_NOMINAL_BITS + stuff[0], data_bits + stuff[1]
 
 
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
@@ -181,49 +229,71 @@ class BusLoad:
 
     _BATCH: Final = 4096
 
-    def __init__(self, bitrate_bps: int = 1_000_000) -> None:
-        if bitrate_bps <= 0:
-            raise ConfigError("bitrate_bps", bitrate_bps, "more than 0")
+    def __init__(self, bitrate_bps: int = 1_000_000, data_bitrate_bps: int | None = None) -> None:
+        for name, rate in (("bitrate_bps", bitrate_bps), ("data_bitrate_bps", data_bitrate_bps)):
+            if rate is not None and rate <= 0:
+                raise ConfigError(name, rate, "more than 0")
         self.bitrate_bps = bitrate_bps
+        self._data_bit = bitrate_bps / (data_bitrate_bps or bitrate_bps)
         self._frames = 0
-        self._bits = 0
+        self._bits = self._fast_bits = 0
         self._ids: list[int] = []
         self._data: list[bytes] = []
+        self._fd: list[tuple[int, bytes]] = []
 
     def add(
-        self, can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int = 0
+        self,
+        can_id: int,
+        data: bytes,
+        *,
+        extended: bool = False,
+        remote: bool = False,
+        dlc: int = 0,
+        fd: bool = False,
     ) -> None:
-        """Count a frame, as in :func:`exact_bits`. ``data`` is kept until the next batch, not copied."""
+        """Count a frame, as in :func:`exact_bits` or, where ``fd``, :func:`fd_bits`. ``data`` is kept until
+        the next batch, not copied."""
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
             self._frames += 1
             return
-        self._ids.append(can_id)
-        self._data.append(data)
-        if len(self._ids) >= self._BATCH:
+        if fd:
+            self._fd.append((can_id, data))
+        else:
+            self._ids.append(can_id)
+            self._data.append(data)
+        if len(self._ids) + len(self._fd) >= self._BATCH:
             self._work_off()
 
     @property
     def frames(self) -> int:
         """Frames added so far."""
-        return self._frames + len(self._ids)
+        return self._frames + len(self._ids) + len(self._fd)
 
     @property
     def bits(self) -> int:
-        """Bits they were on the bus."""
+        """Bits they were on the bus; one at the data bit rate of CAN FD counts as its share of a nominal
+        one."""
         self._work_off()
-        return self._bits
+        return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
         """Share of ``time_s`` the bus was busy with the frames so far; above 1 they do not fit."""
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 
     def _work_off(self) -> None:
-        if not self._ids:
-            return
-        padded = b"".join([data.ljust(8, b"\0") for data in self._data])
-        payload = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 8)
-        self._bits += int(exact_bits_batch(self._ids, [len(data) for data in self._data], payload).sum())
-        self._frames += len(self._ids)
-        self._ids.clear()
-        self._data.clear()
+        self._frames += len(self._ids) + len(self._fd)
+        if self._ids:
+            padded = b"".join([data.ljust(8, b"\0") for data in self._data])
+            payload = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 8)
+            lengths = [len(data) for data in self._data]
+            self._bits += int(exact_bits_batch(self._ids, lengths, payload).sum())
+            self._ids.clear()
+            self._data.clear()
+        for length in {len(data) for _, data in self._fd}:
+            chosen = [frame for frame in self._fd if len(frame[1]) == length]
+            payload = np.frombuffer(b"".join([data for _, data in chosen]), dtype=np.uint8)
+            nominal, fast = fd_bits([can_id for can_id, _ in chosen], payload.reshape(len(chosen), length))
+            self._bits += int(nominal.sum())
+            self._fast_bits += int(fast.sum())
+        self._fd.clear()

@@ -6,9 +6,11 @@ import gc
 import logging
 import threading
 import time
+import uuid
 import weakref
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import can
 import numpy as np
@@ -17,9 +19,13 @@ import pytest
 from skinnode.errors import BusError, ConfigError
 from skinnode.host import Condition, Host, Subscription
 from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp
+from skinnode.model.layout import Float
+from skinnode.node import NodeRunner, PatchNode
 from skinnode.node.nmt import NmtState
 from skinnode.transport import CanPort
+from skinnode.wire.profile import PatchProfile
 from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, eventually, heard
@@ -219,6 +225,74 @@ def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:
     for field in fields:
         by_scan[stamp(field).scan].add(stamp(field).t_sync_ns)
     assert all(len(times) == 1 for times in by_scan.values())
+
+
+@pytest.mark.parametrize("code_bits", [16, 24])
+def test_fields_over_can_fd_are_those_of_a_classic_bus(code_bits: int) -> None:
+    """The same pressed patch on two buses of one hand: the same codes, so the same fields to the last bit."""
+    buses = [{"name": name, "channel": uuid.uuid4().hex, "fd": name == "fd"} for name in ("classic", "fd")]
+    size = {"upper_wires": 4, "upper_electrodes": 8, "lower_wires": 32, "lower_electrodes": 4}
+    patches = [
+        {
+            "name": f"on {bus['name']}",
+            "node_id": 5,
+            "bus": bus["name"],
+            "layout": size,
+            "code_bits": code_bits,
+        }
+        for bus in buses
+    ]
+    hand = parse_hand({"buses": buses, "patches": patches, "sync": {"period_ms": 50}})
+    layout = hand.patches[0].layout.build()
+    rest_ohm = resistance_ohm(layout, layout.upper_m)
+    pressed_m = layout.upper_m.copy()
+    pressed_m[1:3, 3:5, 2] -= 100e-6
+    source = Fixed(resistance_ohm(layout, pressed_m))
+    with ExitStack() as stack:
+        for patch in hand.patches:
+            bus = hand.bus(patch.bus)
+            port = stack.enter_context(CanPort(bus))
+            profile = PatchProfile.from_config(patch, bus)
+            node = PatchNode(
+                5, layout, source, send=port.send, profile=profile, serial=5, baseline_ohm=rest_ohm
+            )
+            stack.enter_context(NodeRunner(port, [node]))
+        host = stack.enter_context(Host.from_config(hand))
+        fields = take(host.fields(timeout_s=10), 12)
+        stats = host.stats()
+    assert {lane.assembler.scans_torn for lane in stats.patches.values()} == {0}
+    for name, chunks in (("on classic", -(-128 // (3 if code_bits == 16 else 2))), ("on fd", 8)):
+        lane = stats.patches[name].assembler
+        assert 0 <= lane.chunks_accepted - chunks * lane.scans_complete <= chunks  # a scan may be open
+    assert stats.buses["fd"].load > 0
+    by_bus = {name: [f for f in fields if stamp(f).patch == f"on {name}"] for name in ("classic", "fd")}
+    for classic, fd in zip(*(by_bus[name] for name in ("classic", "fd")), strict=False):
+        assert classic.trusted
+        assert abs(fd.displacement_m[1, 3, 2] + 100e-6) < 20e-6
+        np.testing.assert_array_equal(fd.displacement_m, classic.displacement_m)
+        np.testing.assert_array_equal(fd.displacement_std_m, classic.displacement_std_m)
+
+
+class Fixed:
+    """A source whose patch does not move."""
+
+    def __init__(self, ohm: Float) -> None:
+        self.ohm = ohm
+
+    def read(self, t_ns: int) -> Float:
+        return self.ohm
+
+
+def test_simulated_hand_over_can_fd(make_hand: Callable[..., HandConfig]) -> None:
+    bus = {"name": "can0", "channel": uuid.uuid4().hex, "fd": True}
+    hand = make_hand(buses=[bus])
+    with Fleet(hand), Host.from_config(hand) as host:
+        fields = take(host.fields(timeout_s=10), 30)
+        stats = host.stats()
+    assert {stamp(field).patch for field in fields} == {"p0", "p1"}
+    for lane in stats.patches.values():
+        assert (lane.assembler.scans_torn, lane.assembler.bad_length) == (0, 0)
+    assert stats.buses["can0"].ignored == 0
 
 
 def test_patch_of_fewer_wires_than_unknowns_is_solved_with_its_prior(

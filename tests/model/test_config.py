@@ -12,8 +12,10 @@ import pytest
 from skinnode.errors import BusLoadError, ConfigError
 from skinnode.model.config import BusConfig, load_hand, parse_hand
 from skinnode.model.layout import PatchLayout
+from skinnode.wire.profile import PatchProfile
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hand.toml"
+FD_EXAMPLE = EXAMPLE.with_name("hand-fd.toml")
 MINIMAL: dict[str, Any] = {
     "buses": [{"name": "can0"}],
     "patches": [{"name": "thumb", "node_id": 1}, {"name": "index", "node_id": 2}],
@@ -47,6 +49,15 @@ def test_example_is_the_hand_of_the_readme() -> None:
     layout = hand.patch("thumb").layout.build()
     assert layout.layout_hash == PatchLayout.preset("staggered", height_m=2e-3).layout_hash
     assert layout.shape == (10, 30)
+
+
+def test_fd_example_is_the_same_hand_faster() -> None:
+    hand, fd = load_hand(EXAMPLE), load_hand(FD_EXAMPLE)
+    assert fd.buses[0].fd
+    hashes = [[patch.layout.build().layout_hash for patch in one.patches] for one in (hand, fd)]
+    assert hashes[0] == hashes[1]
+    assert fd.sync.period_ms == 20
+    assert fd.bus_load("can0") < 0.5
 
 
 def test_example_says_the_defaults() -> None:
@@ -192,6 +203,34 @@ def test_bus_load_is_the_worst_case_of_the_plan() -> None:
     # (Davis et al. 2007, table of worst cases); 300 codes are 100 chunks and a summary.
     hand = parse_hand(minimal())
     assert hand.bus_load("can0") == pytest.approx((2 * 101 * 135 + 65) / 80e3, rel=1e-12)
+
+
+def test_bus_load_of_can_fd_is_the_worst_case_too() -> None:
+    # 64 bytes: 29 bits and 3 stuff bits at 1 Mbit/s; 38 + 640 at 5 Mbit/s: 5 + 512 before the CRC field with
+    # 128 stuff bits, 4 + 21 + 7 in it, the delimiter. Ten wires a patch; summaries and SYNC stay classic.
+    table = minimal()
+    table["buses"][0]["fd"] = True
+    wire_s = 32e-6 + 678 / 5e6
+    expected_s = 2 * (10 * wire_s + 135e-6) + 65e-6
+    assert parse_hand(table).bus_load("can0") == pytest.approx(expected_s / 0.08, rel=1e-12)
+    table["sync"] = {"period_ms": 6}
+    assert parse_hand(table).bus_load("can0") == pytest.approx(expected_s / 0.006, rel=1e-12)
+    table["buses"][0]["data_bitrate_bps"] = 2_000_000
+    with pytest.raises(BusLoadError, match=r"sync\.period_ms = \d+"):
+        parse_hand(table)
+
+
+@pytest.mark.parametrize("fd", [False, True])
+@pytest.mark.parametrize("bits", [16, 24])
+@pytest.mark.parametrize(("rows", "columns"), [(10, 30), (1, 1), (3, 61), (7, 33)])
+def test_frames_planned_are_the_frames_of_the_profile(fd: bool, bits: int, rows: int, columns: int) -> None:
+    table = minimal()
+    table["buses"][0]["fd"] = fd
+    table["patches"][0] |= {"code_bits": bits, "layout": {"upper_wires": rows, "lower_wires": columns}}
+    hand = parse_hand(table)
+    profile = PatchProfile.from_config(hand.patches[0], hand.buses[0])
+    assert profile.bus == ("fd" if fd else "classic")
+    assert hand.patches[0].chunks_per_scan(fd=fd) == profile.n_chunks
 
 
 def test_plan_that_does_not_fit_its_bus() -> None:

@@ -17,7 +17,7 @@ from skinnode.model.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, NodeRunner, PatchNode
 from skinnode.transport import CanPort
-from skinnode.wire.profile import eds_text
+from skinnode.wire.profile import PatchProfile, eds_text
 
 WAIT_S = 5.0
 
@@ -249,6 +249,43 @@ def test_frames_that_are_not_classic_data_are_no_frames_to_a_node(
         answer = manager.recv(WAIT_S)
         assert answer is not None
         assert answer.arbitration_id == 0x584
+
+
+def test_a_node_on_a_bus_of_can_fd(virtual: BusConfig, layout: PatchLayout) -> None:
+    """Chunks are FD frames with bit-rate switch, and an RPDO may be one, padded as FD frames are."""
+    config = virtual.model_copy(update={"fd": True})
+    profile = PatchProfile.from_layout(layout, 16, "fd")
+    with (
+        can.Bus(interface="virtual", channel=virtual.channel) as manager,
+        CanPort(config) as port,
+        NodeRunner(port, [PatchNode(4, layout, Steady(layout), send=port.send, profile=profile)]) as runner,
+    ):
+
+        def send(can_id: int, data: str, *, fd: bool = False) -> None:
+            payload = bytes.fromhex(data)
+            message = can.Message(arbitration_id=can_id, is_extended_id=False, data=payload, is_fd=fd)
+            manager.send(message)
+
+        assert manager.recv(WAIT_S) is not None
+        send(0x000, "01 00")
+        send(0x080, "")
+        messages = collect(manager, lambda ms: bool(ms) and ms[-1].arbitration_id == 0x284)
+        shapes = [(m.arbitration_id, m.is_fd, m.bitrate_switch, m.dlc) for m in messages]
+        assert shapes == [(0x184, True, True, 16)] * 2 + [(0x284, False, False, 8)]
+        # five mapped bytes more than a classic frame has: 12 bytes in the frame
+        send(0x604, "23 00 14 01 04 02 00 80")
+        send(0x604, "2f 00 16 00 00 00 00 00")
+        for slot in range(1, 12):
+            send(0x604, f"23 00 16 {slot:02x} 08 01 20 20")  # send mode, again and again
+        send(0x604, "2f 00 16 00 0b 00 00 00")
+        send(0x604, "23 00 14 01 04 02 00 00")
+        answers = collect(manager, lambda ms: len(ms) == 15)
+        assert {bytes(m.data)[:1] for m in answers} == {b"\x60"}
+        send(0x204, "01" * 11 + "00", fd=True)
+        send(0x604, "40 20 20 01 00 00 00 00")
+        (answer,) = collect(manager, lambda ms: len(ms) == 1)  # no EMCY: one byte of padding is no excess
+        assert (answer.arbitration_id, bytes(answer.data)[4]) == (0x584, 1)
+        assert not runner.failed
 
 
 def test_nodes_must_differ(virtual: BusConfig, layout: PatchLayout) -> None:

@@ -550,3 +550,52 @@ def test_source_of_the_wrong_shape(operational) -> None:
 def _float(pattern: int) -> float:
     (value,) = struct.unpack("<f", pattern.to_bytes(4, "little"))
     return value
+
+
+class TestCanFd:
+    """PDO over CAN FD: a frame is a part of one upper wire."""
+
+    @pytest.fixture
+    def fd(self, make: Callable, layout: PatchLayout):
+        desk = make(profile=PatchProfile.from_layout(layout, 16, "fd"), catch_up_ns=0)
+        desk.start()
+        return desk
+
+    def test_a_wire_is_a_frame(self, fd, rest_ohm) -> None:
+        fd.source.ohm = rest_ohm * np.linspace(0.5, 1.0, 12).reshape(2, 6)
+        frames = scan(fd, "")
+        assert [can_id for can_id, _ in frames] == [CHUNK, CHUNK, SUMMARY]
+        for wire, (_, data) in enumerate(frames[:2]):
+            raw = bytes.fromhex(data)
+            assert len(raw) == 16  # 4 + 12 bytes, a length that CAN FD has
+            assert struct.unpack_from("<BBH", raw) == (wire, 0, 0)
+            ratio = np.linspace(0.5, 1.0, 12)[6 * wire : 6 * wire + 6]
+            got = np.array(struct.unpack_from("<6H", raw, 4))
+            assert np.abs(got - np.rint((ratio - 0.25) * STEPS)).max() <= 1
+        assert fd.read(0x2010, 1) == 1  # the last wire
+        assert fd.read(0x2010, 3) == 0  # its first column
+        assert fd.read(0x2010, 9) == fd.read(0x2101, 6)
+        assert fd.read(0x2011, 3) == 2
+
+    def test_only_wires_that_changed(self, fd, rest_ohm) -> None:
+        fd.write(0x2020, 1, 1, 1)
+        assert len(scan(fd, "")) == 3
+        fd.source.ohm = rest_ohm.copy()
+        fd.source.ohm[1, 2] *= 0.9
+        frames = scan(fd, "")
+        assert [data[:11] for _, data in frames] == ["01 01 00 00", "01 01 01 00"]
+
+    def test_up_to_64_bytes_are_mapped(self, fd) -> None:
+        fd.write(0x1801, 1, 0x80000284, 4)
+        fd.write(0x1A01, 0, 0, 1)
+        for slot in range(1, 65):
+            fd.write(0x1A01, slot, 0x10010008, 4)
+        fd.write(0x1A01, 0, 64, 1)
+        fd.write(0x1801, 1, 0x284, 4)
+        fd.take()
+        (frame,) = [data for can_id, data in scan(fd, "") if can_id == SUMMARY]
+        assert bytes.fromhex(frame) == bytes(64)
+        fd.write(0x1801, 1, 0x80000284, 4)
+        fd.write(0x1A01, 0, 0, 1)
+        fd.write(0x1A01, 64, 0x20110310, 4)  # one more byte
+        assert fd.sdo("2f 01 1a 00 40 00 00 00").endswith("42 00 04 06")

@@ -135,6 +135,48 @@ def test_no_such_frame(open_port, can_id: int, data: bytes, message: str) -> Non
         open_port().send(can_id, data)
 
 
+@pytest.fixture
+def fd_port(config: BusConfig) -> Iterator[Callable[[], CanPort]]:
+    opened: list[CanPort] = []
+
+    def open_() -> CanPort:
+        opened.append(CanPort(config.model_copy(update={"fd": True})))
+        return opened[-1]
+
+    yield open_
+    for port in opened:
+        port.close()
+
+
+def test_longer_frames_on_a_bus_of_can_fd(config: BusConfig, fd_port) -> None:
+    ours, theirs = fd_port(), fd_port()
+    for n_bytes in (8, 9, 12, 33, 64):
+        ours.send(0x185, bytes(range(1, n_bytes + 1)))
+    lengths = []
+    for n_bytes in (8, 9, 12, 33, 64):
+        frame = receive(theirs)
+        assert frame.data.rstrip(b"\0") == bytes(range(1, n_bytes + 1))
+        assert frame.fd == (n_bytes > 8)
+        lengths.append(len(frame.data))
+    assert lengths == [8, 12, 12, 48, 64]  # padded to lengths that CAN FD has
+    with pytest.raises(ValueError, match="got 65 bytes, must be at most 64"):
+        ours.send(0x185, bytes(65))
+
+
+def test_python_can_sees_an_fd_frame_with_bit_rate_switch(config: BusConfig, fd_port) -> None:
+    options = {"fd": True} if config.interface == "udp_multicast" else {}
+    with can.Bus(interface=config.interface, channel=config.channel, **options) as other:
+        port = fd_port()
+        port.send(0x185, bytes(64))
+        message = other.recv(WAIT_S)
+        assert message is not None
+        assert (message.is_fd, message.bitrate_switch, len(message.data)) == (True, True, 64)
+        port.send(0x185, bytes(8))
+        message = other.recv(WAIT_S)
+        assert message is not None
+        assert (message.is_fd, message.bitrate_switch) == (False, False)
+
+
 def test_closed(open_port) -> None:
     port = open_port()
     port.close()

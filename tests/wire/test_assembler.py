@@ -8,6 +8,7 @@ whole stretches are blacked out, and whatever comes out must be a part of what e
 from __future__ import annotations
 
 import dataclasses
+import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -25,8 +26,28 @@ from skinnode.wire.profile import PatchProfile
 PERIOD = 80_000_000
 GRACE = 5_000_000
 PACE = PERIOD // 20
-PROFILES = [PatchProfile(2, 5, 1, 1, 16), PatchProfile(2, 5, 1, 1, 24)]
-"""10 codes in 4 and in 5 chunks; the last chunk is not full."""
+PROFILES = [
+    PatchProfile(2, 5, 1, 1, 16),
+    PatchProfile(2, 5, 1, 1, 24),
+    PatchProfile(2, 21, 1, 1, 24, bus="fd"),
+]
+"""10 codes in 4 and in 5 chunks; the last chunk is not full. Over CAN FD 2 chunks a wire, of 11 and 10."""
+
+
+def owners(profile: PatchProfile) -> NDArray[np.int64]:
+    """The chunk of each code of a scan."""
+    place = np.arange(profile.n_codes)
+    if profile.bus == "fd":
+        return np.where(place % 21 < 11, 0, 1) + 2 * (place // 21)
+    return place // (6 // (profile.code_bits // 8))
+
+
+def payload(profile: PatchProfile, chunk: int, counter: int, codes: Sequence[int]) -> bytes:
+    """A chunk with ``codes``, of which the last of a wire or a scan may have fewer."""
+    if profile.bus == "fd":
+        body = b"".join(code.to_bytes(3, "little") for code in codes)
+        return struct.pack("<BBH", chunk // 2, counter, chunk % 2 * 11) + body.ljust(44, b"\0")
+    return pack_chunk(chunk, counter, codes, profile.code_bits)
 
 
 @dataclass(frozen=True)
@@ -57,11 +78,11 @@ class ModelNode:
 
     def scan(self, sample: int, chunks: Iterable[int] | None = None, *, overrun: bool = False) -> list[Frame]:
         """Sample, with new codes in ``chunks`` (None: in all, and a full scan), and send these in order."""
-        per, n = self.profile.codes_per_chunk, self.profile.n_chunks
+        n, owner = self.profile.n_chunks, owners(self.profile)
         chosen = tuple(range(n)) if chunks is None else tuple(sorted(chunks))
         flags = 0 if chunks is None else SummaryFlag.CHANGED_ONLY
         place = np.arange(self.profile.n_codes)
-        changed = np.isin(place // per, range(n) if overrun else chosen)
+        changed = np.isin(owner, range(n) if overrun else chosen)
         self.codes = np.where(changed, sample * self.profile.n_codes + place, self.codes)
         self.truth[sample], self.sent[sample] = self.codes, chosen
         if overrun:
@@ -69,9 +90,7 @@ class ModelNode:
         t, counter = sample * PERIOD, self.counter(sample)
         frames = []
         for chunk in chosen:
-            data = pack_chunk(
-                chunk, counter, self.codes[chunk * per : chunk * per + per].tolist(), self.profile.code_bits
-            )
+            data = payload(self.profile, chunk, counter, self.codes[owner == chunk].tolist())
             frames.append(Frame(data, t := t + PACE, False, sample))
         summary = pack_summary(counter, flags, len(chosen), sample)  # device time: the true number
         return [*frames, Frame(summary, t + PACE, True, sample)]
@@ -235,7 +254,7 @@ def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
         assert scan.complete == all(arrived)
         assert (scan.chunks_received, scan.chunks_expected) == (sum(arrived), n)
         assert (scan.device_time_us is None) == (copies[n] == 0)
-        shown = np.repeat(arrived, profile.codes_per_chunk)[: profile.n_codes]
+        shown = np.array(arrived)[owners(profile)]
         np.testing.assert_array_equal(scan.valid.ravel(), shown)
     stats = assembler.stats
     assert stats == AssemblerStats(
@@ -555,6 +574,33 @@ def test_frames_that_are_not_of_this_patch_are_counted_and_change_nothing(
     (scan,) = receive(assembler, [summary])
     assert scan.complete
     assert (assembler.stats.bad_index, assembler.stats.bad_counter) == (3, 3)
+
+
+@pytest.mark.parametrize(
+    ("wire", "column"),
+    [(2, 0), (255, 0), (0, 1), (0, 10), (0, 21), (1, 22), (0, 65535)],  # 2 wires, columns from 0 and 11 on
+)
+def test_parts_of_wires_that_the_patch_does_not_have(wire: int, column: int) -> None:
+    node = ModelNode(PROFILES[2], 240)
+    assembler = ScanAssembler(PROFILES[2], counter_overflow=240, period_ns=PERIOD)
+    *chunks, summary = node.scan(7)
+    for counter in (7, 8):
+        receive(assembler, chunks[: 2 if counter == 7 else 0])
+        bad = struct.pack("<BBH", wire, counter, column).ljust(48, b"\1")
+        assert assembler.on_chunk(bad, chunks[-1].t_ns) is None
+    assert assembler.stats.bad_index == 2
+    (scan,) = receive(assembler, [*chunks[2:], summary])
+    assert scan.complete
+    assert_from_one_scan(scan, node)
+
+
+def test_a_fd_chunk_of_another_length_is_rejected_and_reported() -> None:
+    told: list[CodecError] = []
+    assembler = ScanAssembler(PROFILES[2], node_id=5, on_reject=told.append)
+    for length in (0, 3, 8, 44, 64):
+        assert assembler.on_chunk(bytes(length), 0) is None
+    assert assembler.stats.bad_length == len(told) == 5
+    assert str(told[2]).endswith("allowed: 48 bytes (chunk)")
 
 
 def test_frames_of_the_wrong_length_are_rejected_and_reported() -> None:

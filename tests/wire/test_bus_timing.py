@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.errors import ConfigError
-from skinnode.wire.timing import BusLoad, exact_bits, exact_bits_batch, nominal_bits, worst_case_bits
+from skinnode.wire.timing import (
+    BusLoad,
+    exact_bits,
+    exact_bits_batch,
+    fd_bits,
+    fd_length,
+    nominal_bits,
+    worst_case_bits,
+)
 
 # Runs of equal bits are what stuffing is about, so bytes are drawn that make them.
 BYTE = st.sampled_from([0x00, 0xFF, 0x0F, 0xF0, 0xE0, 0x07, 0x83, 0x55]) | st.integers(0, 255)
@@ -113,6 +121,66 @@ def test_bus_load_counts_foreign_frames_and_many_of_them() -> None:
     extra = exact_bits(0x1234_5678, b"\x01", extended=True) + exact_bits(0x705, b"", remote=True, dlc=1)
     assert load.bits == 10_000 * 53 + extra
     assert load.load(0.0) == 0.0
+
+
+# --- CAN FD
+
+FD_CODES = {**{n: n for n in range(9)}, 12: 9, 16: 10, 20: 11, 24: 12, 32: 13, 48: 14, 64: 15}
+"""Bytes to length code: ISO 11898-1, table of the data length code."""
+FD_DATA = st.sampled_from(sorted(FD_CODES)).flatmap(
+    lambda n: st.lists(BYTE, min_size=n, max_size=n).map(bytes)
+)
+
+
+def fd_bits_on_a_naive_bus(can_id: int, data: bytes) -> tuple[int, int]:
+    """Nominal and data bits of an FD frame sent bit by bit."""
+    bits = f"0{can_id:011b}001" + "01" + f"0{FD_CODES[len(data)]:04b}" + "".join(f"{b:08b}" for b in data)
+    counts, fast, equal, last = [0, 0], 0, 0, ""
+    for place, bit in enumerate(bits):
+        fast = int(place >= 17)  # from ESI on
+        equal = equal + 1 if bit == last else 1
+        last = bit
+        counts[fast] += 1
+        if equal == 5 and place + 1 < len(bits):  # after the last there is a fixed stuff bit anyway
+            last, equal = "10"[int(bit)], 1
+            counts[fast] += 1
+    checked = "c" * 4 + "r" * (17 if len(data) <= 16 else 21)
+    fixed = len([place for place in range(len(checked)) if place % 4 == 0])  # one before each 4
+    return counts[0] + 1 + 1 + 7 + 3, counts[1] + len(checked) + fixed + 1
+
+
+@settings(deadline=None, max_examples=300)
+@given(frames=st.lists(st.tuples(STANDARD, FD_DATA), min_size=1, max_size=6))
+def test_fd_frames_as_on_the_naive_bus(frames: list[tuple[int, bytes]]) -> None:
+    expected = [fd_bits_on_a_naive_bus(can_id, data) for can_id, data in frames]
+    for (can_id, data), bits in zip(frames, expected, strict=True):
+        payload = np.frombuffer(data, dtype=np.uint8).reshape(1, -1)
+        assert tuple(int(part[0]) for part in fd_bits([can_id], payload)) == bits
+        assert bits[0] <= 32
+        assert bits[1] <= 33 + 5 * (len(data) > 16) + 10 * len(data)
+    load = BusLoad(1_000_000, 5_000_000)
+    for can_id, data in frames:
+        load.add(can_id, data, fd=True)
+    load.add(0, b"")  # a classic one among them: 53 bits
+    assert load.frames == len(frames) + 1
+    assert load.bits == round(53 + sum(nominal + fast / 5 for nominal, fast in expected))
+
+
+def test_an_fd_frame_of_one_wire_takes_about_a_sixth_of_a_millisecond() -> None:
+    nominal, fast = fd_bits([0x185], np.arange(64, dtype=np.uint8).reshape(1, 64))
+    assert 140 < nominal[0] + fast[0] / 5 < 168
+
+
+def test_lengths_of_fd_frames() -> None:
+    lengths = sorted(FD_CODES)
+    for n in range(65):
+        assert fd_length(n) == next(length for length in lengths if length >= n)
+    with pytest.raises(ValueError, match="got 65 bytes, must be at most 64"):
+        fd_length(65)
+    with pytest.raises(ValueError, match="got 9 bytes"):
+        fd_bits([1], np.zeros((1, 9)))
+    with pytest.raises(ValueError, match=r"must be \(n,\)"):
+        fd_bits([1], np.zeros((2, 8)))
 
 
 def test_what_is_no_frame_is_refused() -> None:

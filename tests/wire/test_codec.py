@@ -16,6 +16,8 @@ from skinnode.wire.codec import (
     CodeScale,
     SendMode,
     SummaryFlag,
+    chunk_indexer,
+    chunk_of_code,
     decode,
     encode,
     pack_chunk,
@@ -194,6 +196,45 @@ def test_a_scan_is_packed_in_row_major_order_and_reads_back(
         assert frame == expected
     assert len(frames) == profile.n_chunks
     np.testing.assert_array_equal(unpack_scan(b"".join(frames), profile), codes)
+
+
+@pytest.mark.parametrize(
+    ("columns", "bits", "starts", "length"),
+    [
+        (1, 16, [0], 6),
+        (2, 16, [0], 8),
+        (4, 24, [0], 16),
+        (30, 16, [0], 64),
+        (20, 24, [0], 64),
+        (30, 24, [0, 15], 64),  # 4 + 45 bytes
+        (31, 16, [0, 16], 48),  # 4 + 32 bytes
+        (254, 16, [29 * n for n in range(9)], 64),
+        (254, 24, [20 * n for n in range(13)], 64),
+    ],
+)
+def test_over_can_fd_a_frame_is_a_part_of_one_wire(
+    columns: int, bits: int, starts: list[int], length: int
+) -> None:
+    profile = PatchProfile(3, columns, 1, 1, bits, bus="fd")
+    codes = np.random.default_rng(columns).integers(0, 1 << bits, (3, columns))
+    frames = pack_scan(codes, 200, profile)
+    ends = [*starts[1:], columns]
+    expected = [
+        struct.pack("<BBH", wire, 200, start)
+        + b"".join(struct.pack("<I", code)[: bits // 8] for code in codes[wire, start:end].tolist())
+        for wire in range(3)
+        for start, end in zip(starts, ends, strict=True)
+    ]
+    assert frames == [frame.ljust(length, b"\0") for frame in expected]
+    assert profile.chunk_bytes == length
+    np.testing.assert_array_equal(unpack_scan(b"".join(frames), profile), codes)
+    indexed = [chunk_indexer(profile)(frame) for frame in frames]
+    assert indexed == list(range(profile.n_chunks))
+    for chunk, (frame, wire_start) in enumerate(
+        zip(frames, [(wire, start) for wire in range(3) for start in starts], strict=True)
+    ):
+        assert (frame[0], int.from_bytes(frame[2:4], "little")) == wire_start
+        assert chunk_of_code(profile)[wire_start] == chunk
 
 
 @pytest.mark.parametrize("length", [0, 7, 9, 64])

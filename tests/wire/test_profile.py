@@ -10,6 +10,7 @@ from pathlib import Path
 
 import canopen
 import dcf
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -18,7 +19,7 @@ from skinnode.cli.eds import eds
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
 from skinnode.wire import indices as od
-from skinnode.wire.codec import pack_chunk, pack_command, pack_summary
+from skinnode.wire.codec import pack_command, pack_scan, pack_summary
 from skinnode.wire.dictionary import DataType, Entry, ObjectType
 from skinnode.wire.profile import DEFAULT_PERIOD_MS, REFERENCE_PROFILES, PatchProfile, eds_name, eds_text
 
@@ -29,6 +30,7 @@ PROFILES = [
     PatchProfile(1, 1, 1, 1, 16),
     PatchProfile(33, 7, 255, 255, 24),
     PatchProfile(3, 254, 1, 1, 16),
+    PatchProfile(3, 61, 1, 1, 24, bus="fd"),
 ]
 
 
@@ -182,7 +184,9 @@ def test_default_mappings_name_mappable_entries_of_the_right_length(
 ) -> None:
     known = entries(profile)
     count = known[index, 0].default
-    mapped = [known[index, sub].default for sub in range(1, 9)]
+    slots = 64 if profile.bus == "fd" else 8
+    mapped = [known[index, sub].default for sub in range(1, slots + 1)]
+    assert (index, slots + 1) not in known
     bits = 0
     for value in mapped[:count]:
         entry = known[value >> 16, value >> 8 & 0xFF]
@@ -190,8 +194,11 @@ def test_default_mappings_name_mappable_entries_of_the_right_length(
         assert value & 0xFF == entry.data_type.bits
         assert entry.access == ("rww" if index == 0x1600 else "ro")
         bits += value & 0xFF
-    assert mapped[count:] == [0] * (8 - count)
-    assert bits == (48 if index == 0x1600 else 64)
+    assert mapped[count:] == [0] * (slots - count)
+    chunk = 8 * profile.chunk_bytes
+    if profile.bus == "fd":  # before padding
+        chunk = 32 + profile.codes_per_chunk * profile.code_bits
+    assert bits == {0x1600: 48, 0x1A00: chunk, 0x1A01: 64}[index]
 
 
 @pytest.mark.parametrize("reference", REFERENCE_PROFILES, ids=eds_name)
@@ -200,12 +207,18 @@ def test_canopen_decodes_our_payloads_through_the_default_mapping(reference: Pat
     node.tpdo.read(from_od=True)
     node.rpdo.read(from_od=True)
     chunk, summary, command = node.tpdo[1], node.tpdo[2], node.rpdo[1]
-    codes = [0x0102, 0xFFFD, 7] if reference.code_bits == 16 else [0x010203, 0xFFFFFD]
-    chunk.data = bytearray(pack_chunk(9, 200, codes, reference.code_bits))
+    scan = np.random.default_rng(1).integers(0, 1 << reference.code_bits, (10, 30))
+    payload, per = pack_scan(scan, 200, reference)[9], reference.codes_per_chunk
+    chunk.data = bytearray(payload)
+    if reference.bus == "classic":
+        head, codes = [9, 200], scan.ravel()[9 * per : 10 * per].tolist()
+    else:
+        wire, first = (9, 0) if per == 30 else (4, 15)
+        head, codes = [wire, 200, first], scan[wire, first : first + per].tolist()
     summary.data = bytearray(pack_summary(200, 3, 77, 0xDEADBEEF))
     command.data = bytearray(pack_command(tare=True, single_scan=True))
     assert [(v.index, v.subindex, v.raw) for v in chunk] == [
-        (0x2010, sub, value) for sub, value in enumerate([9, 200, *codes], 1)
+        (0x2010, sub, value) for sub, value in enumerate([*head, *codes], 1)
     ]
     assert [v.raw for v in summary] == [200, 3, 77, 0xDEADBEEF]
     assert [(v.index, v.subindex, v.raw) for v in command] == [
@@ -226,7 +239,7 @@ def test_canopen_decodes_our_payloads_through_the_default_mapping(reference: Pat
 
 
 def test_chunks_hold_three_narrow_or_two_wide_codes() -> None:
-    narrow, wide = REFERENCE_PROFILES
+    narrow, wide = REFERENCE_PROFILES[:2]
     assert (narrow.n_codes, narrow.codes_per_chunk, narrow.n_chunks) == (300, 3, 100)
     assert (wide.n_codes, wide.codes_per_chunk, wide.n_chunks) == (300, 2, 150)
     assert PatchProfile(1, 4, 1, 1).n_chunks == 2

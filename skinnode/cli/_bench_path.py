@@ -48,6 +48,11 @@ FIGURE8: Final = (5, 10, 20, 50)
 FIGURE9: Final = (10, 20, 50, 100)
 FIGURE10: Final = (1e-3, 1e-4, 1e-5, 1e-6)
 RELAXED: Final = 1e-4
+LABELS: Final = {
+    "levenberg_marquardt": "Levenberg-Marquardt",
+    "gauss_newton": "Gauss-Newton",
+    "dogleg": "dogleg",
+}
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
 """Calls of F that F and J by forward differences cost."""
@@ -130,7 +135,7 @@ def run(count: int) -> dict[str, Any]:
         "experiments": count,
         "paper": printed(),
         "settings": settings,
-        "ten_steps_ms": _ten_steps(),
+        "ten_steps": _ten_steps(),
         "surface": _surface(),
     }
 
@@ -284,8 +289,9 @@ def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Floa
     return r, jacobian(layout, upper_m)[0].reshape(len(a), -1) * a[:, None] * layout.pitch_m
 
 
-def _ten_steps() -> dict[str, float]:
-    """Time of the ten-step path on ``staggered``: of one wire called alone, and of one of a patch of ten."""
+def _ten_steps() -> list[dict[str, Any]]:
+    """Time and error of the ten-step path on ``staggered``: of one wire called alone, by each operator and as
+    we do it, and of one of a patch of ten."""
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
     points = layout.upper_m[..., :2].reshape(-1, 2)
@@ -293,13 +299,26 @@ def _ten_steps() -> dict[str, float]:
     patch = [resistance_ohm(layout, layout.upper_m + u) for u in moved]
     chosen = one.samples_ohm[SAMPLES // 10 - 1 :: SAMPLES // 10]
     plain = Uniform(plain=True)
-    calls: dict[str, Callable[[], object]] = {
-        "alone": lambda: solve_path(one.layout, chosen, schedule=plain),
-        "of the ten of a patch": lambda: solve_path(layout, patch, schedule=plain),
-    }
+
+    def alone(operator: str, schedule: Schedule) -> Callable[[], PathResult]:
+        return lambda: solve_path(one.layout, chosen, operator=operator, schedule=schedule)
+
+    calls = {f"alone, {LABELS[operator]}": alone(operator, plain) for operator in OPERATORS}
+    calls["alone, ours"] = alone("dogleg", Uniform())
+    calls["of the ten of a patch, dogleg"] = lambda: solve_path(layout, patch, schedule=plain)
     times = take_turns(calls, rounds=11)
-    alone, shared = (times[name].call_us / 1e3 for name in calls)
-    return {"alone": alone, "of the ten of a patch": shared / layout.shape[0]}
+    rows = []
+    for what, call in calls.items():
+        path = call()
+        truth = one.truth_m if len(path.status) == 1 else moved[-1]
+        rows.append(
+            {
+                "what": what,
+                "ms": times[what].call_us / 1e3 / len(path.status),
+                "error": float(np.linalg.norm(path.displacement_m - truth) / np.linalg.norm(truth)),
+            }
+        )
+    return rows
 
 
 def _surface() -> dict[str, Any]:
@@ -340,11 +359,6 @@ def _surface() -> dict[str, Any]:
 # -- print ---------------------------------------------------------------------------------------------
 
 Say = Callable[[str], None]
-LABELS: Final = {
-    "levenberg_marquardt": "Levenberg-Marquardt",
-    "gauss_newton": "Gauss-Newton",
-    "dogleg": "dogleg",
-}
 
 
 def print_all(figures: dict[str, Any], say: Say) -> None:
@@ -353,8 +367,9 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second try.")
     say("Tol_X: the largest correction still to come, pitches. Times: medians of the call for the one wire.")
-    for what, spent in figures["ten_steps_ms"].items():
-        say(f"Ten-step path of one wire, {what}: {spent:.2f} ms (paper: 2.03 s)")
+    say("Ten-step path of one wire (paper: 2.03 s)")
+    for row in figures["ten_steps"]:
+        say(f"  {row['what']:32}{row['ms']:6.2f} ms, error {100 * row['error']:.0e} %")
     for setting in figures["settings"]:
         say(
             f"\n== {setting['layout']}, h = {setting['height']:g} pitches, press {setting['depth']:.0%} of it"

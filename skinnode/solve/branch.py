@@ -21,9 +21,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skinnode.jit import njit
 from skinnode.model.forward import jacobian
 from skinnode.model.kernels import potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.linear import Index, dot, largest, lu_factor, lu_solve_transposed, padded
 from skinnode.solve.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
@@ -31,7 +33,7 @@ CORRELATION_PITCHES: Final = 1.0
 82 random presses each of 70 % on staggered, h = 0.5, and 10, 30 and 50 % on h = 1; 0.7 and 1.5 lose more."""
 ROUGH_SHARE: Final = 1e-3
 """Share of C that is not smooth, so that C⁻¹ exists in floating point."""
-NOISE_LEVELS: Final = tuple(10.0 ** (-0.5 * np.arange(2, 16)))
+NOISE_LEVELS: Final = 10.0 ** (-0.5 * np.arange(2, 16))
 """Standard deviations of r the guided start goes through, 0.1 to 3e-8, one step each. Whole decades lose one
 wire in a hundred more at h = 1 and 50 %."""
 POWER_STEPS: Final = 8
@@ -65,22 +67,30 @@ class Smoothness:
 
     def __init__(self, problem: PatchProblem) -> None:
         self._problem = problem
-        electrodes: Float = problem.layout.upper_m / problem.layout.pitch_m
-        gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]
-        smooth = np.exp(-(gaps**2).sum(axis=-1) / (2.0 * CORRELATION_PITCHES**2))
-        smooth += ROUGH_SHARE * np.eye(electrodes.shape[1])
-        each = np.eye(3)
-        scale = problem.step_limit**2  # of a displacement; its size hardly matters, tenfold either way
-        self.covariance: Float = scale * np.einsum("uij,cd->uicjd", smooth, each).reshape(
-            len(electrodes), problem.rest.shape[1], -1
-        )
+        covariance, self._whitening = _smooth(problem.layout, problem.step_limit)
+        self.covariance: Float = covariance
         """(U, n, n)"""
-        self._whitening = np.linalg.inv(np.linalg.cholesky(smooth)) / problem.step_limit
 
     def roughness(self, x: Float) -> Float:
         """(U,) √(uᵀ C⁻¹ u) of x (U, n), in standard deviations."""
         displacement = (x - self._problem.rest).reshape(self._problem.layout.upper_m.shape)
         return np.asarray(np.sqrt(((self._whitening @ displacement) ** 2).sum(axis=(1, 2))))
+
+
+@functools.lru_cache(maxsize=64)
+def _smooth(layout: PatchLayout, size: float) -> tuple[Float, Float]:
+    """(U, n, n) C for displacements of ``size``, which hardly matters, tenfold either way; (U, N, N) the
+    inverse of its Cholesky factor, of one coordinate."""
+    electrodes: Float = layout.upper_m / layout.pitch_m
+    wires, most = electrodes.shape[:2]
+    gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]
+    smooth = np.exp(-(gaps**2).sum(axis=-1) / (2.0 * CORRELATION_PITCHES**2))
+    smooth += ROUGH_SHARE * np.eye(most)
+    covariance = size**2 * np.einsum("uij,cd->uicjd", smooth, np.eye(3)).reshape(wires, 3 * most, -1)
+    whitening = np.linalg.inv(np.linalg.cholesky(smooth)) / size
+    covariance.setflags(write=False)
+    whitening.setflags(write=False)
+    return covariance, whitening
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
@@ -89,22 +99,67 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
     ``a`` (K,). Any covariance will do; that of elastic rubber would know the neighbouring wires as well. The
     rest position where it runs into an electrode.
     """
-    rest = problem.rest[wire]
-    x = rest.copy()
-    f, jt = np.empty(a.size), np.empty((rest.size, a.size))
-    for count, noise in enumerate(NOISE_LEVELS):
-        potential_jacobian(x, problem.lower, f, jt)
-        jt *= a
-        spread = covariance @ jt
-        inner = jt.T @ spread
-        inner[np.diag_indices_from(inner)] += noise * noise
-        try:
-            x = rest + spread @ np.linalg.solve(inner, (x - rest) @ jt - (a * f - 1.0))
-        except np.linalg.LinAlgError:
-            x = np.full_like(rest, np.nan)
-        if not np.isfinite(x).all():
-            return rest.copy(), count + 1
-    return x, len(NOISE_LEVELS)
+    n, equations = problem.rest.shape[1], a.size
+    x = problem.rest[wire].copy()
+    evaluations = _follow_noise(
+        x, problem.rest[wire], problem.lower, a, covariance, NOISE_LEVELS, np.empty(equations),
+        *np.empty((2, n, equations)), padded(equations + 3, equations), np.empty(equations, np.int64),
+    )  # fmt: skip
+    return x, evaluations
+
+
+@njit
+def _follow_noise(
+    x: Float,
+    rest: Float,
+    lower: Float,
+    a: Float,
+    covariance: Float,
+    noises: Float,
+    y: Float,
+    jt: Float,
+    spread: Float,
+    inner: Float,
+    pivot: Index,
+) -> int:
+    """One Gauss-Newton step a noise level into ``x`` (n,), C Jᵀ (J C Jᵀ + σ²)⁻¹ y with y = J (x − rest) − r;
+    evaluations. All behind ``noises`` is scratch, ``inner`` with zeros as :func:`lu_factor` wants it."""
+    n, equations = jt.shape
+    for level in range(noises.size):
+        potential_jacobian(x, lower, y, jt)
+        for k in range(equations):
+            y[k] = 1.0 - a[k] * y[k]
+        for i in range(n):
+            row, moved = jt[i], x[i] - rest[i]
+            for k in range(equations):
+                row[k] *= a[k]
+                y[k] += moved * row[k]
+        inner[:equations, :equations] = 0.0
+        for i in range(n):
+            target, source = spread[i], jt[i]
+            target[:] = 0.0
+            for j in range(n):
+                share = covariance[i, j]
+                if share != 0.0:
+                    row = jt[j]
+                    for k in range(equations):
+                        target[k] += share * row[k]
+            for k in range(equations):
+                row = inner[k]
+                for m in range(equations):
+                    row[m] += source[k] * target[m]
+        for k in range(equations):
+            inner[k, k] += noises[level] * noises[level]
+        found = lu_factor(inner, pivot) != 0
+        if found:
+            lu_solve_transposed(inner, pivot, y)
+            for i in range(n):
+                x[i] = rest[i] + dot(spread[i], y)
+        if not (found and largest(x) < math.inf):
+            for i in range(n):
+                x[i] = rest[i]
+            return level + 1
+    return noises.size
 
 
 def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:

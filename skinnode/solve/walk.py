@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinnode.jit import njit
 from skinnode.model.layout import Float
 from skinnode.solve import operators as op
 from skinnode.solve import wires
@@ -97,14 +98,7 @@ class Walk:
         """Move every wire on towards a sample, on the secant through the last two points solved: as far as
         the change of R is a multiple of the last change, and no farther than the trust radius."""
         (x_before, a_before), (x, a) = self._points
-        old, new = a / a_before - 1.0, self._knots[sample + 1] / a - 1.0
-        square = (old * old).sum(axis=1)
-        share = (new * old).sum(axis=1) / np.maximum(square, TINY)
-        move = share[:, None] * (x - x_before)
-        longest = np.abs(move).max(axis=1, keepdims=True)
-        reach = self.problem.step_limit
-        move *= reach / np.maximum(longest, reach)
-        self.solver.x[:] = x + np.where(np.isfinite(move), move, 0.0)
+        _secant(x_before, a_before, x, a, self._knots[sample + 1], self.problem.step_limit, self.solver.x)
 
     def solve(self, sample: int, tolerance: float, most_steps: int) -> Index:
         """Solve a sample from where the wires are; (U,) steps, 0 where the first-order optimality was below
@@ -377,3 +371,23 @@ class Walk:
         every = np.arange(self.wires)
         first, second = self._knots[before + 1, every], self._knots[before + 2, every]
         return np.where(share == 1.0, second, first + share * (second - first))
+
+
+@njit
+def _secant(
+    x_before: Float, a_before: Float, x: Float, a: Float, a_next: Float, reach: float, out: Float
+) -> None:
+    """x + share (x − x_before) of every wire into ``out`` (U, n), no coordinate by more than ``reach``; the
+    share is that of the last change of a in the next. ``x`` where that is not finite."""
+    for u in range(x.shape[0]):
+        along, square, longest = 0.0, TINY, reach
+        for k in range(a.shape[1]):
+            change = a[u, k] / a_before[u, k] - 1.0
+            along += change * (a_next[u, k] / a[u, k] - 1.0)
+            square += change * change
+        share = along / square
+        for j in range(x.shape[1]):
+            longest = max(longest, abs(share * (x[u, j] - x_before[u, j])))
+        for j in range(x.shape[1]):
+            move = share * (x[u, j] - x_before[u, j]) * (reach / longest)
+            out[u, j] = x[u, j] + (move if math.isfinite(move) else 0.0)

@@ -116,7 +116,8 @@ def path(figures: dict[str, Any]) -> str:
     ten = "; ".join(f"{row['what']}: {row['ms']:.2f} ms" for row in figures["ten_steps"])
     worst = max(row["error"] for row in figures["ten_steps"])
     parts.append(
-        f"Ten-step path of one wire at the first setting, to {percent(worst)}: {ten}. The paper prints 2.03 s."
+        f"Ten-step path of one wire at the first setting, to {percent(worst)}: {ten}. "
+        "The paper prints 2.03 s."
     )
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _all_rows(setting))
     parts.append(f"Converged and wrong, all settings and schedules: {wrong}.")

@@ -33,7 +33,7 @@ CORRELATION_PITCHES: Final = 1.0
 82 random presses each of 70 % on staggered, h = 0.5, and 10, 30 and 50 % on h = 1; 0.7 and 1.5 lose more."""
 ROUGH_SHARE: Final = 1e-3
 """Share of C that is not smooth, so that C⁻¹ exists in floating point."""
-NOISE_LEVELS: Final = 10.0 ** (-0.5 * np.arange(2, 16))
+NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
 """Standard deviations of r the guided start goes through, 0.1 to 3e-8, one step each. Whole decades lose one
 wire in a hundred more at h = 1 and 50 %."""
 POWER_STEPS: Final = 8
@@ -101,10 +101,11 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()
+    y, (jt, spread) = np.empty(equations), np.empty((2, n, equations))
+    inner, pivot = padded(equations + 3, equations), np.empty(equations, np.int64)
     evaluations = _follow_noise(
-        x, problem.rest[wire], problem.lower, a, covariance, NOISE_LEVELS, np.empty(equations),
-        *np.empty((2, n, equations)), padded(equations + 3, equations), np.empty(equations, np.int64),
-    )  # fmt: skip
+        x, problem.rest[wire], problem.lower, a, covariance, NOISE_LEVELS, y, jt, spread, inner, pivot
+    )
     return x, evaluations
 
 

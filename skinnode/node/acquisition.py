@@ -62,9 +62,9 @@ class Acquisition:
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
         """R0 as the object dictionary keeps it: REAL32; 0 where there is none."""
-        self.codes: Codes = np.zeros(shape, dtype=np.uint32)
-        """(U, K) of the last scan."""
-        self.faults = find_faults(self.codes, scale)
+        self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
+        """(U, K) of the last scan; none has a resistance before the first one."""
+        self.faults = WireFaults.none(profile)
         self._sent: Codes | None = None  # what the host has, chunk by chunk; None: nothing it could rely on
         self._since_full = 0
 

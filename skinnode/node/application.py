@@ -1,7 +1,7 @@
 """What a node is for: scans of the patch, at SYNC, by its own timer or on command; tare; wire faults.
 
-Connects the manufacturer's objects (0x2000 to 0x2301) with the acquisition behind them and the TPDO engine
-before them. The communication around it is in :mod:`skinnode.node.device`.
+Connects the manufacturer's objects (0x2000 to 0x2301) with the acquisition behind them and the stream of
+scans before them. The communication around it is in :mod:`skinnode.node.device`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.device import Services
 from skinnode.node.emcy import EmcyCode
 from skinnode.node.od import ObjectStore
-from skinnode.node.tpdo import OutgoingScan
+from skinnode.node.stream import OutgoingScan, ScanStream
 from skinnode.wire import indices as od
 from skinnode.wire.codec import SendMode, SummaryFlag, pack_scan
 from skinnode.wire.coordinates import pack_coordinates
@@ -35,10 +35,14 @@ class PatchApplication:
         serial: int,
         acquisition: Acquisition,
         services: Services,
+        catch_up_ns: int,
     ) -> None:
         self._profile, self._acquisition = profile, acquisition
         self._store, self._now = services.store, services.now
-        self._tpdos, self._emcy = services.tpdos, services.emcy
+        self._emcy = services.emcy
+        unknown = np.full((profile.rows, profile.columns), acquisition.scale.open, dtype=np.uint32)
+        first_chunk = pack_scan(unknown, 0, profile)[0]
+        self.stream = ScanStream(services.store, services.tpdos, first_chunk, catch_up_ns)
         self._operational = False
         self._counter = -1
         self._period_ns = 0
@@ -47,12 +51,16 @@ class PatchApplication:
         self._baseline_changed = False
         self.overruns = 0
         """Scans skipped because two others were still to be sent."""
-        self.deadline_ns = NO_DEADLINE_NS
-        """When :meth:`on_timer` has a scan of the node's own timer to take."""
+        self._scan_ns = NO_DEADLINE_NS  # when the node's own timer has a scan to take
         self._describe(layout, serial)
         self._connect()
 
     # --- events
+
+    @property
+    def deadline_ns(self) -> int:
+        """When :meth:`on_timer` has a scan to take or to send."""
+        return min(self._scan_ns, self.stream.deadline_ns)
 
     def power_on(self, t_ns: int) -> None:
         """Tare, unless there is a baseline from before."""
@@ -69,18 +77,22 @@ class PatchApplication:
         self._operational = operational
         if operational:
             self._acquisition.forget_sent()
+        else:
+            self.stream.stop()
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
         """A SYNC came, in OPERATIONAL; ``turns`` are the synchronous TPDOs whose turn it is."""
+        self.stream.on_sync(turns, t_ns)
         if not self._period_ns:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Take the scan that is due, if one is."""
-        if t_ns >= self.deadline_ns:
-            self.deadline_ns = max(self.deadline_ns + self._period_ns, t_ns)
+        """Take the scan that is due, if one is, and send what is due of those taken."""
+        if t_ns >= self._scan_ns:
+            self._scan_ns = max(self._scan_ns + self._period_ns, t_ns)
             self._scan(self._following(), frozenset(), t_ns)
+        self.stream.on_timer(t_ns)
 
     # --- scans
 
@@ -91,7 +103,7 @@ class PatchApplication:
         """Sample now; the engine sends. Skipped, and counted, when a sampled scan waits to be sent
         already."""
         self._counter = counter
-        if self._tpdos.full:
+        if self.stream.full:
             self.overruns += 1
             if not self._late:
                 self._late = True
@@ -113,8 +125,8 @@ class PatchApplication:
             if changed is not None:
                 flags |= SummaryFlag.CHANGED_ONLY
                 chunks = [chunks[index] for index in changed]
-        self._tpdos.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
-        if self._late and not self._tpdos.full:
+        self.stream.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
+        if self._late and not self.stream.full:
             self._late = False
             self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
 
@@ -146,10 +158,10 @@ class PatchApplication:
         put(od.COORDINATES, 0, pack_coordinates(layout))
 
     def _connect(self) -> None:
-        store, acquisition, tpdos = self._store, self._acquisition, self._tpdos
+        store, acquisition, stream = self._store, self._acquisition, self.stream
         chunk, summary = _fields(store, od.CHUNK), _fields(store, od.SUMMARY)
-        store.bind(od.CHUNK, lambda sub: tpdos.chunk[chunk[sub]])
-        store.bind(od.SUMMARY, lambda sub: tpdos.summary[summary[sub]])
+        store.bind(od.CHUNK, lambda sub: stream.chunk[chunk[sub]])
+        store.bind(od.SUMMARY, lambda sub: stream.summary[summary[sub]])
         store.watch(od.SEND_POLICY, lambda _: acquisition.forget_sent())
         store.guard(od.ACQUISITION, self._guard_acquisition)
         store.watch(od.ACQUISITION, self._on_acquisition)
@@ -212,7 +224,7 @@ class PatchApplication:
     def _plan(self) -> None:
         self._period_ns = self._store.integer(od.ACQUISITION, od.ACQUISITION_PERIOD) * 1_000_000
         runs = self._operational and self._period_ns
-        self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
+        self._scan_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
 
 def _fields(store: ObjectStore, index: int) -> dict[int, slice]:

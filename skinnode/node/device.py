@@ -8,7 +8,6 @@ test does so with numbers. No frame whatever raises out of it; an error of the a
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,25 +15,24 @@ from typing import Final, Protocol
 
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, PdoRecords, check_cob_id
 from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.node.rpdo import RpdoEngine
 from skinnode.node.sdo import SdoServer
+from skinnode.node.sync import Sync
 from skinnode.node.time_of_day import TimeConsumer
 from skinnode.node.tpdo import TpdoEngine
 from skinnode.wire import indices as od
 from skinnode.wire.dictionary import Object
-from skinnode.wire.timing import fd_length
 
 HARDWARE_VERSION: Final = "none"
 """A node in software has no board."""
 
 _COMMUNICATION: Final = 0x1000, 0x1FFF
 _EVERYTHING: Final = 0x1000, 0x9FFF
-_SYNC_PRODUCER_BIT: Final = 1 << 30
 
 Send = Callable[[int, bytes], None]
 """Takes COB-ID and payload."""
@@ -90,7 +88,6 @@ class CanopenDevice:
         application: made once, with the services of the device.
         send: called with COB-ID and payload of every frame the node sends, in order.
         serial: serial number (0x1018:4), u32.
-        catch_up_ns: see :mod:`skinnode.node.tpdo`; 0 for a strict inhibit time.
 
     Raises ValueError for an argument out of range. The node is silent until :meth:`power_on`.
     """
@@ -103,7 +100,6 @@ class CanopenDevice:
         *,
         send: Send,
         serial: int,
-        catch_up_ns: int,
     ) -> None:
         if not 1 <= node_id <= 127:
             raise ValueError(f"node_id: got {node_id}, must be 1 to 127")
@@ -128,14 +124,13 @@ class CanopenDevice:
             self._communication_failed,
         )
         self._time = TimeConsumer(self._store, self._now)
-        tpdos = sum(od.TPDO1_PARAMETER <= item.index < od.TPDO1_PARAMETER + od.MAX_PDOS for item in objects)
-        self._tpdos = TpdoEngine(self._store, tpdos, send, self._now, catch_up_ns)
-        self._rpdo = PdoRecords(self._store, od.RPDO1_PARAMETER, od.RPDO1_MAPPING, transmits=False)
-        self._command = self._rpdo.read()
-        self._pending_command: bytes | None = None  # of a synchronous RPDO, until the next SYNC
-        self._wrong_sync_length: int | None = None
+        store, emcy, now, rejected = self._store, self._emcy, self._now, self._rejected
+        tpdos, rpdos = (_count(objects, first) for first in (od.TPDO1_PARAMETER, od.RPDO1_PARAMETER))
+        self._tpdos = TpdoEngine(store, tpdos, send, now)
+        self._rpdos = RpdoEngine(store, rpdos, emcy, rejected, now)
+        self._sync = Sync(store, emcy, rejected, send, now)
         self._handlers: dict[int, Handler] = {}
-        self._application = application(Services(self._store, self._tpdos, self._emcy, self._now))
+        self._application = application(Services(store, self._tpdos, emcy, now))
         self._describe(serial)
         self._connect()
 
@@ -159,17 +154,21 @@ class CanopenDevice:
         if remote:
             if can_id == od.heartbeat_cob_id(self.node_id):
                 self._error_control.on_request(self.nmt_state, t_ns)
-            return
-        handler = self._handlers.get(can_id)
-        if handler is not None:
+            elif self.nmt_state is NmtState.OPERATIONAL:
+                self._tpdos.on_remote(can_id, t_ns)
+        elif (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
+        else:
+            self._rpdos.on_frame(can_id, data, t_ns)
 
     def next_deadline_ns(self) -> int | None:
         """When :meth:`on_timer` is to be called; None while there is nothing to wait for."""
         if self.nmt_state is NmtState.INITIALISING:
             return None
         deadline_ns = min(
+            self._sync.deadline_ns,
             self._tpdos.deadline_ns,
+            self._rpdos.deadline_ns,
             self._error_control.deadline_ns,
             self._application.deadline_ns,
             self._emcy.deadline_ns,
@@ -183,8 +182,12 @@ class CanopenDevice:
             return
         self._now_ns = t_ns
         self._error_control.on_timer(self.nmt_state, t_ns)
+        sync = self._sync.on_timer(t_ns)
+        if sync is not None:
+            self._synchronise(sync, t_ns)
         self._application.on_timer(t_ns)
         self._tpdos.on_timer(t_ns)
+        self._rpdos.on_timer(t_ns)
         self._emcy.on_timer(t_ns)
         self._sdo.on_timer(t_ns)
 
@@ -217,8 +220,9 @@ class CanopenDevice:
             self._time.reset()
         self._emcy.reset()
         self._error_control.reset()
-        self._wrong_sync_length = None
         self._tpdos.restore()
+        self._rpdos.restore()
+        self._sync.reload()
         self._application.reset()
         self._reload()
         self._error_control.boot_up(t_ns)
@@ -228,13 +232,14 @@ class CanopenDevice:
         if state is self.nmt_state:
             return
         was, self.nmt_state = self.nmt_state, state
-        self._pending_command = None
         if not state.communicates:
             self._sdo.reset()
         if state is NmtState.OPERATIONAL:
             self._tpdos.start(t_ns)
         elif was is NmtState.OPERATIONAL:
             self._tpdos.stop()
+        self._rpdos.enter(operational=state is NmtState.OPERATIONAL)
+        self._sync.enter(communicates=state.communicates)
         self._application.enter(operational=state is NmtState.OPERATIONAL)
         self._emcy.allow(state.communicates, t_ns)
 
@@ -261,49 +266,19 @@ class CanopenDevice:
         self._send(od.sdo_response_cob_id(self.node_id), response)
 
     def _on_sync(self, data: bytes, t_ns: int) -> None:
-        if not self.nmt_state.communicates:
-            return
-        counted = self._store.integer(od.SYNC_COUNTER_OVERFLOW) > 0
-        if len(data) != counted:
-            self._rejected.count(Rejected.SYNC)
-            if len(data) != self._wrong_sync_length:  # once, not with every SYNC
-                self._wrong_sync_length = len(data)
-                self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(data), counted)), t_ns)
-            return
-        self._wrong_sync_length = None
+        if self.nmt_state.communicates and self._sync.accept(data, t_ns):
+            self._synchronise(data, t_ns)
+
+    def _synchronise(self, sync: bytes, t_ns: int) -> None:
+        """What was received before the SYNC takes effect, the application samples, what was sampled is
+        sent."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
-        if self._pending_command is not None:
-            pending, self._pending_command = self._pending_command, None
-            self._execute(pending)
-        counter = data[0] if counted else None
-        self._application.on_sync(counter, self._tpdos.on_sync(counter, t_ns), t_ns)
-
-    def _on_command(self, data: bytes, t_ns: int) -> None:
-        if self.nmt_state is not NmtState.OPERATIONAL:
-            return
-        wanted = self._command.size
-        if len(data) < wanted:
-            self._rejected.count(Rejected.RPDO)
-            self._emcy.present(EmcyCode.PDO_NOT_PROCESSED, bytes((1, len(data), wanted)), t_ns)
-            return
-        self._emcy.over(EmcyCode.PDO_NOT_PROCESSED, t_ns)
-        if len(data) > fd_length(wanted):  # of a classic frame that is what is wanted itself
-            self._emcy.happened(EmcyCode.PDO_LENGTH_EXCEEDED, bytes((1, len(data), wanted)), t_ns)
-        if self._command.event_driven:
-            self._execute(data)
-        else:
-            self._pending_command = data
-
-    def _execute(self, data: bytes) -> None:
-        """Write the objects mapped into RPDO1. One that refuses its value does not keep the others from
-        theirs: process data have no way to answer."""
-        at = 0
-        for index, subindex in self._command.mapping:
-            size = self._store.find(index, subindex).data_type.bits // 8
-            with contextlib.suppress(Refused):
-                self._store.write(index, subindex, data[at : at + size])
-            at += size
+        counter = sync[0] if sync else None
+        turns = self._tpdos.count_sync(counter)
+        self._rpdos.on_sync()
+        self._application.on_sync(counter, turns, t_ns)
+        self._tpdos.on_sync(turns, t_ns)
 
     def _on_time(self, data: bytes, t_ns: int) -> None:
         if self.nmt_state.communicates and not self._time.on_time(data, t_ns):
@@ -323,36 +298,29 @@ class CanopenDevice:
             # Nothing is kept over a power cycle yet: 0 says so, and commands are refused as CiA 301 wants it.
             store.bind(index, lambda _: bytes(4))
             store.guard(index, _cannot_store)
-        store.guard(od.COB_ID_SYNC, _guard_sync)
-        store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_sync_counter)
-        for index in (od.COB_ID_SYNC, od.COB_ID_TIME, od.RPDO1_PARAMETER, od.RPDO1_MAPPING):
-            store.watch(index, lambda _: self._reload())
+        for index in (od.COB_ID_SYNC, od.CYCLE_PERIOD):
+            store.watch(index, lambda _: self._reload_sync())
+        store.watch(od.COB_ID_TIME, lambda _: self._reload())
+
+    def _reload_sync(self) -> None:
+        self._sync.reload()
+        self._reload()
 
     def _reload(self) -> None:
-        """Listen to the COB-IDs that the object dictionary names."""
-        self._command, self._pending_command = self._rpdo.read(), None
+        """Listen to the COB-IDs that the object dictionary names, other than those of RPDOs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
-        if self._command.enabled:
-            handlers[self._command.cob_id] = self._on_command
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
         # Last, so that no configuration can take the node its SYNC, SDO and NMT.
-        handlers[self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK] = self._on_sync
+        handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
         self._handlers = handlers
 
-    def _guard_sync_counter(self, _: int, value: int) -> None:
-        if value == 1:  # 0, or 2 to 240
-            raise Refused(AbortCode.INVALID_VALUE)
-        if self._store.integer(od.CYCLE_PERIOD):
-            raise Refused(AbortCode.DEVICE_STATE)
 
-
-def _guard_sync(_: int, value: int) -> None:
-    if value & (_SYNC_PRODUCER_BIT | INVALID_BIT):  # this node only consumes SYNC; bit 31 means nothing here
-        raise Refused(AbortCode.INVALID_VALUE)
-    check_cob_id(value, INVALID_BIT)
+def _count(objects: Sequence[Object], first: int) -> int:
+    """PDOs whose parameters stand from ``first`` on."""
+    return sum(first <= item.index < first + od.MAX_PDOS for item in objects)
 
 
 def _cannot_store(_subindex: int, _value: int) -> None:

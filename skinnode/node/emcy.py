@@ -33,6 +33,7 @@ class EmcyCode(IntEnum):
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
+    RPDO_TIMEOUT = 0x8250
 
     @property
     def register_bit(self) -> int:

@@ -29,7 +29,7 @@ class PatchNode(CanopenDevice):
         profile: its wire format. Default: that of the layout, with codes of 16 bits.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
         baseline_ohm: (U, K) R0 remembered from before, ohm; None to tare at the first power-on.
-        catch_up_ns: see :mod:`skinnode.node.tpdo`; 0 for a strict inhibit time.
+        catch_up_ns: see :mod:`skinnode.node.stream`; 0 for a strict inhibit time.
 
     Raises ValueError or ConfigError for an argument out of range. The node is silent until :meth:`power_on`.
     """
@@ -51,17 +51,15 @@ class PatchNode(CanopenDevice):
         self._patch: PatchApplication
 
         def application(services: Services) -> PatchApplication:
-            self._patch = PatchApplication(layout, self.profile, serial, acquisition, services)
+            self._patch = PatchApplication(layout, self.profile, serial, acquisition, services, catch_up_ns)
             return self._patch
 
-        super().__init__(
-            node_id, self.profile.objects(), application, send=send, serial=serial, catch_up_ns=catch_up_ns
-        )
+        super().__init__(node_id, self.profile.objects(), application, send=send, serial=serial)
 
     @property
     def scans_sent(self) -> int:
         """Scans sent to their end since the node was made."""
-        return self._tpdos.scans_sent
+        return self._patch.stream.scans_sent
 
     @property
     def overruns(self) -> int:

@@ -109,6 +109,10 @@ class ObjectStore:
             raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
         return entry
 
+    def has(self, index: int, subindex: int) -> bool:
+        """Whether there is such an object."""
+        return (index, subindex) in self._entries
+
     def lengths(self, index: int, subindex: int) -> Lengths:
         """Bytes that may be written to an object; refuses one that may not be written."""
         entry = self.find(index, subindex)

@@ -5,6 +5,7 @@ Where the standard leaves the abort code open, the ones of CANopenNode, the open
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,11 +13,16 @@ from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.od import ObjectStore
 from skinnode.wire import indices as od
 
-INVALID_BIT: Final = 1 << 31
+INVALID_BIT: Final = od.PDO_INVALID
+NO_RTR_BIT: Final = 1 << 30
 EXTENDED_BIT: Final = 1 << 29
 COB_ID_MASK: Final = 0x7FF
 SYNC_CYCLIC_MAX: Final = 240
+SYNC_REMOTE, REMOTE = 252, 253
+"""Transmission types on remote request only: sampled at SYNC, and when asked."""
 EVENT_TYPES: Final = (254, 255)
+
+_MOST_MAPPED: Final = 64  # entries of a mapping record
 
 _TRANSMITTED: Final = ("const", "ro", "rw", "rwr")
 _RECEIVED: Final = ("wo", "rw", "rww")
@@ -33,7 +39,7 @@ _RESTRICTED: Final = (
 
 def check_cob_id(value: int, current: int) -> None:
     """Refuse a COB-ID that no configurable service may use, or that changes while it is in use."""
-    if value & EXTENDED_BIT or value & ~(INVALID_BIT | 1 << 30) > COB_ID_MASK:
+    if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
     if not value & INVALID_BIT and any(value & COB_ID_MASK in block for block in _RESTRICTED):
         raise Refused(AbortCode.INVALID_VALUE)
@@ -43,18 +49,29 @@ def check_cob_id(value: int, current: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class Mapped:
+    """An object in a PDO. One at the index of a data type is a dummy: so many bytes that say nothing."""
+
+    index: int
+    subindex: int
+    size: int
+    """Bytes."""
+
+
+@dataclass(frozen=True, slots=True)
 class PdoParameters:
     """A PDO as its two records describe it. Times in ns, 0 where not used."""
 
     enabled: bool
     cob_id: int
+    answers_rtr: bool
+    """Whether the COB-ID lets it be asked for by a remote frame."""
     kind: int
     """Transmission type."""
     inhibit_ns: int
     event_timer_ns: int
     sync_start: int
-    mapping: tuple[tuple[int, int], ...]
-    """Index and sub-index of each mapped object."""
+    mapping: tuple[Mapped, ...]
     size: int
     """Bytes of the payload."""
 
@@ -62,70 +79,108 @@ class PdoParameters:
     def event_driven(self) -> bool:
         return self.kind in EVENT_TYPES
 
+    @property
+    def synchronous(self) -> bool:
+        """Cyclic or acyclic; what is sampled at SYNC but sent on request is not counted as that."""
+        return self.kind <= SYNC_CYCLIC_MAX
+
 
 class PdoRecords:
-    """The communication and the mapping record of one PDO in an object dictionary: guards them, reads
-    them."""
+    """The communication and the mapping record of one PDO in an object dictionary: guards them, reads them.
 
-    def __init__(self, store: ObjectStore, parameter: int, mapping: int, *, transmits: bool) -> None:
+    ``taken`` says whether another PDO has a CAN-ID already; None where several may share one.
+    """
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        parameter: int,
+        mapping: int,
+        *,
+        transmits: bool,
+        taken: Callable[[int], bool] | None = None,
+    ) -> None:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
-        self._most_bytes = store.find(mapping, 0).high or 0  # as many as entries: the smallest is a byte
+        self._taken = taken
+        # Bytes of a PDO, and entries of its mapping record: the smallest is a byte.
+        self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
+    def _word(self, subindex: int) -> int:
+        """A communication parameter; 0 for one that this PDO does not have."""
+        has = self._store.has(self._parameter, subindex)
+        return self._store.integer(self._parameter, subindex) if has else 0
+
     @property
     def _enabled(self) -> bool:
-        return not self._store.integer(self._parameter, od.PDO_COB_ID) & INVALID_BIT
+        return not self._word(od.PDO_COB_ID) & INVALID_BIT
 
     def read(self) -> PdoParameters:
         """The parameters as they are now."""
-        store, parameter = self._store, self._parameter
+        store = self._store
         count = store.integer(self._mapping, 0)
         words = [store.integer(self._mapping, sub) for sub in range(1, count + 1)]
-        cob_id = store.integer(parameter, od.PDO_COB_ID)
-        timed = self._transmits
+        mapping = tuple(Mapped(word >> 16, word >> 8 & 0xFF, (word & 0xFF) // 8) for word in words)
+        cob_id = self._word(od.PDO_COB_ID)
         return PdoParameters(
-            enabled=self._enabled and bool(words),
+            enabled=self._enabled and bool(mapping),
             cob_id=cob_id & COB_ID_MASK,
-            kind=store.integer(parameter, od.PDO_TYPE),
-            inhibit_ns=store.integer(parameter, od.PDO_INHIBIT_TIME) * 100_000 if timed else 0,
-            event_timer_ns=store.integer(parameter, od.PDO_EVENT_TIMER) * 1_000_000 if timed else 0,
-            sync_start=store.integer(parameter, od.PDO_SYNC_START) if timed else 0,
-            mapping=tuple((word >> 16, word >> 8 & 0xFF) for word in words),
-            size=sum((word & 0xFF) // 8 for word in words),
+            answers_rtr=self._transmits and not cob_id & NO_RTR_BIT,
+            kind=self._word(od.PDO_TYPE),
+            inhibit_ns=self._word(od.PDO_INHIBIT_TIME) * 100_000,
+            event_timer_ns=self._word(od.PDO_EVENT_TIMER) * 1_000_000,
+            sync_start=self._word(od.PDO_SYNC_START),
+            mapping=mapping,
+            size=sum(each.size for each in mapping),
         )
 
     def _guard_parameter(self, subindex: int, value: int) -> None:
         match subindex:
             case od.PDO_COB_ID:
-                check_cob_id(value, self._store.integer(self._parameter, od.PDO_COB_ID))
+                self._guard_cob_id(value)
             case od.PDO_TYPE:
-                if SYNC_CYCLIC_MAX < value < EVENT_TYPES[0]:  # reserved, and on remote request
+                remote = self._transmits and value in (SYNC_REMOTE, REMOTE)
+                if not remote and SYNC_CYCLIC_MAX < value < EVENT_TYPES[0]:  # reserved
                     raise Refused(AbortCode.INVALID_VALUE)
             case od.PDO_INHIBIT_TIME | od.PDO_SYNC_START:
                 if self._enabled:
                     raise Refused(AbortCode.INVALID_VALUE)
 
+    def _guard_cob_id(self, value: int) -> None:
+        check_cob_id(value, self._word(od.PDO_COB_ID))
+        if value & INVALID_BIT:
+            return
+        if not self._store.integer(self._mapping, 0):  # a PDO of nothing
+            raise Refused(AbortCode.INVALID_VALUE)
+        if not self._enabled and self._taken is not None and self._taken(value & COB_ID_MASK):
+            raise Refused(AbortCode.INCOMPATIBLE)
+
     def _guard_mapping(self, subindex: int, value: int) -> None:
         if self._enabled or (subindex and self._store.integer(self._mapping, 0)):
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
-        if subindex:
-            self._mapped_bytes(value)
-        else:
+        if not subindex:
             self._check_mapping(value)
+        elif value:  # an entry may be emptied, but not mapped then
+            self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:
-        words = (self._store.integer(self._mapping, sub) for sub in range(1, count + 1))
-        if sum(self._mapped_bytes(word) for word in words) > self._most_bytes:
+        if count > self._longest:
+            raise Refused(AbortCode.PDO_TOO_LONG)
+        words = [self._store.integer(self._mapping, sub) for sub in range(1, count + 1)]
+        if sum([self._mapped_bytes(word) for word in words]) > self._longest:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Bytes of the object a mapping entry names; 0 for an empty entry."""
-        if word == 0:
-            return 0
-        entry = self._store.find(word >> 16, word >> 8 & 0xFF)
-        allowed = entry.mappable and entry.access in (_TRANSMITTED if self._transmits else _RECEIVED)
-        if not (allowed and word & 0xFF == entry.data_type.bits):
+        """Bytes of the object a mapping entry names."""
+        index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
+        if not self._transmits and not subindex and index in od.DUMMY_BITS:
+            allowed, size = True, od.DUMMY_BITS[index]
+        else:
+            entry = self._store.find(index, subindex)
+            allowed = entry.mappable and entry.access in (_TRANSMITTED if self._transmits else _RECEIVED)
+            size = entry.data_type.bits
+        if not (allowed and bits == size):
             raise Refused(AbortCode.NOT_MAPPABLE)
-        return entry.data_type.bits // 8
+        return size // 8

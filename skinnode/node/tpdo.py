@@ -1,99 +1,78 @@
-"""The TPDO engine: transmits what the object dictionary says, when it says so. No clock of its own.
+"""The TPDO engine: transmits what the object dictionary says, when it says so (CiA 301 v4.2, 7.2.2 and
+7.5.2.37). No clock of its own.
 
-What a TPDO carries follows from the first object mapped into it:
+=========  =======================================================================================
+type       sent
+=========  =======================================================================================
+0          after a SYNC, if the values are others than those sent last
+1 to 240   after every n-th SYNC; from the one with the SYNC start value on, if there is one
+252        when asked by a remote frame, with the values of the last SYNC; not before there was one
+253        when asked by a remote frame
+254, 255   when something happened (:meth:`TpdoEngine.trigger`), when the event timer elapses and when
+           asked by a remote frame; all of them no sooner than the inhibit time allows
+=========  =======================================================================================
 
-========  ==================  ==========================================================================
-content   first object        sent
-========  ==================  ==========================================================================
-chunks    0x2010              once per chunk of a scan, paced by the inhibit time
-summary   0x2011              when the scan has been sent; by a synchronous TPDO whose turn it was not at the
-                              scan's SYNC, after the next SYNC whose turn it is
-values    any other           synchronous: after the SYNC (type 0: if they changed); event-driven: when a scan
-                              has been sent and when the event timer elapses
-========  ==================  ==========================================================================
+A TPDO whose first object the application has *claimed* is sent by that where a SYNC or an event would send
+another one; the engine counts its SYNCs, and remote frames and event timer are its own matter as ever.
 
-Pacing. The standard's inhibit time is a shortest distance. A thread of a general-purpose system wakes late,
-and distances that only ever grow would let a scan outgrow its SYNC period; so lateness up to ``catch_up_ns``
-is made up for, with several frames at once if need be, while the mean rate is never exceeded (the generic
-cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the shortest distance is strict.
-
-A scan that is offered while one is being sent waits for it to end, and there is room for one to wait. Chunks
-of two scans are never sent in turns, and a scan once begun is sent whole unless the node leaves OPERATIONAL
-or its chunk TPDO is disabled; then its summary says so, or there is none.
+However many TPDOs there are: a SYNC costs as much as there are enabled ones that listen to it, a turn of the
+timer as much as there are due ones.
 """
 
 from __future__ import annotations
 
 import functools
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum, auto
+from bisect import bisect_left
+from collections.abc import Callable, Collection
+from typing import Protocol
 
+from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import PdoRecords
+from skinnode.node.pdo import REMOTE, SYNC_REMOTE, PdoRecords
 from skinnode.wire import indices as od
-from skinnode.wire.codec import SummaryFlag, pack_summary
 
 Send = Callable[[int, bytes], None]
 
 
-@dataclass(frozen=True, slots=True)
-class OutgoingScan:
-    """A scan ready to be sent."""
-
-    counter: int
-    chunks: list[bytes]
-    """Payloads of the chunk record, in order; only those to be sent."""
-    flags: int
-    device_time_us: int
-    turns: frozenset[int] = frozenset()
-    """Numbers of the synchronous TPDOs whose turn it was at the SYNC that started the scan."""
-
-
-class _Content(Enum):
-    CHUNKS = auto()
-    SUMMARY = auto()
-    VALUES = auto()
-
-
-class _Tpdo:
+class Tpdo:
     """One TPDO: its parameters and when it may send next."""
 
-    def __init__(self, number: int, records: PdoRecords, store: ObjectStore) -> None:
-        self.number, self._records, self._store = number, records, store
+    def __init__(self, number: int, records: PdoRecords) -> None:
+        self.number, self._records = number, records
         self.ready_ns = 0
         """From when on the inhibit time allows to send again."""
         self.timer_ns = NO_DEADLINE_NS
         """When the event timer elapses."""
         self.waiting = False
-        """There is something to tell, but neither SYNC nor inhibit time have let it out yet."""
+        """There is something to tell that neither SYNC nor inhibit time have let out yet."""
         self.last: bytes | None = None
+        """What was sent last; of type 252 what was sampled last."""
+        self.owner: Owner | None = None
         self._in_step = False
         self._syncs = 0
         self.parameters = records.read()
-        self.content, self.whole_record = self._classify()
+
+    @property
+    def first_index(self) -> int:
+        """Of the first object mapped; 0 if none is."""
+        mapping = self.parameters.mapping
+        return mapping[0].index if mapping else 0
+
+    @property
+    def deadline_ns(self) -> int:
+        """When there is something to send."""
+        held = self.waiting and self.parameters.event_driven
+        return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
         """Take over parameters that were written."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
-        self.content, self.whole_record = self._classify()
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
-            self._in_step, self._syncs = False, 0
+            self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         if (old.enabled, old.kind, old.event_timer_ns) != (new.enabled, new.kind, new.event_timer_ns):
             self.start_timer(t_ns)
-
-    def _classify(self) -> tuple[_Content, bool]:
-        mapping = self.parameters.mapping
-        contents = {od.CHUNK: _Content.CHUNKS, od.SUMMARY: _Content.SUMMARY}
-        content = contents.get(mapping[0][0], _Content.VALUES) if mapping else _Content.VALUES
-        if content is _Content.VALUES:
-            return content, False
-        index = mapping[0][0]
-        record = tuple((index, sub) for sub in range(1, self._store.integer(index, 0) + 1))
-        return content, mapping == record
 
     def start(self, t_ns: int) -> None:
         """The node became OPERATIONAL."""
@@ -101,72 +80,85 @@ class _Tpdo:
         self.start_timer(t_ns)
 
     def start_timer(self, t_ns: int) -> None:
-        """Run the event timer anew, if the TPDO has one."""
+        """Run the event timer anew from ``t_ns`` on, if the TPDO has one."""
         parameters = self.parameters
-        timed = parameters.enabled and parameters.event_driven and self.content is not _Content.CHUNKS
-        timed = timed and parameters.event_timer_ns > 0
+        timed = parameters.enabled and parameters.event_driven and parameters.event_timer_ns > 0
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
+    def elapse(self, t_ns: int) -> None:
+        """The event timer elapsed; set it anew. Free of drift, and without bursts when served late."""
+        self.timer_ns += self.parameters.event_timer_ns
+        if self.timer_ns <= t_ns:
+            self.start_timer(t_ns)
+
     def turn(self, counter: int | None) -> bool:
-        """Count a SYNC; True if this TPDO is synchronous and it is its turn."""
+        """Count a SYNC; True if it is the turn of this synchronous TPDO."""
         parameters = self.parameters
-        if not parameters.enabled or parameters.event_driven:
-            return False
         if not self._in_step and parameters.sync_start and counter is not None:
             if counter != parameters.sync_start:
                 return False
             self._in_step, self._syncs = True, 0
             return True  # the SYNC with the start value is the first of the cycle
         self._syncs += 1
-        if self._syncs < max(parameters.kind, 1):
+        if self._syncs < parameters.kind:
             return False
         self._syncs = 0
         return True
 
-    def takes_part(self, scan: OutgoingScan) -> bool:
-        """Whether it is this TPDO's turn to carry a part of ``scan``."""
-        return self.parameters.enabled and (self.parameters.event_driven or self.number in scan.turns)
 
-    @property
-    def deadline_ns(self) -> int:
-        held = self.waiting and self.parameters.event_driven
-        return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
+class Owner(Protocol):
+    """Whoever sends the TPDOs of objects that it has claimed."""
+
+    def sends(self, tpdo: Tpdo) -> bool:
+        """Whether it is about to send this TPDO anyway: nothing else needs to."""
+        ...
+
+    def on_reload(self, tpdo: Tpdo) -> None:
+        """A TPDO of its own has got other parameters, or is no longer its own."""
+        ...
 
 
 class TpdoEngine:
-    """The TPDOs of a node, and the scans that pass through them. ``now`` is the time of the event being
-    handled."""
+    """The TPDOs of a node. ``now`` is the time of the event being handled."""
 
-    def __init__(self, store: ObjectStore, count: int, send: Send, now: Clock, catch_up_ns: int) -> None:
-        self._store, self._send, self._now, self._catch_up_ns = store, send, now, catch_up_ns
-        self._tpdos: list[_Tpdo] = []
+    def __init__(self, store: ObjectStore, count: int, send: Send, now: Clock) -> None:
+        self._store, self._send, self._now = store, send, now
+        self._claims: dict[int, Owner] = {}
+        self._running = False
+        self._alarms = Alarms()
+        # Numbers of enabled TPDOs, ascending: those that listen to SYNC, those that events concern, and those
+        # that have an owner.
+        self._listening: list[int] = []
+        self._eventful: list[int] = []
+        self._owned: list[int] = []
+        self._by_cob_id: dict[int, Tpdo] = {}
+        self._tpdos: list[Tpdo] = []
         for number in range(count):
             parameter, mapping = od.TPDO1_PARAMETER + number, od.TPDO1_MAPPING + number
-            records = PdoRecords(store, parameter, mapping, transmits=True)
-            self._tpdos.append(_Tpdo(number, records, store))
+            records = PdoRecords(store, parameter, mapping, transmits=True, taken=self._taken)
+            self._tpdos.append(Tpdo(number, records))
             for index in (parameter, mapping):
                 store.watch(index, functools.partial(self._on_written, number))
-        self._running = False
-        self._scan: OutgoingScan | None = None
-        self._next_scan: OutgoingScan | None = None
-        self._unsent: deque[bytes] = deque()
-        self._carrier: _Tpdo | None = None  # of the chunks of the scan being sent
-        self._chunks_sent = 0
-        self.chunk = bytes(64)
-        """The chunk record (0x2010) as last sent, zeros before the first; over CAN FD up to 64 bytes."""
-        self.summary = bytes(8)
-        """The summary record (0x2011) of the last scan."""
-        self.scans_sent = 0
-        self.deadline_ns = NO_DEADLINE_NS
-        """When :meth:`on_timer` has something to do."""
+        self.restore()
 
     @property
-    def full(self) -> bool:
-        """Whether a scan is being sent and another one waits already."""
-        return self._next_scan is not None
+    def deadline_ns(self) -> int:
+        """When :meth:`on_timer` has something to do."""
+        return self._alarms.deadline_ns
+
+    def claim(self, index: int, owner: Owner) -> None:
+        """Leave the TPDOs whose first object is of ``index`` to ``owner``."""
+        self._claims[index] = owner
+        self.restore()
+
+    def owned(self, index: int) -> list[Tpdo]:
+        """The enabled TPDOs that are claimed with ``index``."""
+        return [tpdo for tpdo in map(self._tpdos.__getitem__, self._owned) if tpdo.first_index == index]
+
+    # --- parameters
 
     def restore(self) -> None:
-        """All parameters have changed at once: a reset."""
+        """All parameters may have changed at once: a reset."""
         for number in range(len(self._tpdos)):
             self._reload(number)
 
@@ -175,119 +167,136 @@ class TpdoEngine:
 
     def _reload(self, number: int) -> None:
         tpdo = self._tpdos[number]
+        former, before = tpdo.owner, tpdo.parameters
+        if self._by_cob_id.get(before.cob_id) is tpdo:
+            del self._by_cob_id[before.cob_id]
         tpdo.reload(self._now())
-        if tpdo is self._carrier and not (tpdo.parameters.enabled and tpdo.content is _Content.CHUNKS):
-            self._unsent.clear()
-            self._carrier = None
-        self._plan()
+        now = tpdo.parameters
+        tpdo.owner = self._claims.get(tpdo.first_index)
+        if now.enabled:
+            self._by_cob_id[now.cob_id] = tpdo
+        listens = now.synchronous or now.kind == SYNC_REMOTE
+        _keep(self._listening, number, now.enabled and listens)
+        _keep(self._eventful, number, now.enabled and now.event_driven and tpdo.owner is None)
+        _keep(self._owned, number, now.enabled and tpdo.owner is not None)
+        for owner in {former, tpdo.owner}:
+            if owner is not None:
+                owner.on_reload(tpdo)
+        self._plan(tpdo)
+
+    def _taken(self, cob_id: int) -> bool:
+        return cob_id in self._by_cob_id
+
+    # --- events
 
     def start(self, t_ns: int) -> None:
         """The node became OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
-        self._plan()
+            self._plan(tpdo)
 
     def stop(self) -> None:
-        """The node left OPERATIONAL: a scan in progress ends without a summary."""
+        """The node left OPERATIONAL."""
         self._running = False
-        self._unsent.clear()
-        self._scan = self._next_scan = self._carrier = None
-        self._plan()
+        self._alarms.clear()
 
-    def on_sync(self, counter: int | None, t_ns: int) -> frozenset[int]:
-        """Send the values whose turn it is. Returns the numbers of all synchronous TPDOs whose turn it is,
-        for the scan that starts here. ``counter`` is the SYNC counter, None without one."""
-        turns = frozenset([tpdo.number for tpdo in self._tpdos if tpdo.turn(counter)])
-        for tpdo in self._tpdos:
-            if tpdo.number not in turns or tpdo.content is _Content.CHUNKS:
-                continue
-            if tpdo.content is _Content.VALUES:
-                payload = self._payload(tpdo)
+    def count_sync(self, counter: int | None) -> frozenset[int]:
+        """A SYNC came: the numbers of the synchronous TPDOs whose turn it is. ``counter`` is the SYNC
+        counter, None without one."""
+        tpdos = [self._tpdos[number] for number in self._listening]
+        return frozenset(
+            [each.number for each in tpdos if each.parameters.synchronous and each.turn(counter)]
+        )
+
+    def on_sync(self, turns: Collection[int], t_ns: int) -> None:
+        """After the application has dealt with the SYNC: send the values of those whose turn it is, sample
+        those that will be asked for."""
+        for number in tuple(self._listening):
+            tpdo = self._tpdos[number]
+            if tpdo.parameters.kind == SYNC_REMOTE:
+                tpdo.last = self.payload(tpdo)
+            elif number in turns and tpdo.owner is None:
+                payload = self.payload(tpdo)
                 if tpdo.parameters.kind or payload != tpdo.last:
                     self._transmit(tpdo, payload, t_ns)
-            elif tpdo.waiting:
-                self._transmit(tpdo, self._payload(tpdo), t_ns)
-        return turns
 
-    def offer(self, scan: OutgoingScan, t_ns: int) -> None:
-        """Send ``scan``, at once or after the one being sent. Must not be called while :attr:`full`."""
-        if self._scan is None:
-            self._begin(scan, t_ns)
-        else:
-            self._next_scan = scan
-        self.on_timer(t_ns)
+    def trigger(self, t_ns: int) -> None:
+        """Something happened that all event-driven TPDOs tell of."""
+        for number in tuple(self._eventful):
+            self.request(self._tpdos[number], t_ns)
+
+    def request(self, tpdo: Tpdo, t_ns: int) -> None:
+        """Send an event-driven TPDO as soon as its inhibit time allows."""
+        tpdo.waiting = True
+        self._let_out(tpdo, t_ns)
+
+    def on_remote(self, cob_id: int, t_ns: int) -> None:
+        """A remote frame came, in OPERATIONAL. Synchronous TPDOs do not answer any (7.2.2.3)."""
+        tpdo = self._by_cob_id.get(cob_id)
+        if tpdo is None or not tpdo.parameters.answers_rtr or self._sent_anyway(tpdo):
+            return
+        parameters = tpdo.parameters
+        if parameters.event_driven:
+            self.request(tpdo, t_ns)
+        elif parameters.kind == REMOTE:
+            self._transmit(tpdo, self.payload(tpdo), t_ns)
+        elif parameters.kind == SYNC_REMOTE and tpdo.last is not None:
+            self._transmit(tpdo, tpdo.last, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
         """Send everything that is due at ``t_ns``."""
-        if not self._running:
-            return
-        while self._scan is not None and self._stream(t_ns):
-            self._end(self._scan, t_ns)
-            self._scan, following, self._next_scan = None, self._next_scan, None
-            if following is not None:
-                self._begin(following, t_ns)
-        for tpdo in self._tpdos:
+        for number in self._alarms.take(t_ns):
+            tpdo = self._tpdos[number]
             if t_ns >= tpdo.timer_ns:
-                tpdo.waiting = True
-                tpdo.start_timer(t_ns)
-            if tpdo.waiting and tpdo.parameters.event_driven and t_ns >= tpdo.ready_ns:
-                self._transmit(tpdo, self._payload(tpdo), t_ns)
-        self._plan()
+                tpdo.elapse(t_ns)
+                tpdo.waiting = tpdo.waiting or not self._sent_anyway(tpdo)
+                self._let_out(tpdo, t_ns, timer=False)
+            else:
+                self._let_out(tpdo, t_ns)
 
-    def _begin(self, scan: OutgoingScan, t_ns: int) -> None:
-        self._scan, self._carrier, self._chunks_sent = scan, None, 0
-        for tpdo in self._tpdos:
-            if tpdo.content is _Content.CHUNKS and tpdo.takes_part(scan):
-                self._carrier = tpdo
-                self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # an idle while earns no burst
-                return
+    def _sent_anyway(self, tpdo: Tpdo) -> bool:
+        return tpdo.owner is not None and tpdo.owner.sends(tpdo)
 
-    def _stream(self, t_ns: int) -> bool:
-        """Send the chunks that the pace allows. True when there are no more."""
-        unsent, carrier = self._unsent, self._carrier
-        if carrier is None:
-            return True
-        cob_id, inhibit_ns = carrier.parameters.cob_id, carrier.parameters.inhibit_ns
-        earliest_ns = t_ns - self._catch_up_ns
-        while unsent and carrier.ready_ns <= t_ns:
-            self.chunk = unsent.popleft()
-            carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
-            self._send(cob_id, self.chunk if carrier.whole_record else self._payload(carrier))
-            self._chunks_sent += 1  # after it has been sent: a bus may refuse it
-        return not unsent
+    # --- sending
 
-    def _end(self, scan: OutgoingScan, t_ns: int) -> None:
-        flags = scan.flags if self._chunks_sent == len(scan.chunks) else scan.flags | SummaryFlag.OVERRUN
-        self.summary = pack_summary(scan.counter, flags, self._chunks_sent, scan.device_time_us)
-        self.scans_sent += 1
-        for tpdo in self._tpdos:
-            if tpdo.content is _Content.SUMMARY:
-                tpdo.waiting = tpdo.parameters.enabled
-                if tpdo.number in scan.turns:
-                    self._transmit(tpdo, self._payload(tpdo), t_ns)
-            elif tpdo.content is _Content.VALUES and tpdo.parameters.event_driven:
-                tpdo.waiting = tpdo.parameters.enabled
-
-    def _payload(self, tpdo: _Tpdo) -> bytes:
-        if tpdo.whole_record:
-            return self.chunk if tpdo.content is _Content.CHUNKS else self.summary
+    def payload(self, tpdo: Tpdo) -> bytes:
+        """What is mapped into it, as it is now."""
         raw = self._store.raw
-        return b"".join([raw(index, subindex) for index, subindex in tpdo.parameters.mapping])
+        return b"".join([raw(each.index, each.subindex) for each in tpdo.parameters.mapping])
 
-    def _transmit(self, tpdo: _Tpdo, payload: bytes, t_ns: int) -> None:
-        tpdo.last, tpdo.waiting = payload, False
-        tpdo.ready_ns = t_ns + tpdo.parameters.inhibit_ns
-        tpdo.start_timer(t_ns)
+    def emit(self, tpdo: Tpdo, payload: bytes) -> None:
+        """Send without a look at any time; the owner of the TPDO does that."""
         self._send(tpdo.parameters.cob_id, payload)
 
-    def _plan(self) -> None:
-        if not self._running:
-            self.deadline_ns = NO_DEADLINE_NS
-            return
-        deadline_ns = min([tpdo.deadline_ns for tpdo in self._tpdos])
-        if self._scan is not None:
-            ready_ns = self._carrier.ready_ns if self._carrier is not None else 0
-            deadline_ns = min(deadline_ns, ready_ns)
-        self.deadline_ns = deadline_ns
+    def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
+        """Send now, because of a SYNC."""
+        self._transmit(tpdo, self.payload(tpdo), t_ns)
+
+    def _let_out(self, tpdo: Tpdo, t_ns: int, *, timer: bool = True) -> None:
+        if tpdo.waiting and t_ns >= tpdo.ready_ns:
+            self._transmit(tpdo, self.payload(tpdo), t_ns, timer=timer)
+        else:
+            self._plan(tpdo)
+
+    def _transmit(self, tpdo: Tpdo, payload: bytes, t_ns: int, *, timer: bool = True) -> None:
+        """``timer``: let the event timer start anew."""
+        tpdo.last, tpdo.waiting = payload, False
+        tpdo.ready_ns = t_ns + tpdo.parameters.inhibit_ns
+        if timer:
+            tpdo.start_timer(t_ns)
+        self._plan(tpdo)
+        self._send(tpdo.parameters.cob_id, payload)  # last: a bus may refuse it
+
+    def _plan(self, tpdo: Tpdo) -> None:
+        self._alarms.set(tpdo.number, tpdo.deadline_ns if self._running else NO_DEADLINE_NS)
+
+
+def _keep(numbers: list[int], number: int, wanted: bool) -> None:
+    """Have ``number`` in the ascending list or not."""
+    at = bisect_left(numbers, number)
+    there = at < len(numbers) and numbers[at] == number
+    if wanted and not there:
+        numbers.insert(at, number)
+    elif there and not wanted:
+        del numbers[at]

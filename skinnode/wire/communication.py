@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from skinnode.wire import indices as od
-from skinnode.wire.dictionary import DataType, Entry, Object, array, highest, record, var
+from skinnode.wire.dictionary import DataType, Entry, Object, array, record, var
 
 _U8, _U16, _U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
 _STRING = DataType.VISIBLE_STRING
@@ -117,6 +117,7 @@ def _rpdo_parameter(index: int, number: int, pdo: PdoDefault) -> Object:
         (
             _cob_id(index, "COB-ID used by RPDO", pdo),
             Entry(index, od.PDO_TYPE, "Transmission type", _U8, "rw", pdo.kind),
+            Entry(index, od.PDO_EVENT_TIMER, "Event timer", _U16, "rw", 0),
         ),
     )
 
@@ -140,5 +141,6 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    first = highest(index, slots, "rw", len(pdo.mapped))
+    # Without a limit: too many objects have an abort code of their own, not that of a value out of range.
+    first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

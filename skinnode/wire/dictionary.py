@@ -112,11 +112,9 @@ def var(
     return Object(index, name, kind, (entry,))
 
 
-def highest(index: int, highest: int, access: str = "const", default: int | None = None) -> Entry:
-    """Sub-index 0 of an array or a record; ``default``: its value at start, where that may be written."""
-    value = highest if default is None else default
-    high = highest if access == "rw" else None
-    return Entry(index, 0, "Highest sub-index supported", DataType.UNSIGNED8, access, value, high=high)
+def highest(index: int, highest: int) -> Entry:
+    """Sub-index 0 of an array or a record."""
+    return Entry(index, 0, "Highest sub-index supported", DataType.UNSIGNED8, "const", highest)
 
 
 def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None = None) -> Object:
@@ -134,10 +132,12 @@ def array(
     default: Value | None = None,
     *,
     first: Entry | None = None,
+    mappable: bool = False,
     high: int | None = None,
 ) -> Object:
     """An array with one entry for each of ``labels``; ``first`` as in :func:`record`."""
     entries = tuple(
-        Entry(index, sub, label, data_type, access, default, high=high) for sub, label in enumerate(labels, 1)
+        Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)
+        for sub, label in enumerate(labels, 1)
     )
     return Object(index, name, ObjectType.ARRAY, (first or highest(index, len(entries)), *entries))

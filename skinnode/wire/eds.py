@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.wire import indices as od
 from skinnode.wire.dictionary import DataType, Entry, Object, ObjectType
 
 _DATE, _TIME = "01-01-2025", "12:00AM"  # fixed: a generated file must not change by itself
@@ -94,7 +95,9 @@ def _head(info: DeviceInfo) -> Iterator[str]:
             ("LSS_Supported", "0"),
         ],
     )
-    yield from _section("DummyUsage", [(f"Dummy{kind:04X}", "0") for kind in _DUMMY_TYPES])
+    yield from _section(
+        "DummyUsage", [(f"Dummy{kind:04X}", str(int(kind in od.DUMMY_BITS))) for kind in _DUMMY_TYPES]
+    )
     yield from _section(
         "Comments", [("Lines", "1"), ("Line1", "Generated from the patch profile of skinnode; do not edit.")]
     )

@@ -106,6 +106,9 @@ PDO_INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID that switches it off."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication parameter."""
+DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
+"""Data types that an RPDO can map, at sub-index 0, where bytes of it are not for this node. Not BOOLEAN: PDOs
+are made of bytes."""
 ERROR_FIELD_LENGTH: Final = 8
 HEARTBEAT_CONSUMERS: Final = 4
 

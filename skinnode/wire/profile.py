@@ -193,7 +193,7 @@ def _chunk_record(profile: PatchProfile) -> Object:
         od.CHUNK,
         "Chunk of a scan",
         [
-            Entry(od.CHUNK, sub, name, data_type, "ro", 0, mappable=True)
+            Entry(od.CHUNK, sub, name, data_type, "ro", mappable=True)
             for sub, (name, data_type) in enumerate(head + codes, 1)
         ],
     )
@@ -263,7 +263,7 @@ _REJECTED = ("NMT", "SYNC", "TIME", "Heartbeat", "SDO", "RPDO", "Error control o
 
 def _wire_faults(index: int, name: str, wires: int) -> Object:
     labels = [f"{kind} from wire {first}" for first in range(0, wires, 32) for kind in ("Open", "Shorted")]
-    return array(index, name, labels, _U32, "ro", 0)
+    return array(index, name, labels, _U32, "ro", 0, mappable=True)
 
 
 def _descriptor_record(profile: PatchProfile) -> Object:
@@ -303,7 +303,7 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
         _wire_faults(od.LOWER_WIRE_FAULTS, "Faults of lower wires", profile.columns),
         array(od.REJECTED_FRAMES, "Rejected frames", _REJECTED, _U32, "ro", 0),
         *(
-            array(od.CODES + r, f"Codes of upper wire {r}", columns, profile.code_type, "ro", 0)
+            array(od.CODES + r, f"Codes of upper wire {r}", columns, profile.code_type, "ro", mappable=True)
             for r in range(profile.rows)
         ),
         *(

@@ -114,7 +114,8 @@ def test_download_in_two_segments_toggles(desk) -> None:
         ("2f 19 10 00 01 00 00 00", "value"),  # 0 or 2 to 240
         ("2f 19 10 00 f1 00 00 00", "too high"),
         ("2f 03 10 00 01 00 00 00", "value"),  # only 0 clears the error history
-        ("23 05 10 00 80 00 00 40", "value"),  # no SYNC producer
+        ("23 05 10 00 80 00 00 80", "value"),  # bit 31 means nothing here
+        ("23 06 10 00 63 00 00 00", "too low"),  # SYNC every 99 µs
         ("23 05 10 00 80 00 00 20", "value"),  # no extended identifiers
         ("23 05 10 00 01 06 00 00", "value"),  # an SDO's identifier
         ("23 14 10 00 85 00 00 00", "value"),  # in use
@@ -254,7 +255,6 @@ class TestRemapping:
             ("2b 01 18 03 0a 00 00 00", "value"),  # inhibit time while valid
             ("2f 01 18 06 01 00 00 00", "value"),  # SYNC start value while valid
             ("2f 01 18 02 f1 00 00 00", "value"),  # reserved transmission type
-            ("2f 01 18 02 fd 00 00 00", "value"),  # on remote request: not offered
             ("23 01 18 01 84 02 00 a0", "value"),  # extended
         ],
     )
@@ -286,7 +286,7 @@ class TestRemapping:
         for slot in (1, 2, 3):
             desk.write(0x1A01, slot, 0x20110420, 4)
         assert desk.sdo("2f 01 1a 00 03 00 00 00").endswith(ABORTS["pdo too long"])
-        assert desk.sdo("2f 01 1a 00 09 00 00 00").endswith(ABORTS["too high"])
+        assert desk.sdo("2f 01 1a 00 09 00 00 00").endswith(ABORTS["pdo too long"])  # nine objects
         desk.write(0x1A01, 0, 2, 1)
 
     @pytest.mark.parametrize("cob_id", [0x000, 0x07F, 0x101, 0x180, 0x581, 0x604, 0x6E0, 0x704, 0x7FF])

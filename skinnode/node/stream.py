@@ -1,0 +1,163 @@
+"""Scans on their way: chunks, paced by the inhibit time of the TPDO that carries them, then the summary.
+
+The TPDO whose first object is 0x2010 carries the chunks of a scan, as long as it is event-driven or it was
+its turn at the SYNC that started the scan. Those of 0x2011 carry the summary when the scan has been sent: on
+event, or synchronous ones if it was their turn at that SYNC, otherwise after the next SYNC whose turn it is.
+Event-driven TPDOs of any other object are sent then too.
+
+Pacing. The standard's inhibit time is a shortest distance. A thread of a general-purpose system wakes late,
+and distances that only ever grow would let a scan outgrow its SYNC period; so lateness up to ``catch_up_ns``
+is made up for, with several frames at once if need be, while the mean rate is never exceeded (the generic
+cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the shortest distance is strict.
+
+A scan that is offered while one is being sent waits for it to end, and there is room for one to wait. Chunks
+of two scans are never sent in turns, and a scan once begun is sent whole unless the node leaves OPERATIONAL
+or its chunk TPDO is disabled; then its summary says so, or there is none.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.od import ObjectStore
+from skinnode.node.tpdo import Tpdo, TpdoEngine
+from skinnode.wire import indices as od
+from skinnode.wire.codec import SummaryFlag, pack_summary
+
+
+@dataclass(frozen=True, slots=True)
+class OutgoingScan:
+    """A scan ready to be sent."""
+
+    counter: int
+    chunks: list[bytes]
+    """Payloads of the chunk record, in order; only those to be sent."""
+    flags: int
+    device_time_us: int
+    turns: frozenset[int] = frozenset()
+    """Numbers of the synchronous TPDOs whose turn it was at the SYNC that started the scan."""
+
+
+class ScanStream:
+    """The scans of a patch that pass through its TPDOs. ``chunk`` is the chunk record (0x2010) until there is
+    one."""
+
+    def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
+        self._tpdos, self._catch_up_ns = tpdos, catch_up_ns
+        self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
+        self._scan: OutgoingScan | None = None
+        self._next_scan: OutgoingScan | None = None
+        self._unsent: deque[bytes] = deque()
+        self._carrier: Tpdo | None = None  # of the chunks of the scan being sent
+        self._verbatim = False  # whether it carries nothing but the record as it is
+        self._chunks_sent = 0
+        self.chunk = chunk
+        """The chunk record as last sent."""
+        self.summary = bytes(8)
+        """The summary record (0x2011) of the last scan."""
+        self.scans_sent = 0
+        tpdos.claim(od.CHUNK, self)
+        tpdos.claim(od.SUMMARY, self)
+
+    @property
+    def full(self) -> bool:
+        """Whether a scan is being sent and another one waits already."""
+        return self._next_scan is not None
+
+    @property
+    def deadline_ns(self) -> int:
+        """When :meth:`on_timer` has something to do."""
+        if self._scan is None:
+            return NO_DEADLINE_NS
+        return self._carrier.ready_ns if self._carrier is not None else 0
+
+    # --- as the owner of TPDOs
+
+    def sends(self, tpdo: Tpdo) -> bool:
+        """Whether chunks of a scan are on their way through it."""
+        return tpdo is self._carrier
+
+    def on_reload(self, tpdo: Tpdo) -> None:
+        """End a scan whose TPDO has been taken away."""
+        if tpdo is not self._carrier:
+            return
+        if tpdo.parameters.enabled and tpdo.first_index == od.CHUNK:
+            self._verbatim = self._carries_record(tpdo)
+        else:
+            self._unsent.clear()
+            self._carrier = None
+
+    # --- events
+
+    def stop(self) -> None:
+        """The node left OPERATIONAL: a scan in progress ends without a summary."""
+        self._unsent.clear()
+        self._scan = self._next_scan = self._carrier = None
+
+    def on_sync(self, turns: Collection[int], t_ns: int) -> None:
+        """A SYNC came, and no scan has started with it yet: send summaries that waited for it."""
+        for tpdo in self._tpdos.owned(od.SUMMARY):
+            if tpdo.waiting and tpdo.number in turns:
+                self._tpdos.transmit(tpdo, t_ns)
+
+    def offer(self, scan: OutgoingScan, t_ns: int) -> None:
+        """Send ``scan``, at once or after the one being sent. Must not be called while :attr:`full`."""
+        if self._scan is None:
+            self._begin(scan, t_ns)
+        else:
+            self._next_scan = scan
+        self.on_timer(t_ns)
+
+    def on_timer(self, t_ns: int) -> None:
+        """Send everything that is due at ``t_ns``."""
+        while self._scan is not None and self._stream(t_ns):
+            ended, self._scan, self._carrier = self._scan, None, None
+            following, self._next_scan = self._next_scan, None
+            try:
+                self._end(ended, t_ns)
+            finally:  # a bus may refuse the summary
+                if following is not None:
+                    self._begin(following, t_ns)
+
+    def _begin(self, scan: OutgoingScan, t_ns: int) -> None:
+        self._scan, self._carrier, self._chunks_sent = scan, None, 0
+        for tpdo in self._tpdos.owned(od.CHUNK):
+            if tpdo.parameters.event_driven or tpdo.number in scan.turns:
+                self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
+                tpdo.waiting = False
+                self._unsent.extend(scan.chunks)
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # an idle while earns no burst
+                return
+
+    def _carries_record(self, tpdo: Tpdo) -> bool:
+        return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
+
+    def _stream(self, t_ns: int) -> bool:
+        """Send the chunks that the pace allows. True when there are no more."""
+        unsent, carrier = self._unsent, self._carrier
+        if carrier is None:
+            return True
+        tpdos, inhibit_ns = self._tpdos, carrier.parameters.inhibit_ns
+        earliest_ns = t_ns - self._catch_up_ns
+        while unsent and carrier.ready_ns <= t_ns:
+            self.chunk = unsent.popleft()
+            carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
+            tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
+            self._chunks_sent += 1  # after it has been sent: a bus may refuse it
+        return not unsent
+
+    def _end(self, scan: OutgoingScan, t_ns: int) -> None:
+        flags = scan.flags if self._chunks_sent == len(scan.chunks) else scan.flags | SummaryFlag.OVERRUN
+        self.summary = pack_summary(scan.counter, flags, self._chunks_sent, scan.device_time_us)
+        self.scans_sent += 1
+        for tpdo in self._tpdos.owned(od.SUMMARY):
+            if tpdo.parameters.event_driven:
+                self._tpdos.request(tpdo, t_ns)
+            elif tpdo.number in scan.turns:
+                self._tpdos.transmit(tpdo, t_ns)
+            else:
+                tpdo.waiting = True
+        self._tpdos.trigger(t_ns)

@@ -1,0 +1,120 @@
+"""SYNC, consumed and produced: objects 0x1005, 0x1006 and 0x1019 (CiA 301 v4.2, 7.2.5, 7.5.2.5, 7.5.2.6 and
+7.5.2.22)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from skinnode.node.abort import AbortCode, Refused
+from skinnode.node.clock import NO_DEADLINE_NS, Clock
+from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.od import ObjectStore
+from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
+from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.wire import indices as od
+
+PRODUCER_BIT: Final = 1 << 30
+"""Of 0x1005: the device generates SYNC."""
+
+SHORTEST_PERIOD_US: Final = 100
+"""Of 0x1006: a SYNC takes half of it at 1 Mbit/s."""
+
+
+class Sync:
+    """Takes SYNC messages, checks their counter, and makes them where 0x1005 says so.
+
+    A device that produces SYNC obeys its own too, so whoever drives this does the same for :meth:`on_frame`
+    and :meth:`on_timer`.
+    """
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        emcy: EmcyProducer,
+        rejected: RejectedFrames,
+        send: Callable[[int, bytes], None],
+        now: Clock,
+    ) -> None:
+        self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
+        self._communicates = False
+        self._period_ns = 0
+        self._counter = 0  # of the last SYNC produced
+        self._wrong_length: int | None = None  # of the last SYNC consumed
+        self.cob_id = od.SYNC_COB_ID
+        self.deadline_ns = NO_DEADLINE_NS
+        """When a SYNC is to be sent."""
+        store.guard(od.COB_ID_SYNC, self._guard_cob_id)
+        store.guard(od.CYCLE_PERIOD, _guard_period)
+        store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_overflow)
+
+    @property
+    def _overflow(self) -> int:
+        return self._store.integer(od.SYNC_COUNTER_OVERFLOW)
+
+    @property
+    def _produces(self) -> bool:
+        return bool(self._store.integer(od.COB_ID_SYNC) & PRODUCER_BIT)
+
+    def reload(self) -> None:
+        """Objects were written, or all were reset. The next SYNC of a producer comes one period later; it is
+        the first, and its counter 1, if there was none before."""
+        self.cob_id = self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK
+        self._start()
+
+    def enter(self, *, communicates: bool) -> None:
+        """The node entered another state. SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL;
+        whoever comes from another state begins to count at 1."""
+        if communicates != self._communicates:
+            self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
+            self._start()
+
+    def _start(self) -> None:
+        if not self._period_ns:
+            self._counter = 0
+        self._period_ns = self._store.integer(od.CYCLE_PERIOD) * 1000 if self._produces else 0
+        runs = self._communicates and self._period_ns
+        self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
+
+    def on_timer(self, t_ns: int) -> bytes | None:
+        """Send the SYNC that is due, and return it. Free of drift; what was missed is not made up for."""
+        if t_ns < self.deadline_ns:
+            return None
+        self.deadline_ns += (t_ns - self.deadline_ns) // self._period_ns * self._period_ns + self._period_ns
+        message = b""
+        if self._overflow:
+            self._counter = self._counter % self._overflow + 1
+            message = bytes((self._counter,))
+        self._send(self.cob_id, message)
+        return message
+
+    def accept(self, message: bytes, t_ns: int) -> bool:
+        """Whether a SYNC is one: a length other than that of 0x1019 is told, once until it changes."""
+        counted = self._overflow > 0
+        if len(message) == counted:
+            self._wrong_length = None
+            return True
+        self._rejected.count(Rejected.SYNC)
+        if len(message) != self._wrong_length:
+            self._wrong_length = len(message)
+            self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(message), counted)), t_ns)
+        return False
+
+    # --- guards
+
+    def _guard_cob_id(self, _: int, value: int) -> None:
+        check_cob_id(value & ~PRODUCER_BIT, INVALID_BIT)
+        moved = (value ^ self._store.integer(od.COB_ID_SYNC)) & COB_ID_MASK
+        if value & INVALID_BIT or (moved and value & PRODUCER_BIT and self._produces):
+            raise Refused(AbortCode.INVALID_VALUE)
+
+    def _guard_overflow(self, _: int, value: int) -> None:
+        if value == 1:  # 0, or 2 to 240
+            raise Refused(AbortCode.INVALID_VALUE)
+        if self._store.integer(od.CYCLE_PERIOD):
+            raise Refused(AbortCode.DEVICE_STATE)
+
+
+def _guard_period(_: int, value: int) -> None:
+    if 0 < value < SHORTEST_PERIOD_US:
+        raise Refused(AbortCode.VALUE_TOO_LOW)

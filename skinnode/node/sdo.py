@@ -75,10 +75,7 @@ class SdoServer:
                 self._abort(transfer.index, transfer.subindex, refused.code)
 
     def on_request(self, request: bytes, t_ns: int) -> None:
-        """Take a frame of the client. Nothing is said to an abort, nor to what is no SDO, which always has 8
-        bytes."""
-        if len(request) != 8:
-            return
+        """Take a frame of the client, eight bytes. Nothing is said to an abort."""
         transfer = self._transfer
         if request[0] == _ABORT:
             self._transfer = None

@@ -15,7 +15,7 @@ from typing import Final, Protocol
 
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyProducer
+from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.od import ObjectStore
@@ -25,6 +25,7 @@ from skinnode.node.sdo import SdoServer
 from skinnode.node.sync import Sync
 from skinnode.node.time_of_day import TimeConsumer
 from skinnode.node.tpdo import TpdoEngine
+from skinnode.transport.bus_state import BusState
 from skinnode.wire import indices as od
 from skinnode.wire.dictionary import Object
 
@@ -114,7 +115,6 @@ class CanopenDevice:
         self._rejected = RejectedFrames(self._store)
         self._emcy = EmcyProducer(self._store, send)
         self._error_control = ErrorControl(
-            node_id,
             self._store,
             self._emcy,
             self._rejected,
@@ -129,6 +129,7 @@ class CanopenDevice:
         self._tpdos = TpdoEngine(store, tpdos, send, now)
         self._rpdos = RpdoEngine(store, rpdos, emcy, rejected, now)
         self._sync = Sync(store, emcy, rejected, send, now)
+        self._bus_state = BusState.ACTIVE
         self._handlers: dict[int, Handler] = {}
         self._application = application(Services(store, self._tpdos, emcy, now))
         self._describe(serial)
@@ -160,6 +161,20 @@ class CanopenDevice:
             handler(data, t_ns)
         else:
             self._rpdos.on_frame(can_id, data, t_ns)
+
+    def on_bus(self, state: BusState, t_ns: int) -> None:
+        """The CAN controller is in ``state``. What there is to tell of a bus that was off is told once it is
+        back; error behaviour (0x1029) does not wait for that."""
+        was, self._bus_state = self._bus_state, state
+        if self.nmt_state is NmtState.INITIALISING or state is was:
+            return
+        self._now_ns = t_ns
+        if state is BusState.OFF:
+            self._communication_failed(t_ns)
+            return
+        if was is BusState.OFF:
+            self._emcy.happened(EmcyCode.BUS_OFF_RECOVERED, b"", t_ns)
+        self._tell_passive(t_ns)
 
     def next_deadline_ns(self) -> int | None:
         """When :meth:`on_timer` is to be called; None while there is nothing to wait for."""
@@ -219,7 +234,7 @@ class CanopenDevice:
             self._rejected.reset()
             self._time.reset()
         self._emcy.reset()
-        self._error_control.reset()
+        self._error_control.reset(self.node_id)
         self._tpdos.restore()
         self._rpdos.restore()
         self._sync.reload()
@@ -227,6 +242,7 @@ class CanopenDevice:
         self._reload()
         self._error_control.boot_up(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+        self._tell_passive(t_ns)
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
         if state is self.nmt_state:
@@ -242,6 +258,12 @@ class CanopenDevice:
         self._sync.enter(communicates=state.communicates)
         self._application.enter(operational=state is NmtState.OPERATIONAL)
         self._emcy.allow(state.communicates, t_ns)
+
+    def _tell_passive(self, t_ns: int) -> None:
+        if self._bus_state is BusState.PASSIVE:
+            self._emcy.present(EmcyCode.CAN_PASSIVE, b"", t_ns)
+        else:
+            self._emcy.over(EmcyCode.CAN_PASSIVE, t_ns)
 
     def _communication_failed(self, t_ns: int) -> None:
         """Heartbeat or guarding failed, or the bus. Error behaviour, 0x1029: 0 pre-operational, 1 nothing,

@@ -26,7 +26,6 @@ class ErrorControl:
 
     def __init__(
         self,
-        node_id: int,
         store: ObjectStore,
         emcy: EmcyProducer,
         rejected: RejectedFrames,
@@ -35,7 +34,7 @@ class ErrorControl:
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
-        self._cob_id = od.heartbeat_cob_id(node_id)
+        self._cob_id = 0  # known when there is a node-ID
         self._store, self._rejected, self._send, self._now = store, rejected, send, now
         self._listen = listen
         self._producer = HeartbeatProducer()
@@ -60,8 +59,9 @@ class ErrorControl:
         handlers[self._cob_id] = lambda _data, _t_ns: self._rejected.count(Rejected.OWN_ERROR_CONTROL)
         return handlers
 
-    def reset(self) -> None:
+    def reset(self, node_id: int) -> None:
         """The node is being reset: nobody guards it, and nobody has been heard."""
+        self._cob_id = od.heartbeat_cob_id(node_id)
         self._guarding.reset()
         self._consumer.reset()
 

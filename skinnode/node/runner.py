@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Iterable
@@ -11,6 +12,8 @@ from typing import Final, Self
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.node import PatchNode
+from skinnode.transport.bus_state import BusState, bus_state
+from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
@@ -22,6 +25,9 @@ when the thread wakes for every chunk and 7 % with 2 ms; a bus sees bursts of th
 
 _RETRY_S: Final = 0.02
 """Pause after an error of the bus: a queue that was full has drained by then."""
+
+OFF_AFTER_S: Final = 0.1
+"""A bus on which everything has failed for this long is off to the nodes: a full queue drains sooner."""
 
 PATIENCE_S: Final = 5.0
 """An interface that does nothing but fail for this long has gone."""
@@ -51,6 +57,8 @@ class NodeRunner:
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
         self.bus_errors = 0
         """Errors of the bus that the nodes got over."""
+        self._bus_state = BusState.ACTIVE
+        self._sent_before = 0  # frames, when everything had begun to fail: one more, and the bus is back
         self._stopping = threading.Event()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
@@ -106,6 +114,8 @@ class NodeRunner:
             try:
                 self._turn()
                 failing_since_s = None
+                if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
+                    self._tell(BusState.ACTIVE)
             except BusError:
                 # What could not be sent is lost, as on any bus; the nodes go on. A bus that stays away ends
                 # them.
@@ -114,7 +124,24 @@ class NodeRunner:
                 failing_since_s = now_s if failing_since_s is None else failing_since_s
                 if now_s - failing_since_s > PATIENCE_S:
                     raise
+                if now_s - failing_since_s > OFF_AFTER_S and self._bus_state is not BusState.OFF:
+                    self._tell(BusState.OFF)
+                    self._sent_before = self._port.sent
                 self._stopping.wait(_RETRY_S)
+
+    def _tell(self, state: BusState) -> None:
+        self._bus_state = state
+        now_ns = time.monotonic_ns()
+        for node in self.nodes:
+            with contextlib.suppress(BusError):  # the emergency waits in the node
+                node.on_bus(state, now_ns)
+
+    def _on_error_frame(self, frame: Frame) -> None:
+        if self._port.config.interface == "socketcan":  # others put other things into them
+            state = bus_state(frame)
+            if state is not None:
+                self._tell(state)
+                self._sent_before = 1 << 63  # frames queued for a controller that is off are not sent
 
     def _turn(self) -> None:
         """Serve all nodes and at most one frame; returns when there is something to do, or now and then."""
@@ -134,7 +161,11 @@ class NodeRunner:
                 first_ns = deadline_ns
         wait_s = min((first_ns + self._slack_ns - clock()) * 1e-9, _IDLE_S)
         frame = self._port.recv(wait_s if wait_s > 0.0 else 0.0)
-        if frame is not None and not (frame.error or frame.extended or (frame.fd and not self._fd)):
+        if frame is not None and frame.error:
+            self._on_error_frame(frame)
+        elif frame is not None and not (frame.extended or (frame.fd and not self._fd)):
+            if self._bus_state is BusState.OFF:
+                self._tell(BusState.ACTIVE)  # a frame was heard
             for node in nodes:
                 try:
                     node.on_frame(frame.can_id, frame.data, frame.t_ns, frame.remote)

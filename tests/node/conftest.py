@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.errors import BusError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import PatchNode
@@ -36,9 +37,12 @@ class Desk:
         self.source = Source(layout)
         self.t_ns = 1_000 * MS
         self.sent: list[tuple[int, bytes, int]] = []
+        self.bus_refuses = False
         self.node = PatchNode(NODE_ID, layout, self.source, send=self._send, **options)
 
     def _send(self, can_id: int, data: bytes) -> None:
+        if self.bus_refuses:
+            raise BusError("can0: no buffer space available")
         self.sent.append((can_id, data, self.t_ns))
 
     def power_on(self) -> None:

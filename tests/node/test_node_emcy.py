@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from skinnode.errors import BusError
 from skinnode.node import NmtState
+from skinnode.transport.bus_state import BusState
 
 
 def test_open_wire_is_told_once_and_its_end_too(operational) -> None:
@@ -123,3 +126,137 @@ def test_emergency_of_a_stopped_node_waits(operational) -> None:
     desk.run(2000)
     assert desk.take() == []
     assert desk.frame(0, "80 00") == [(0x084, "30 81 11 7f 00 00 00 00")]
+
+
+def set_cob_id(desk, value: int) -> str:
+    """The answer to writing 0x1014."""
+    return desk.sdo("23 14 10 00" + value.to_bytes(4, "little").hex())
+
+
+ACCEPTED, INVALID = "60 14 10 00 00 00 00 00", "80 14 10 00 30 00 09 06"
+
+
+def test_cob_id_at_start(desk) -> None:
+    assert desk.read(0x1014, 0) == 0x084
+
+
+def test_cob_id_changes_only_while_it_is_invalid(operational) -> None:
+    desk = operational
+    assert set_cob_id(desk, 0x085) == INVALID
+    assert set_cob_id(desk, 0x8000_0085) == ACCEPTED
+    assert set_cob_id(desk, 0x086) == ACCEPTED
+    assert set_cob_id(desk, 0x087) == INVALID
+    assert desk.read(0x1014, 0) == 0x086
+    assert desk.frame(0x80) == [(0x086, "40 82 11 00 01 00 00 00")]
+
+
+@pytest.mark.parametrize(
+    "can_id",
+    # the restricted ones (CiA 301 v4.2, table 41), at their limits
+    [0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF],
+)
+def test_restricted_cob_ids(desk, can_id: int) -> None:
+    set_cob_id(desk, 0x8000_0084)
+    assert set_cob_id(desk, can_id) == INVALID
+    assert desk.read(0x1014, 0) == 0x8000_0084
+
+
+@pytest.mark.parametrize("can_id", [0x080, 0x100, 0x181, 0x580, 0x600, 0x680, 0x6DF, 0x700])
+def test_cob_ids_that_are_free(desk, can_id: int) -> None:
+    set_cob_id(desk, 0x8000_0084)
+    assert set_cob_id(desk, can_id) == ACCEPTED
+
+
+@pytest.mark.parametrize("value", [0x2000_0084, 0x4000_0084, 0xC000_0084, 0x0000_0884, 0x1000_0084])
+def test_bits_that_are_no_part_of_the_cob_id(desk, value: int) -> None:
+    assert set_cob_id(desk, value) == INVALID
+
+
+def test_what_was_told_to_nobody_is_not_told_later(operational) -> None:
+    desk = operational
+    set_cob_id(desk, 0x8000_0084)
+    desk.frame(0x80)
+    desk.frame(0x80, "01 02")
+    desk.take()
+    assert desk.frame(0x604, "23 14 10 00 84 00 00 00") == [(0x584, ACCEPTED)]
+    desk.run(1000)
+    assert [can_id for can_id, _ in desk.take() if can_id == 0x084] == []
+    assert desk.read(0x1003, 0) == 2
+
+
+@pytest.mark.parametrize("value", [1, 8, 9, 255])
+def test_history_is_cleared_by_nothing_but_zero(operational, value: int) -> None:
+    desk = operational
+    desk.frame(0x80)
+    assert desk.sdo(f"2f 03 10 00 {value:02x} 00 00 00") == "80 03 10 00 30 00 09 06"
+    assert desk.read(0x1003, 0) == 1
+
+
+def test_history_holds_no_more_than_there_was(operational) -> None:
+    desk = operational
+    assert desk.sdo("40 03 10 01 00 00 00 00") == "80 03 10 01 24 00 00 08"
+    desk.frame(0x80)
+    assert desk.sdo("40 03 10 01 00 00 00 00") == "43 03 10 01 40 82 00 01"
+    assert desk.sdo("40 03 10 02 00 00 00 00") == "80 03 10 02 24 00 00 08"
+    assert desk.sdo("40 03 10 09 00 00 00 00") == "80 03 10 09 11 00 09 06"
+    assert desk.sdo("23 03 10 01 00 00 00 00") == "80 03 10 01 02 00 01 06"
+
+
+def test_inhibit_time_that_is_shortened_lets_go_at_once(operational) -> None:
+    desk = operational
+    desk.write(0x1015, 0, 0xFFFF, 2)  # 6.5 s
+    desk.frame(0x80)
+    assert desk.frame(0x80, "01 02") == []
+    desk.write(0x1015, 0, 0, 2)
+    desk.run(0)
+    assert desk.take() == [(0x084, "40 82 11 02 01 00 00 00")]
+
+
+def test_more_emergencies_than_can_wait_are_counted(operational) -> None:
+    desk = operational
+    desk.write(0x1015, 0, 10, 2)  # 1 ms
+    for number in range(20):
+        desk.node.on_frame(0x80, bytes(2 + number % 2), desk.t_ns)
+    desk.run(30)
+    told = [data for _, data in desk.take()]
+    assert told[0] == "40 82 11 02 01 00 00 00"
+    assert told[1] == "10 81 11 00 00 03 00 00"  # one was told, 16 waited, 3 gave way
+    assert told[2:] == [f"40 82 11 {2 + number % 2:02x} 01 00 00 00" for number in range(4, 20)]
+    assert desk.read(0x1003, 1) == 0x8110  # the newest: it was said after all those were known
+
+
+def test_emergency_that_the_bus_refuses_is_told_later(operational) -> None:
+    desk = operational
+    desk.bus_refuses = True
+    with pytest.raises(BusError):
+        desk.node.on_frame(0x80, b"", desk.t_ns)
+    desk.bus_refuses = False
+    desk.run(0)
+    assert desk.take() == [(0x084, "40 82 11 00 01 00 00 00")]
+
+
+def test_controller_that_becomes_error_passive(operational) -> None:
+    desk = operational
+    desk.node.on_bus(BusState.PASSIVE, desk.t_ns)
+    desk.node.on_bus(BusState.PASSIVE, desk.t_ns)
+    assert desk.take() == [(0x084, "20 81 11 00 00 00 00 00")]
+    assert desk.node.nmt_state is NmtState.OPERATIONAL
+    assert desk.frame(0, "82 00") == [(0x704, "00"), (0x084, "20 81 11 00 00 00 00 00")]  # it still is
+    desk.node.on_bus(BusState.ACTIVE, desk.t_ns)
+    assert desk.take() == [(0x084, "00 00 00 20 81 00 00 00")]
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "state"),
+    [(0, NmtState.PRE_OPERATIONAL), (1, NmtState.OPERATIONAL), (2, NmtState.STOPPED)],
+)
+def test_bus_off(operational, behaviour: int, state: NmtState) -> None:
+    desk = operational
+    desk.write(0x1029, 1, behaviour, 1)
+    desk.node.on_bus(BusState.OFF, desk.t_ns)
+    assert desk.node.nmt_state is state
+    assert desk.take() == []  # there is no bus to tell it on
+    desk.node.on_bus(BusState.ACTIVE, desk.t_ns)
+    recovered = [(0x084, "40 81 11 00 00 00 00 00")]
+    assert desk.take() == ([] if state is NmtState.STOPPED else recovered)
+    assert (desk.frame(0, "80 00") == recovered) is (state is NmtState.STOPPED)

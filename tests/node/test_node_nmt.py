@@ -36,24 +36,83 @@ def test_silent_before_power_on_and_after_power_off(layout) -> None:
     assert node.next_deadline_ns() is None
 
 
+# CiA 301 v4.2, figure 49: the command that leads into each state, and where each command leads from there.
+INTO = {"7f": "80 00", "05": "01 00", "04": "02 00"}
+COMMANDS = {"01": "05", "02": "04", "80": "7f", "81": "7f", "82": "7f"}
+
+
+def state_of(desk) -> str:
+    """As node guarding tells it."""
+    ((can_id, data),) = desk.frame(0x704, remote=True)
+    assert can_id == 0x704
+    return f"{int(data, 16) & 0x7F:02x}"
+
+
 @pytest.mark.parametrize("address", ["00", "04"])
-def test_transitions(desk, address: str) -> None:
-    for command, state in (
-        ("01", NmtState.OPERATIONAL),
-        ("02", NmtState.STOPPED),
-        ("80", NmtState.PRE_OPERATIONAL),
-        ("02", NmtState.STOPPED),
-        ("01", NmtState.OPERATIONAL),
-        ("80", NmtState.PRE_OPERATIONAL),
-    ):
-        assert desk.frame(0, f"{command} {address}") == []
-        assert desk.node.nmt_state is state
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("state", INTO)
+def test_every_transition(desk, state: str, command: str, address: str) -> None:
+    desk.frame(0, INTO[state])
+    assert state_of(desk) == state
+    boot_up = [(0x704, "00")] if command in ("81", "82") else []
+    assert desk.frame(0, f"{command} {address}") == boot_up
+    assert state_of(desk) == COMMANDS[command]
 
 
-@pytest.mark.parametrize("data", ["", "01", "01 05", "01 04 00", "03 04", "ff 00", "01 00 00 00 00 00 00 00"])
-def test_frames_that_are_no_command_of_ours(desk, data: str) -> None:
+@pytest.mark.parametrize("state", INTO)
+@pytest.mark.parametrize("data", ["01 05", "81 7f", "82 80", "02 ff"])
+def test_commands_for_others(desk, state: str, data: str) -> None:
+    desk.frame(0, INTO[state])
     assert desk.frame(0, data) == []
-    assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+    assert state_of(desk) == state
+    desk.frame(0, "80 00")
+    assert desk.read(0x2040, 1) == 0
+
+
+@pytest.mark.parametrize("state", INTO)
+@pytest.mark.parametrize(
+    "data", ["", "01", "01 04 00", "00 00", "03 04", "7f 00", "83 00", "ff 00", "01 00 00 00 00 00 00 00"]
+)
+def test_what_is_no_command_is_ignored_and_counted(desk, state: str, data: str) -> None:
+    desk.frame(0, INTO[state])
+    assert desk.frame(0, data) == []
+    assert desk.frame(0, data, remote=True) == []
+    assert state_of(desk) == state
+    desk.frame(0, "80 00")
+    assert desk.read(0x2040, 1) == 1
+
+
+@pytest.mark.parametrize(
+    ("state", "sdo", "pdo", "emcy"),
+    [("7f", True, False, True), ("05", True, True, True), ("04", False, False, False)],
+)
+def test_services_of_a_state(desk, state: str, sdo: bool, pdo: bool, emcy: bool) -> None:
+    """CiA 301 v4.2, table 39. TIME: see test_node_time.py; error control: every test here."""
+    desk.frame(0, INTO[state])
+    answer = [(0x584, "43 00 10 00 00 00 00 00")]
+    assert desk.frame(0x604, "40 00 10 00 00 00 00 00") == (answer if sdo else [])
+    told = [(0x084, "40 82 11 01 00 00 00 00")]  # a SYNC with a byte too many
+    assert desk.frame(0x80, "01") == (told if emcy else [])
+    desk.node.on_frame(0x80, b"", desk.t_ns)
+    desk.run(100)
+    assert [can_id for can_id, _ in desk.take()] == ([0x184] * 4 + [0x284] if pdo else [])
+    desk.node.on_frame(0x204, bytes.fromhex("00 00 00 00 01 00"), desk.t_ns)  # a single scan
+    desk.run(100)
+    assert [can_id for can_id, _ in desk.take()] == ([0x184] * 4 if pdo else [])
+
+
+def test_requests_that_are_no_sdo_are_counted(desk) -> None:
+    for length in range(8):
+        assert desk.frame(0x604, "40 00 10 00 00 00 00 00"[: 3 * length]) == []
+    assert desk.read(0x2040, 5) == 8
+
+
+def test_counters_survive_reset_communication_but_not_reset_node(desk) -> None:
+    desk.frame(0, "01")
+    desk.frame(0, "82 00")
+    assert desk.read(0x2040, 1) == 1
+    desk.frame(0, "81 00")
+    assert desk.read(0x2040, 1) == 0
 
 
 def test_stopped_serves_nothing_but_nmt_and_heartbeat(operational) -> None:

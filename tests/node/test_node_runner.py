@@ -227,6 +227,33 @@ def test_bus_that_refuses_frames_for_a_while(virtual: BusConfig, layout: PatchLa
             assert runner.bus_errors >= 1
 
 
+def test_bus_that_goes_away_and_comes_back(virtual: BusConfig, layout: PatchLayout) -> None:
+    """Off to the node: error behaviour at once, 0x8140 as soon as there is somebody to tell."""
+    with CanPort(virtual) as port, CanPort(virtual) as manager:
+        gone = threading.Event()
+
+        def send(can_id: int, data: bytes) -> None:
+            if gone.is_set():
+                raise BusError("can0: network is down")
+            port.send(can_id, data)
+
+        def heard() -> list[tuple[int, str]]:
+            frame = manager.recv(0.01)
+            return [] if frame is None else [(frame.can_id, frame.data.hex(" "))]
+
+        node = PatchNode(4, layout, Steady(layout), send=send)
+        with NodeRunner(port, [node]):
+            manager.send(0x604, bytes.fromhex("2b17100001000000"))  # a heartbeat each ms
+            manager.send(0x000, bytes((1, 0)))
+            eventually(lambda: (0x704, "05") in heard())
+            gone.set()
+            eventually(lambda: node.nmt_state is NmtState.PRE_OPERATIONAL)
+            gone.clear()
+            eventually(lambda: (0x084, "40 81 11 00 00 00 00 00") in heard())
+            manager.send(0x000, bytes((1, 0)))
+            eventually(lambda: (0x704, "05") in heard())
+
+
 def test_frames_that_are_not_classic_data_are_no_frames_to_a_node(
     virtual: BusConfig, layout: PatchLayout
 ) -> None:

@@ -1,0 +1,37 @@
+"""Fault confinement of a CAN controller (ISO 11898-1), and how SocketCAN tells of it: <linux/can/error.h>."""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+from typing import Final
+
+from skinnode.transport.frame import Frame
+
+_CONTROLLER, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100
+_WARNING, _PASSIVE, _ACTIVE = 0x0C, 0x30, 0x40
+_CONTROLLER_BYTE: Final = 1
+
+
+class BusState(Enum):
+    """What a controller may do on the bus."""
+
+    ACTIVE = auto()
+    PASSIVE = auto()
+    """It has met many errors; it still sends and receives."""
+    OFF = auto()
+    """It neither sends nor receives."""
+
+
+def bus_state(frame: Frame) -> BusState | None:
+    """The state an error frame of SocketCAN tells; None where it is about something else."""
+    if frame.can_id & _BUS_OFF:
+        return BusState.OFF
+    if frame.can_id & _RESTARTED:
+        return BusState.ACTIVE
+    if frame.can_id & _CONTROLLER and len(frame.data) > _CONTROLLER_BYTE:
+        bits = frame.data[_CONTROLLER_BYTE]
+        if bits & _PASSIVE:
+            return BusState.PASSIVE
+        if bits & (_ACTIVE | _WARNING):  # warned is active still
+            return BusState.ACTIVE
+    return None

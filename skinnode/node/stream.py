@@ -98,7 +98,7 @@ class ScanStream:
         self._scan = self._next_scan = self._carrier = None
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """A SYNC came, and no scan has started with it yet: send summaries that waited for it."""
+        """A SYNC came that starts no scan: send summaries that waited for it."""
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.waiting and tpdo.number in turns:
                 self._tpdos.transmit(tpdo, t_ns)

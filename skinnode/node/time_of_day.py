@@ -12,7 +12,7 @@ from typing import Final
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import Clock
 from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import COB_ID_MASK, check_cob_id
+from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
 from skinnode.wire import indices as od
 
 _CONSUMES: Final = 1 << 31
@@ -75,5 +75,7 @@ class TimeConsumer:
         current = self._store.integer(od.COB_ID_TIME)
         if value & _PRODUCES:
             raise Refused(AbortCode.INVALID_VALUE)
-        # The other way round than elsewhere: bit 31 says that it is used.
+        # The other way round than elsewhere: bit 31 says that it is used. Restricted CAN-IDs are refused
+        # either way.
         check_cob_id(value ^ _CONSUMES, current ^ _CONSUMES)
+        check_cob_id(value & ~_CONSUMES, INVALID_BIT)

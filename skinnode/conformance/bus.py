@@ -83,9 +83,11 @@ class Tester:
 
     def clear(self) -> None:
         """Forget what has come so far."""
-        for _ in range(_INBOX_FRAMES):  # a bus may be so full that it never falls silent
-            if not self._receive(0.0):
-                break
+        self._fetch()
+        self.forget()
+
+    def forget(self) -> None:
+        """Empty the inbox; what still waits at the interface comes in later."""
         self._inbox.clear()
 
     def take(
@@ -122,14 +124,19 @@ class Tester:
 
     def listen(self, can_id: int, for_s: float) -> list[Frame]:
         """All frames of ``can_id`` that come from now on for ``for_s``."""
-        self.clear()
+        self.pending(can_id)
+        self.wait(for_s)
+        return self.pending(can_id)
+
+    def wait(self, for_s: float) -> None:
+        """Let time pass; what comes waits in the inbox."""
         end_s = time.monotonic() + for_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._receive(left_s)
-        return self.pending(can_id)
 
     def pending(self, can_id: int) -> list[Frame]:
-        """Frames of ``can_id`` in the inbox; they leave it."""
+        """Frames of ``can_id`` that have come so far; they leave the inbox."""
+        self._fetch()
         found = [frame for frame in self._inbox if frame.can_id == can_id and not frame.remote]
         for frame in found:
             self._inbox.remove(frame)
@@ -140,6 +147,11 @@ class Tester:
         frame = self.take(can_id, for_s)
         if frame is not None:
             raise Failed(f"no {what}", describe(frame))
+
+    def _fetch(self) -> None:
+        for _ in range(_INBOX_FRAMES):  # a bus may be so full that it never falls silent
+            if not self._receive(0.0):
+                return
 
     def _receive(self, timeout_s: float) -> bool:
         frame = self._port.recv(timeout_s)

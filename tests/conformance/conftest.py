@@ -51,3 +51,9 @@ def dut() -> Iterator[Dut]:
     channel = f"conformance-{uuid.uuid4().hex[:8]}"
     with patch_on(channel), bench_on(channel) as found:
         yield found
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that does not come up is waited for as long as ours takes many times over, not for seconds."""
+    monkeypatch.setattr("skinnode.conformance.dut.BOOT_S", 0.6)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 
-from skinnode.conformance import CASES, Case, Dut, Verdict, run_case
+from skinnode.conformance import CASES, Case, Dut, Verdict, run_cases
 
 NOT_APPLICABLE = {
     "SDO-04": "no object with access wo",
@@ -15,16 +17,45 @@ NOT_APPLICABLE = {
 }
 """What a patch does not have, and the words it is said with. Everything else has to pass."""
 
-PENDING = {"OD-02", "OD-08"}
-"""Cases of services that the node is still to get: restoring defaults."""
+PENDING = {"OD-02", "OD-08", "SYNC-08", "SYNC-10", *(f"OTHER-0{number}" for number in range(1, 10))}
+"""Cases of services that the node is still to get: storing parameters and restoring defaults."""
+
+PLAN = {
+    "EDS": 1,
+    "SDO": 30,
+    "PDO": 33,
+    "OD": 9,
+    "EMCY": 6,
+    "SYNC": 10,
+    "GUARD": 6,
+    "HB": 7,
+    "HBVG": 7,
+    "OTHER": 10,
+    "STATE": 4,
+    "TRANS": 4,
+}
+"""Cases an area of a CiA conformance plan has."""
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.id not in PENDING], ids=lambda case: case.id)
 def test_patch(case: Case, dut: Dut) -> None:
-    result = run_case(dut, case)
+    report = run_cases(dut, [case])
+    (result,) = report.results
+    assert report.problems == ()
     if case.id in NOT_APPLICABLE:
         assert result.verdict is Verdict.NOT_APPLICABLE, result.why
         assert NOT_APPLICABLE[case.id] in result.why
     else:
         frames = "\n".join(map(str, result.trace))
         assert result.verdict is Verdict.PASSED, f"{case.title}: {result.why}\n{frames}"
+
+
+def test_the_cases_are_those_of_the_plan() -> None:
+    ids = [f"{area}-{number:02}" for area, count in PLAN.items() for number in range(1, count + 1)]
+    assert len(ids) == 127
+    assert [case.id for case in CASES] == ids
+    assert Counter(case.area for case in CASES) == PLAN
+
+
+def test_at_least_105_apply_to_a_patch() -> None:
+    assert len(CASES) - len(NOT_APPLICABLE) >= 105

@@ -1,0 +1,91 @@
+"""Guarding 1 to 6: the older of the two error control protocols."""
+
+from __future__ import annotations
+
+from skinnode.conformance.bus import Failed
+from skinnode.conformance.case import case
+from skinnode.conformance.dut import GUARD_TIME, LIFE_TIME_FACTOR, RESET_COMMUNICATION, STATES, Dut
+from skinnode.conformance.provoke import COMMUNICATION_LOST, expect_emcy, expect_no_emcy, not_before
+
+_TOGGLE = 0x80
+_GUARD_MS, _FACTOR = 100, 3
+
+
+def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
+    """A remote frame must be answered with this state and, unless None, this toggle bit."""
+    got = dut.guard(what)
+    told = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
+    if got is None:
+        raise Failed(f"{STATES[state]} and {told} to a remote frame, {what}", "nothing")
+    if got & 0x7F != state or (toggle is not None and got >> 7 != toggle):
+        raise Failed(f"{STATES[state]} and {told} to a remote frame, {what}", f"0x{got:02X}")
+
+
+@case("GUARD-01", "0x100C and 0x100D are 0 by default: no life guarding", "7.5.2.11, 7.5.2.12")
+def defaults(dut: Dut) -> None:
+    for index in (GUARD_TIME, LIFE_TIME_FACTOR):
+        default = dut.need(index).default_bytes(dut.node_id)
+        value = dut.sdo.read(index)
+        if value != default:
+            raise Failed(f"0x{index:04X}:00 as in the EDS", value.hex(" ").upper())
+
+
+@case("GUARD-02", "A remote frame is answered with the NMT state", "7.2.8.3.2.1")
+def answered(dut: Dut) -> None:
+    dut.need(GUARD_TIME)
+    guarded(dut, 127, None, "after a reset")
+
+
+@case(
+    "GUARD-03",
+    "The toggle bit is 0 first, alternates, and is 0 again after reset communication",
+    "7.2.8.3.2.1",
+)
+def toggle(dut: Dut) -> None:
+    dut.need(GUARD_TIME)
+    for number in range(5):
+        guarded(dut, 127, number % 2, f"answer {number + 1}")
+    dut.reset(RESET_COMMUNICATION)
+    guarded(dut, 127, 0, "first after reset communication")
+
+
+@case("GUARD-04", "Remote frames for other node-IDs are not answered", "7.2.8.3.2.1; 7.3.3")
+def others(dut: Dut) -> None:
+    dut.need(GUARD_TIME)
+    for node_id in range(1, 128):
+        if node_id != dut.node_id:
+            dut.bus.send(0x700 + node_id, remote=True)
+    dut.bus.expect_silence(dut.error_control_id, "answer to remote frames for others")
+    guarded(dut, 127, 0, "after remote frames for others")
+
+
+@case("GUARD-05", "0x100C and 0x100D are written and read back", "7.5.2.11, 7.5.2.12")
+def written(dut: Dut) -> None:
+    dut.need(GUARD_TIME)
+    dut.need(LIFE_TIME_FACTOR)
+    dut.sdo.write_integer(GUARD_TIME, 0, 0x1234, 2)
+    dut.sdo.write_integer(LIFE_TIME_FACTOR, 0, 3, 1)
+    got = dut.sdo.integer(GUARD_TIME), dut.sdo.integer(LIFE_TIME_FACTOR)
+    if got != (0x1234, 3):
+        raise Failed("0x1234 and 3 read back", f"0x{got[0]:04X} and {got[1]}")
+
+
+@case("GUARD-06", "Life guarding: begins with the first remote frame, tells when they end (EMCY 0x8130)",
+      "7.2.8.2.2.1, 7.5.2.12")  # fmt: skip
+def life_guarding(dut: Dut) -> None:
+    dut.need(GUARD_TIME)
+    dut.need(LIFE_TIME_FACTOR)
+    dut.sdo.write_integer(GUARD_TIME, 0, _GUARD_MS, 2)
+    dut.sdo.write_integer(LIFE_TIME_FACTOR, 0, _FACTOR, 1)
+    dut.operational()
+    dut.bus.wait(1.3 * _GUARD_MS * _FACTOR * 1e-3)
+    expect_no_emcy(dut, COMMUNICATION_LOST, "before the first remote frame")
+    sent_ns = 0
+    for _ in range(8):
+        sent_ns = dut.bus.send(dut.error_control_id, remote=True)
+        dut.bus.wait(0.5 * _GUARD_MS * 1e-3)
+    expect_no_emcy(dut, COMMUNICATION_LOST, "while remote frames come")
+    frame = expect_emcy(dut, COMMUNICATION_LOST, "when they end")
+    not_before(frame, sent_ns, _GUARD_MS * _FACTOR, "EMCY 0x8130")
+    if dut.eds.find(0x1029, 1) is None or dut.sdo.integer(0x1029, 1) == 0:
+        guarded(dut, 127, None, "after life guarding failed in OPERATIONAL")

@@ -1,0 +1,184 @@
+"""Others 1 to 10: storing and restoring by 0x1010 and 0x1011, 0x1020, and CAN-IDs that nothing may be set
+to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from skinnode.conformance.bus import Failed
+from skinnode.conformance.case import NotApplicable, case
+from skinnode.conformance.dut import HEARTBEAT, RESTORE, STORE, Dut
+from skinnode.conformance.pdo import COB_ID, INVALID
+from skinnode.conformance.sdo import expedited
+
+_EMCY_INHIBIT, _VERIFY, _EMCY = 0x1015, 0x1020, 0x1014
+_ON_COMMAND = 1
+_WRONG_SIGNATURE = (0x0800_0020,)
+_RESTRICTED_VALUE = (0x0609_0030, 0x0609_0031, 0x0609_0032)
+
+RESTRICTED = (
+    range(0x080),
+    range(0x101, 0x181),
+    range(0x581, 0x600),
+    range(0x601, 0x680),
+    range(0x6E0, 0x700),
+    range(0x701, 0x800),
+)
+"""CAN-IDs of NMT, the default SDO and error control, and reserved ones."""
+
+
+def _on_command(dut: Dut, index: int, subindex: int) -> None:
+    """NotApplicable where the device does not store or restore on command."""
+    dut.need(index, subindex)
+    capability = dut.sdo.integer(index, subindex)
+    if index == STORE and not capability & _ON_COMMAND:
+        raise NotApplicable(
+            f"0x1010:{subindex:02X} = 0x{capability:08X}: bit 0, saving on command, is not set"
+        )
+    if index == RESTORE and not capability & 1:
+        raise NotApplicable(f"0x1011:{subindex:02X} = 0x{capability:08X}: bit 0, restoring, is not set")
+
+
+def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
+    """Write values that are not the default to what is harmless; values before and after."""
+    before, after = {}, {}
+    for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
+        entry = dut.eds.find(index)
+        if entry is not None and entry.writable:
+            before[index] = dut.sdo.read(index)
+            after[index] = value.to_bytes(2, "little")
+            dut.sdo.write(index, 0, after[index])
+    if not before:
+        raise NotApplicable("neither 0x1015 nor 0x1017 can be written")
+    return before, after
+
+
+def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
+    for index, value in wanted.items():
+        now = dut.sdo.read(index)
+        if now != value:
+            raise Failed(f"0x{index:04X}:00 = {value.hex(' ').upper()} {when}", now.hex(" ").upper())
+
+
+def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
+    """Refused, and nothing has changed: neither at once nor after a reset."""
+    _on_command(dut, index, subindex)
+    before, after = _change(dut)
+    # Were it taken for right, what is stored would have to be put back.
+    dut.stored = True
+    for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
+        request = expedited(index, subindex, signature)
+        what = f"{signature!r} to 0x{index:04X}:{subindex:02X}"
+        dut.sdo.aborts(request, index, subindex, _WRONG_SIGNATURE, what)
+    _compare(dut, after, "after the wrong signature")
+    dut.reset()
+    _compare(dut, before, "after the wrong signature and reset node")
+
+
+def _store(dut: Dut, subindex: int) -> None:
+    _on_command(dut, STORE, subindex)
+    _, after = _change(dut)
+    dut.store(subindex)
+    dut.reset()
+    _compare(dut, after, "stored, after reset node")
+
+
+def _restore(dut: Dut, subindex: int) -> None:
+    """Default values are valid after the next reset, and not before it."""
+    _on_command(dut, RESTORE, subindex)
+    if dut.eds.find(STORE, subindex) is not None:
+        _store(dut, subindex)
+    _, after = _change(dut)
+    dut.restore(subindex)
+    _compare(dut, after, "before the reset that makes defaults valid")
+    dut.reset()
+    defaults = {index: dut.need(index).default_bytes(dut.node_id) for index in after}
+    _compare(
+        dut, {i: d for i, d in defaults.items() if d is not None}, "after restoring defaults and reset node"
+    )
+
+
+@case("OTHER-01", "0x1010:01 stores nothing with a wrong signature", "7.5.2.13")
+def store_all_wrong(dut: Dut) -> None:
+    _wrong_signature(dut, STORE, 1)
+
+
+@case("OTHER-02", "0x1010:01 stores with the signature 'save': values survive reset node", "7.5.2.13")
+def store_all(dut: Dut) -> None:
+    _store(dut, 1)
+
+
+@case("OTHER-03", "0x1011:01 restores nothing with a wrong signature", "7.5.2.14")
+def restore_all_wrong(dut: Dut) -> None:
+    _wrong_signature(dut, RESTORE, 1)
+
+
+@case("OTHER-04", "0x1011:01 restores with the signature 'load': defaults after reset node", "7.5.2.14")
+def restore_all(dut: Dut) -> None:
+    _restore(dut, 1)
+
+
+@case("OTHER-05", "0x1010:02 (communication) stores nothing with a wrong signature", "7.5.2.13")
+def store_communication_wrong(dut: Dut) -> None:
+    _wrong_signature(dut, STORE, 2)
+
+
+@case("OTHER-06", "0x1010:02 (communication) stores with 'save': values survive reset node", "7.5.2.13")
+def store_communication(dut: Dut) -> None:
+    _store(dut, 2)
+
+
+@case("OTHER-07", "0x1011:02 (communication) restores nothing with a wrong signature", "7.5.2.14")
+def restore_communication_wrong(dut: Dut) -> None:
+    _wrong_signature(dut, RESTORE, 2)
+
+
+@case("OTHER-08", "0x1011:02 (communication) restores with 'load': defaults after reset node", "7.5.2.14")
+def restore_communication(dut: Dut) -> None:
+    _restore(dut, 2)
+
+
+@case("OTHER-09", "0x1020 keeps date and time over storing and reset, and is 0 once an object is written",
+      "7.5.2.23")  # fmt: skip
+def verify(dut: Dut) -> None:
+    dut.need(_VERIFY, 1)
+    dut.need(_VERIFY, 2)
+    _on_command(dut, STORE, 1)
+    date, time = 15_000, 43_200_000  # days since 1984, ms since midnight
+    dut.sdo.write_integer(_VERIFY, 1, date, 4)
+    dut.sdo.write_integer(_VERIFY, 2, time, 4)
+    dut.store(1)
+    dut.reset()
+    got = dut.sdo.integer(_VERIFY, 1), dut.sdo.integer(_VERIFY, 2)
+    if got != (date, time):
+        raise Failed(f"date {date} and time {time} after reset node", f"{got[0]} and {got[1]}")
+    _change(dut)
+    got = dut.sdo.integer(_VERIFY, 1), dut.sdo.integer(_VERIFY, 2)
+    if got != (0, 0):
+        raise Failed("date and time 0 after another object was written", f"{got[0]} and {got[1]}")
+
+
+@case("OTHER-10", "No COB-ID can be set to a restricted CAN-ID", "7.3.5")
+def restricted(dut: Dut) -> None:
+    found = False
+    for index, subindex in _cob_ids(dut):
+        found = True
+        if index == _EMCY or index >= 0x1280:  # not to be changed while valid
+            current = dut.sdo.integer(index, subindex)
+            dut.sdo.write_integer(index, subindex, current | INVALID, 4)
+        for block in RESTRICTED:
+            for can_id in block:
+                request = expedited(index, subindex, can_id.to_bytes(4, "little"))
+                what = f"CAN-ID 0x{can_id:03X} for 0x{index:04X}:{subindex:02X}"
+                dut.sdo.aborts(request, index, subindex, _RESTRICTED_VALUE, what)
+    if not found:
+        raise NotApplicable("the EDS has no COB-ID that can be written")
+
+
+def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
+    """COB-IDs that can be written: SYNC, TIME, EMCY, and of each kind of PDO the first."""
+    pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
+    for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
+        entry = dut.eds.find(index, subindex)
+        if entry is not None and entry.writable:
+            yield index, subindex

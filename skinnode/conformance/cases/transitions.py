@@ -1,0 +1,108 @@
+"""NMT transitions 1 to 4: reset node against reset communication, pre-operational, start, stop."""
+
+from __future__ import annotations
+
+from skinnode.conformance.bus import Failed
+from skinnode.conformance.case import case
+from skinnode.conformance.cases.sdo import limited
+from skinnode.conformance.dut import (
+    HEARTBEAT,
+    PRE_OPERATIONAL,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    START,
+    STOP,
+    Dut,
+)
+from skinnode.conformance.eds import UNSIGNED, EdsEntry
+from skinnode.conformance.sdo import Aborted
+
+_COMMANDS = {PRE_OPERATIONAL: 127, START: 5, STOP: 4}
+_NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"}
+
+
+def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
+    """An object of 0x2000 to 0x9FFF that took another value, and the value before; None for none."""
+    for entry in dut.eds.between(0x2000, 0x9FFF):
+        if not (entry.readable and entry.writable and entry.data_type in UNSIGNED and entry.size <= 4):
+            continue
+        before = dut.sdo.read(entry.index, entry.subindex)
+        value = int.from_bytes(before, "little") ^ 1
+        if limited(entry, value, 0) is None or (entry.low is not None and value < entry.low):
+            continue
+        try:
+            dut.sdo.write_integer(entry.index, entry.subindex, value, entry.size)
+        except Aborted:
+            continue
+        if dut.sdo.integer(entry.index, entry.subindex) == value:
+            return entry, before
+        dut.sdo.write(entry.index, entry.subindex, before)
+    return None
+
+
+@case(
+    "TRANS-01",
+    "Reset node and reset communication, from every state; the latter keeps application objects",
+    "7.3.2.2.1",
+)
+def resets(dut: Dut) -> None:
+    for reset in (RESET_NODE, RESET_COMMUNICATION):
+        for command in _COMMANDS:
+            dut.nmt(command)
+            dut.reset(reset)
+            period_ms = dut.sdo.integer(HEARTBEAT) if dut.eds.find(HEARTBEAT) is not None else 0
+            if period_ms == 20:
+                raise Failed("0x1017 as before it was written", "20")
+            dut.start_heartbeat()
+            dut.expect_state(127, f"reset after {_NAMES[command]}")
+    changed = _application_object(dut)
+    if changed is None:
+        return
+    entry, before = changed
+    written = dut.sdo.read(entry.index, entry.subindex)
+    for reset, wanted, what in (
+        (RESET_COMMUNICATION, written, "after reset communication"),
+        (RESET_NODE, before, "after reset node"),
+    ):
+        dut.reset(reset)
+        now = dut.sdo.read(entry.index, entry.subindex)
+        if now != wanted:
+            raise Failed(f"{entry} = {wanted.hex(' ').upper()} {what}", now.hex(" ").upper())
+
+
+def _transition(dut: Dut, command: int, *others: int) -> None:
+    """``command`` leads to its state after each of ``others``, by node-ID and for all nodes; commands for
+    another node, or that are none, change nothing."""
+    state, name = _COMMANDS[command], _NAMES[command]
+    dut.start_heartbeat()
+    for other in others:
+        for node_id in (dut.node_id, 0):
+            dut.nmt(other)
+            dut.expect_state(_COMMANDS[other], f"after {_NAMES[other]}")
+            dut.bus.send(0x000, bytes((command, dut.node_id % 127 + 1)))
+            dut.bus.send(0x000, bytes((command,)))
+            dut.bus.send(0x000, bytes((0x7F, dut.node_id)))
+            dut.expect_state(_COMMANDS[other], "after commands that are not for it")
+            dut.bus.send(0x000, bytes((command, node_id)))
+            dut.expect_state(state, f"{name} (node-ID {node_id}) after {_NAMES[other]}")
+    dut.nmt(command)
+    dut.expect_state(state, f"{name} twice")
+
+
+@case(
+    "TRANS-02",
+    "Enter pre-operational, from OPERATIONAL and STOPPED, by node-ID and for all",
+    "7.2.8.2.1, 7.3.2.2",
+)
+def enter_pre_operational(dut: Dut) -> None:
+    _transition(dut, PRE_OPERATIONAL, START, STOP)
+
+
+@case("TRANS-03", "Start, from PRE-OPERATIONAL and STOPPED, by node-ID and for all", "7.2.8.2.1, 7.3.2.2")
+def start(dut: Dut) -> None:
+    _transition(dut, START, PRE_OPERATIONAL, STOP)
+
+
+@case("TRANS-04", "Stop, from PRE-OPERATIONAL and OPERATIONAL, by node-ID and for all", "7.2.8.2.1, 7.3.2.2")
+def stop(dut: Dut) -> None:
+    _transition(dut, STOP, PRE_OPERATIONAL, START)

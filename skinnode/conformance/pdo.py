@@ -1,0 +1,156 @@
+"""PDOs of a device under test: which there are, how to set one up, what it then sends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.conformance.bus import Failed, describe
+from skinnode.conformance.case import NotApplicable
+from skinnode.conformance.dut import Dut
+from skinnode.conformance.sdo import Aborted
+from skinnode.transport import Frame
+
+INVALID: Final = 1 << 31
+NO_REMOTE: Final = 1 << 30
+CAN_ID: Final = 0x7FF
+COB_ID, KIND, INHIBIT, EVENT_TIMER, SYNC_START = 1, 2, 3, 5, 6
+"""Sub-indices of a communication parameter."""
+
+SYNC_ID: Final = 0x80
+
+_UNSUPPORTED: Final = (0x0609_0030, 0x0609_0031, 0x0604_0043, 0x0601_0002, 0x0800_0000)
+_PAUSE_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Pdo:
+    """A PDO by its communication parameter, 0x1400 or 0x1800 and above."""
+
+    parameter: int
+
+    @property
+    def mapping(self) -> int:
+        return self.parameter + 0x200
+
+    @property
+    def transmits(self) -> bool:
+        return self.parameter >= 0x1800
+
+    def __str__(self) -> str:
+        return f"{'TPDO' if self.transmits else 'RPDO'}{self.parameter % 0x200 + 1}"
+
+
+class Unsupported(Exception):
+    """A PDO does not take a transmission type, or has no such sub-index; that is its right."""
+
+
+def rpdos(dut: Dut) -> list[Pdo]:
+    return [Pdo(index) for index in dut.eds.indices(0x1400, 0x15FF)]
+
+
+def tpdos(dut: Dut) -> list[Pdo]:
+    return [Pdo(index) for index in dut.eds.indices(0x1800, 0x19FF)]
+
+
+def sync(dut: Dut, counter: int | None = None) -> int:
+    """Send a SYNC; returns its time in ns."""
+    return dut.bus.send(SYNC_ID, b"" if counter is None else bytes((counter,)))
+
+
+def disable(dut: Dut, pdo: Pdo) -> int:
+    """Set bit 31 of the COB-ID; returns the COB-ID from before."""
+    cob_id = dut.sdo.integer(pdo.parameter, COB_ID)
+    dut.sdo.write_integer(pdo.parameter, COB_ID, cob_id | INVALID, 4)
+    return cob_id
+
+
+def mapped(dut: Dut, pdo: Pdo) -> list[int]:
+    """The entries of the mapping parameter."""
+    count = dut.sdo.integer(pdo.mapping, 0)
+    return [dut.sdo.integer(pdo.mapping, subindex) for subindex in range(1, count + 1)]
+
+
+def payload_bytes(entries: list[int]) -> int:
+    """Length of a PDO with these mapping entries."""
+    return sum(entry & 0xFF for entry in entries) // 8
+
+
+def set_up(
+    dut: Dut,
+    pdo: Pdo,
+    kind: int,
+    *,
+    event_ms: int = 0,
+    inhibit: int = 0,
+    start: int = 0,
+    remote: bool = False,
+) -> int:
+    """Disable the PDO, write its parameters (inhibit time in 100 µs), enable it; returns its CAN-ID. Raises
+    Unsupported where it does not take them."""
+    cob_id = disable(dut, pdo)
+    _set(dut, pdo, KIND, kind, 1)
+    for subindex, value, size in ((INHIBIT, inhibit, 2), (EVENT_TIMER, event_ms, 2), (SYNC_START, start, 1)):
+        if dut.eds.find(pdo.parameter, subindex) is not None:
+            _set(dut, pdo, subindex, value, size)
+        elif value:
+            raise Unsupported(f"{pdo} has no sub-index {subindex}")
+    valid = cob_id & ~INVALID
+    _set(dut, pdo, COB_ID, valid & ~NO_REMOTE if remote else valid, 4)
+    return cob_id & CAN_ID
+
+
+def _set(dut: Dut, pdo: Pdo, subindex: int, value: int, size: int) -> None:
+    if dut.sdo.integer(pdo.parameter, subindex) == value:
+        return
+    try:
+        dut.sdo.write_integer(pdo.parameter, subindex, value, size)
+    except Aborted as abort:
+        if abort.code in _UNSUPPORTED:
+            raise Unsupported(f"{pdo}: {abort}") from abort
+        raise
+
+
+Trial = Callable[[Dut, Pdo], None]
+
+
+def each_tpdo(dut: Dut, trial: Trial) -> None:
+    """Run ``trial`` on every TPDO that maps something, all others disabled, each from a fresh reset.
+    NotApplicable where none of them supports it."""
+    found = tpdos(dut)
+    if not found:
+        raise NotApplicable("the EDS has no TPDO (0x1800 to 0x19FF)")
+    reasons: list[str] = []
+    tried = False
+    for pdo in found:
+        if not mapped(dut, pdo):
+            reasons.append(f"{pdo} maps nothing")
+            continue
+        for other in found:
+            if other != pdo:
+                disable(dut, other)
+        try:
+            trial(dut, pdo)
+            tried = True
+        except Unsupported as reason:
+            reasons.append(str(reason))
+        dut.prepare()
+    if not tried:
+        raise NotApplicable("; ".join(reasons))
+
+
+def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
+    """The next frame of a PDO, which must have the length of its mapping."""
+    frame = dut.bus.expect(can_id, what)
+    if len(frame.data) != length:
+        raise Failed(f"{length} bytes as mapped, {what}", describe(frame))
+    return frame
+
+
+def drain(dut: Dut, can_id: int) -> None:
+    """Take frames until none comes for a while, or for half a second."""
+    end_s = time.monotonic() + 0.5
+    while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
+        pass

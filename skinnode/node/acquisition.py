@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
-from skinnode.node.source import ResistanceSource
+from skinnode.node.source import ResistanceSource, read_source
 from skinnode.wire.codec import Codes, CodeScale, chunk_of_code, encode
 from skinnode.wire.profile import PatchProfile
 
@@ -68,21 +68,21 @@ class Acquisition:
         self._sent: Codes | None = None  # what the host has, chunk by chunk; None: nothing it could rely on
         self._since_full = 0
 
-    def _read(self, t_ns: int) -> Float:
-        shape = self._profile.rows, self._profile.columns
-        return require_array("source.read()", self._source.read(t_ns), shape, finite=False)
+    def read(self, t_ns: int) -> Float:
+        """(U, K) resistances in ohm. Raises SourceFailed, as all do that read."""
+        return read_source(self._source, (self._profile.rows, self._profile.columns), t_ns)
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
         """Take a scan: the mean of ``readings`` readings, as codes."""
-        resistance = self._read(t_ns)
+        resistance = self.read(t_ns)
         for _ in range(readings - 1):
-            resistance = resistance + self._read(t_ns)
+            resistance = resistance + self.read(t_ns)
         self.codes = encode(resistance / readings, self.baseline_ohm, self.scale)
         self.faults = find_faults(self.codes, self.scale)
 
     def tare(self, t_ns: int, readings: int = TARE_READS) -> None:
         """Make the present resistances the baseline. Pairs without a resistance keep the one they have."""
-        total = sum((self._read(t_ns) for _ in range(readings)), start=np.zeros(self.codes.shape))
+        total = sum((self.read(t_ns) for _ in range(readings)), start=np.zeros(self.codes.shape))
         mean = (total / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)

@@ -6,21 +6,25 @@ scans before them. The communication around it is in :mod:`skinnode.node.device`
 
 from __future__ import annotations
 
+import contextlib
 import math
 import struct
+from collections.abc import Iterator
 
 import numpy as np
 
-from skinnode.model.layout import PRESET_IDS, PatchLayout
+from skinnode.model.layout import PRESET_IDS, Float, PatchLayout
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.device import Services
 from skinnode.node.emcy import EmcyCode
 from skinnode.node.od import ObjectStore
+from skinnode.node.self_test import self_test
+from skinnode.node.source import SourceFailed, SourceFault
 from skinnode.node.stream import OutgoingScan, ScanStream
 from skinnode.wire import indices as od
-from skinnode.wire.codec import SendMode, SummaryFlag, pack_scan
+from skinnode.wire.codec import SELF_TEST_NEVER_RUN, SendMode, SummaryFlag, pack_scan, pack_self_test
 from skinnode.wire.coordinates import pack_coordinates
 from skinnode.wire.profile import PatchProfile
 
@@ -47,8 +51,14 @@ class PatchApplication:
         self._counter = -1
         self._period_ns = 0
         self._faults_told: WireFaults = acquisition.faults
+        self._source_fault: SourceFault | None = None
         self._late = False
         self._baseline_changed = False
+        self._test = SELF_TEST_NEVER_RUN
+        self.source_failures = 0
+        """Readings, tares and self-tests that the source failed."""
+        self.source_error = ""
+        """What it failed of last."""
         self.overruns = 0
         """Scans skipped because two others were still to be sent."""
         self._scan_ns = NO_DEADLINE_NS  # when the node's own timer has a scan to take
@@ -65,12 +75,16 @@ class PatchApplication:
     def power_on(self, t_ns: int) -> None:
         """Tare, unless there is a baseline from before."""
         if not self._acquisition.tared:
-            self._acquisition.tare(t_ns)
+            with contextlib.suppress(SourceFailed):
+                self._tare(t_ns)
 
     def reset(self) -> None:
         """The node was reset: scans are numbered anew and nothing has been told."""
         self._counter, self._late = -1, False
         self._faults_told = WireFaults.none(self._profile)
+        self._test = SELF_TEST_NEVER_RUN
+        if self._source_fault is not None:  # it has not gone away
+            self._tell_source(self._source_fault, self._now())
 
     def enter(self, *, operational: bool) -> None:
         """The node entered another state."""
@@ -111,8 +125,23 @@ class PatchApplication:
                 self._late = True
                 self._emcy.present(EmcyCode.CAN_OVERRUN, struct.pack("<H", self.overruns & 0xFFFF), t_ns)
             return
+        try:
+            chunks, flags = self._sample(counter, t_ns)
+        except SourceFailed:
+            chunks, flags = [], SummaryFlag.SOURCE_FAILED
+        self.stream.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
+        if self._late and not self.stream.full:
+            self._late = False
+            self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
+
+    def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag]:
+        """Chunks to be sent of a scan taken now, and its flags. Raises SourceFailed."""
         store, acquisition = self._store, self._acquisition
-        acquisition.sample(t_ns, store.integer(od.ACQUISITION, od.ACQUISITION_AVERAGING))
+        if not acquisition.tared:  # the source failed when it was to be done
+            self._tare(t_ns)
+            self._baseline_changed = True
+        with self._source_watched(t_ns):
+            acquisition.sample(t_ns, store.integer(od.ACQUISITION, od.ACQUISITION_AVERAGING))
         self._tell_faults(acquisition.faults, t_ns)
         flags = SummaryFlag.WIRE_FAULT if acquisition.faults.any else SummaryFlag(0)
         if self._baseline_changed:
@@ -127,10 +156,31 @@ class PatchApplication:
             if changed is not None:
                 flags |= SummaryFlag.CHANGED_ONLY
                 chunks = [chunks[index] for index in changed]
-        self.stream.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
-        if self._late and not self.stream.full:
-            self._late = False
-            self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
+        return chunks, flags
+
+    def _tare(self, t_ns: int) -> None:
+        with self._source_watched(t_ns):
+            self._acquisition.tare(t_ns)
+
+    @contextlib.contextmanager
+    def _source_watched(self, t_ns: int) -> Iterator[None]:
+        """Count and tell a failure of the source, and that it is over; the failure goes on to the caller."""
+        try:
+            yield
+        except SourceFailed as failure:
+            self.source_failures += 1
+            self.source_error = str(failure)
+            if failure.fault is not self._source_fault:  # once, not with every scan
+                self._tell_source(failure.fault, t_ns)
+            self._acquisition.forget_sent()
+            raise
+        if self._source_fault is not None:
+            self._source_fault = None
+            self._emcy.over(EmcyCode.SOURCE, t_ns)
+
+    def _tell_source(self, fault: SourceFault, t_ns: int) -> None:
+        self._source_fault = fault
+        self._emcy.present(EmcyCode.SOURCE, struct.pack("<BH", fault, self.source_failures & 0xFFFF), t_ns)
 
     def _tell_faults(self, faults: WireFaults, t_ns: int) -> None:
         """One message when wires fail, with the kind and number of the first and how many there are: a pulled
@@ -162,6 +212,8 @@ class PatchApplication:
     def _connect(self) -> None:
         store, acquisition, stream = self._store, self._acquisition, self.stream
         chunk, summary = _fields(store, od.CHUNK), _fields(store, od.SUMMARY)
+        result = _fields(store, od.SELF_TEST_RESULT)
+        store.bind(od.SELF_TEST_RESULT, lambda sub: self._test[result[sub]])
         store.bind(od.CHUNK, lambda sub: stream.chunk[chunk[sub]])
         store.bind(od.SUMMARY, lambda sub: stream.summary[summary[sub]])
         store.watch(od.SEND_POLICY, lambda _: acquisition.forget_sent())
@@ -203,7 +255,7 @@ class PatchApplication:
         match subindex:
             case od.TARE if value not in (0, od.TARE_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
-            case od.SELF_TEST if value:  # there is nothing to test in a node without a board
+            case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
                 # Where SYNC numbers the scans, this one would be taken for the next.
@@ -217,11 +269,28 @@ class PatchApplication:
             self._plan()
         elif subindex == od.TARE and store.integer(od.ACQUISITION, od.TARE):
             store.put(od.ACQUISITION, od.TARE, 0)
-            self._acquisition.tare(self._now())
+            try:
+                self._tare(self._now())
+            except SourceFailed:
+                raise Refused(AbortCode.HARDWARE) from None
             self._baseline_changed = True
+        elif subindex == od.SELF_TEST and store.integer(od.ACQUISITION, od.SELF_TEST):
+            store.put(od.ACQUISITION, od.SELF_TEST, 0)
+            self._run_self_test(self._now())
         elif subindex == od.SINGLE_SCAN and store.integer(od.ACQUISITION, od.SINGLE_SCAN):
             store.put(od.ACQUISITION, od.SINGLE_SCAN, 0)
             self._scan(self._following(), frozenset(), self._now())
+
+    def _run_self_test(self, t_ns: int) -> None:
+        acquisition = self._acquisition
+
+        def read() -> Float:
+            with self._source_watched(t_ns):
+                return acquisition.read(t_ns)
+
+        self._test = pack_self_test(
+            self_test(read, acquisition.baseline_ohm.astype(np.float64), acquisition.scale)
+        )
 
     def _plan(self) -> None:
         self._period_ns = self._store.integer(od.ACQUISITION, od.ACQUISITION_PERIOD) * 1_000_000

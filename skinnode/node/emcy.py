@@ -34,11 +34,14 @@ class EmcyCode(IntEnum):
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
+    SOURCE = 0xFF00
+    """The analogue source gave no reading. Detail: :class:`~skinnode.node.source.SourceFault`, and u16 how
+    often so far."""
 
     @property
     def register_bit(self) -> int:
         """Bit of the error register: 4 is communication, 7 the manufacturer's own."""
-        return 0x10 if self >= 0x8000 else 0x80
+        return 0x10 if self >> 12 == 8 else 0x80
 
 
 class EmcyProducer:

@@ -62,6 +62,16 @@ class PatchNode(CanopenDevice):
         return self._patch.stream.scans_sent
 
     @property
+    def source_failures(self) -> int:
+        """Readings that the source failed to give."""
+        return self._patch.source_failures
+
+    @property
+    def source_error(self) -> str:
+        """What the source failed of last, in one line; empty if it never did."""
+        return self._patch.source_error
+
+    @property
     def overruns(self) -> int:
         """Scans skipped because two others were still to be sent."""
         return self._patch.overruns

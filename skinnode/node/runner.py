@@ -73,8 +73,8 @@ class NodeRunner:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join the thread; the nodes are off. Raises what ended the thread before: an error of a
-        source, or BusError. Stopping again does nothing."""
+        """End and join the thread; the nodes are off. Raises what ended the thread before, as a
+        bus that has gone (BusError). Stopping again does nothing."""
         if self._stopping.is_set():
             return
         self._stopping.set()

@@ -241,6 +241,8 @@ class SummaryFlag(enum.IntFlag):
     """A wire is open or shorted: see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
     """The codes of this scan are the first of a new baseline: read 0x2200 … again."""
+    SOURCE_FAILED = 0x10
+    """The converter gave no reading: no chunk was sent, and nothing is known of this scan."""
 
 
 class Summary(NamedTuple):
@@ -271,6 +273,52 @@ def unpack_summary(data: bytes, *, cob_id: int = 0x280) -> Summary:
     """The summary in a payload of TPDO2. Raises CodecError, naming ``cob_id``, unless it is 8 bytes long."""
     _require_length(data, PDO_BYTES, cob_id, "scan summary")
     return Summary(*_SUMMARY.unpack(data))
+
+
+# --- self-test (0x2023)
+
+
+class SelfTestStatus(enum.IntEnum):
+    """0x2023:1."""
+
+    NEVER_RUN = 0
+    PASSED = 1
+    FAILED = 2
+
+
+class SelfTestFault(enum.IntFlag):
+    """0x2023:2, what a self-test found."""
+
+    SOURCE = 0x01
+    """The converter failed to give a reading at least once."""
+    NOISE = 0x02
+    OPEN_WIRE = 0x04
+    SHORTED_WIRE = 0x08
+    OUT_OF_RANGE = 0x10
+    """Crossings with a baseline that gave no measurement: open, shorted or outside lo … hi."""
+    NO_BASELINE = 0x20
+
+
+class SelfTest(NamedTuple):
+    """What a self-test found; 0x2023 from sub-index 2 on."""
+
+    faults: SelfTestFault
+    readings: int
+    noise: float
+    """Relative, RMS over the crossings."""
+    open_wires: int
+    shorted_wires: int
+    out_of_range: int
+    untared: int
+
+
+_SELF_TEST: Final = struct.Struct("<BHBfHHII")
+SELF_TEST_NEVER_RUN: Final = bytes(_SELF_TEST.size)
+
+
+def pack_self_test(test: SelfTest) -> bytes:
+    """The record 0x2023, its sub-objects one after the other."""
+    return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)
 
 
 # --- command (RPDO1)

@@ -130,6 +130,9 @@ ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
+SELF_TEST_RESULT: Final = 0x2023
+TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
+TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
 """Masks of 32 wires: sub-index 2i+1 open, 2i+2 shorted, for the wires from 32 i on."""
@@ -145,5 +148,6 @@ BASELINE_DOMAIN: Final = 0x2301
 """DOMAIN: R0 of all wire pairs, U·K REAL32 in ohm, upper wire by upper wire; written whole or not at all."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
+SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")
 STORE_SIGNATURE: Final = int.from_bytes(b"save", "little")
 RESTORE_SIGNATURE: Final = int.from_bytes(b"load", "little")

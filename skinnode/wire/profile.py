@@ -261,6 +261,24 @@ def _time_record() -> Object:
 _REJECTED = ("NMT", "SYNC", "TIME", "Heartbeat", "SDO", "RPDO", "Error control of the own node-ID")
 
 
+def _self_test_record() -> Object:
+    fields = (
+        (od.TEST_STATUS, "Self-test status", _U8),
+        (od.TEST_FAULTS, "Self-test faults", _U16),
+        (od.TEST_READINGS, "Self-test readings", _U8),
+        (od.TEST_NOISE, "Self-test relative noise", _REAL32),
+        (od.TEST_OPEN_WIRES, "Open wires", _U16),
+        (od.TEST_SHORTED_WIRES, "Shorted wires", _U16),
+        (od.TEST_OUT_OF_RANGE, "Crossings out of range", _U32),
+        (od.TEST_UNTARED, "Crossings without a baseline", _U32),
+    )
+    return record(
+        od.SELF_TEST_RESULT,
+        "Self-test result",
+        [Entry(od.SELF_TEST_RESULT, sub, name, data_type, "ro", 0) for sub, name, data_type in fields],
+    )
+
+
 def _wire_faults(index: int, name: str, wires: int) -> Object:
     labels = [f"{kind} from wire {first}" for first in range(0, wires, 32) for kind in ("Open", "Shorted")]
     return array(index, name, labels, _U32, "ro", 0, mappable=True)
@@ -299,6 +317,7 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
         _send_policy_record(),
         _acquisition_record(),
         _time_record(),
+        _self_test_record(),
         _wire_faults(od.UPPER_WIRE_FAULTS, "Faults of upper wires", profile.rows),
         _wire_faults(od.LOWER_WIRE_FAULTS, "Faults of lower wires", profile.columns),
         array(od.REJECTED_FRAMES, "Rejected frames", _REJECTED, _U32, "ro", 0),

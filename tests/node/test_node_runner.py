@@ -176,30 +176,30 @@ def test_canopen_library_as_manager(virtual: BusConfig, layout: PatchLayout, tmp
             network.disconnect()
 
 
-def test_error_of_a_source_surfaces_at_stop(virtual: BusConfig, layout: PatchLayout) -> None:
-    with CanPort(virtual) as port, CanPort(virtual) as manager:
-        source = Steady(layout)
-        runner = NodeRunner(port, [PatchNode(4, layout, source, send=port.send)])
-        runner.start()
-        assert manager.recv(WAIT_S) is not None
-        source.error = OSError("the converter is gone")
-        manager.send(0x000, b"\x01\x00")
-        manager.send(0x080, b"")
-        eventually(lambda: runner.failed)
-        with pytest.raises(OSError, match="the converter is gone"):
-            runner.stop()
-        runner.stop()
-
-
-def test_source_that_fails_at_power_on(virtual: BusConfig, layout: PatchLayout) -> None:
-    with CanPort(virtual) as port:
+def test_a_node_survives_its_source(virtual: BusConfig, layout: PatchLayout) -> None:
+    """From power-on without a converter to the first scan with one: emergencies, no silence."""
+    with CanPort(virtual) as port, can.Bus(interface="virtual", channel=virtual.channel) as manager:
         source = Steady(layout)
         source.error = OSError("no converter")
-        with (
-            pytest.raises(OSError, match="no converter"),
-            NodeRunner(port, [PatchNode(4, layout, source, send=port.send)]),
-        ):
-            pass
+        node = PatchNode(4, layout, source, send=port.send)
+        with NodeRunner(port, [node]) as runner:
+
+            def send(can_id: int, data: str) -> None:
+                payload = bytes.fromhex(data)
+                manager.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=payload))
+
+            told = collect(manager, lambda ms: len(ms) == 2)
+            assert [m.arbitration_id for m in told] == [0x704, 0x084]
+            send(0x000, "01 00")
+            send(0x080, "")
+            (summary,) = collect(manager, lambda ms: len(ms) == 1)
+            assert (summary.arbitration_id, bytes(summary.data)[1:4]) == (0x284, b"\x10\0\0")
+            source.error = None
+            send(0x080, "")
+            frames = collect(manager, lambda ms: bool(ms) and ms[-1].arbitration_id == 0x284)
+            assert [m.arbitration_id for m in frames] == [0x084] + [0x184] * 4 + [0x284]
+            assert not runner.failed
+        assert (node.source_failures, node.source_error) == (2, "source.read(): OSError: no converter")
 
 
 def test_bus_that_refuses_frames_for_a_while(virtual: BusConfig, layout: PatchLayout) -> None:

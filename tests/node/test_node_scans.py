@@ -541,12 +541,6 @@ def test_full_size_patch_sends_what_the_codec_makes_of_its_resistances(make: Cal
     np.testing.assert_array_equal(got, encode(desk.source.ohm, rest, CodeScale()))
 
 
-def test_source_of_the_wrong_shape(operational) -> None:
-    operational.source.ohm = np.ones((6, 2))
-    with pytest.raises(ValueError, match=r"source.read\(\): got shape \(6, 2\), must be \(2, 6\)"):
-        operational.frame(0x80, "01")
-
-
 def _float(pattern: int) -> float:
     (value,) = struct.unpack("<f", pattern.to_bytes(4, "little"))
     return value

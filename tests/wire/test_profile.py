@@ -151,7 +151,7 @@ def test_every_object_asked_for_is_there_with_its_type() -> None:
     expected |= dict.fromkeys((0x1018, 0x1200), record)
     pdos = (base + number for base in (0x1400, 0x1600, 0x1800, 0x1A00) for number in range(4))
     expected |= dict.fromkeys(pdos, record)
-    expected |= dict.fromkeys((0x2000, 0x2010, 0x2011, 0x2020, 0x2021, 0x2022), record)
+    expected |= dict.fromkeys((0x2000, 0x2010, 0x2011, 0x2020, 0x2021, 0x2022, 0x2023), record)
     expected |= dict.fromkeys((0x2030, 0x2031, 0x2040, *range(0x2100, 0x210A), *range(0x2200, 0x220A)), array)
     expected |= dict.fromkeys((0x2300, 0x2301), ObjectType.DOMAIN)
     assert types == expected

@@ -86,6 +86,25 @@ class Desk:
         assert answer[1:4] == head
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little")
 
+    def configure_pdo(self, parameter: int, *entries: int, cob_id: int, **values: int) -> None:
+        """The standard's procedure: off, mapping off, map, mapping on, parameters, on. ``parameter`` is the
+        index of the communication record, ``values`` are any of kind, inhibit, timer and start."""
+        mapping = parameter + 0x200
+        self.write(parameter, 1, 0x8000_0000 | cob_id, 4)
+        self.write(mapping, 0, 0, 1)
+        for slot, entry in enumerate(entries, 1):
+            self.write(mapping, slot, entry, 4)
+        self.write(mapping, 0, len(entries), 1)
+        for name, value in values.items():
+            subindex, size = {"kind": (2, 1), "inhibit": (3, 2), "timer": (5, 2), "start": (6, 1)}[name]
+            self.write(parameter, subindex, value, size)
+        self.write(parameter, 1, cob_id, 4)
+        self.take()
+
+    def times(self, can_id: int, since_ns: int) -> list[float]:
+        """When the frames of ``can_id`` were sent, ms since ``since_ns``."""
+        return [(t_ns - since_ns) / MS for sent_id, _, t_ns in self.sent if sent_id == can_id]
+
     def start(self) -> None:
         """NMT start of all nodes."""
         self.frame(0, "01 00")

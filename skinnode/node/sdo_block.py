@@ -21,15 +21,15 @@ MAX_SEGMENTS: Final = 127
 """Segments of the longest block, and of those this server asks for."""
 
 SEGMENT_NS: Final = 500_000
-"""Mean time between two segments that are sent. A quarter of a bus of 1 Mbit/s and no more than one of
-250 kbit/s carries, so that the node's PDOs, in the same queue, do not wait behind hundreds of segments; a
-block takes 64 ms, where clients wait 300 ms (canopen library) and longer for it. Doubled for the rest of a
-transfer whenever the bus takes no more."""
+"""Shortest mean time between two segments. PDOs may take 70 % of a bus; of 1 Mbit/s that leaves at least 2200
+frames/s, of which this takes 2000, so that the queue that the PDOs are in, too, does not fill. A block takes
+64 ms, 100 ms where the thread wakes late, and clients wait 300 ms (canopen library) and longer for a single
+frame. Doubled for the rest of a transfer whenever the bus takes no more, as slower ones do."""
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
 """A quarter of 125 kbit/s: what keeps the bus from taking more than that has nothing to do with the pace."""
-SEGMENTS_AT_ONCE: Final = 6
-"""Most segments sent in one turn, to make up for a thread that wakes late (2 ms by default): little more than
-half of the queue of a Linux CAN interface, which is 10 frames long."""
+SEGMENTS_AT_ONCE: Final = 4
+"""Most segments sent in one turn, to make up for a thread that wakes late (2 ms by default). The queue of a
+Linux CAN interface is 10 frames long, and a thread that was held up may take two turns one upon the other."""
 TWICE_NS: Final = 3_000_000
 """Two of the longest frames at 125 kbit/s and the error frame between: how far apart one frame that is
 delivered twice can be. A client that means its second acknowledgement has seen more segments since."""

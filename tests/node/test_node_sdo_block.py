@@ -226,12 +226,12 @@ class TestUpload:
             before = len(desk.sent)
             desk.t_ns += 3 * MS
             desk.node.on_timer(desk.t_ns)
-            assert 0 < len(desk.sent) - before <= 6
+            assert 0 < len(desk.sent) - before <= 4
         assert (desk.t_ns - begun_ns) / 13 * 127 < 100 * MS
         before = len(desk.sent)
         desk.t_ns += 100 * MS  # and once much later
         desk.node.on_timer(desk.t_ns)
-        assert len(desk.sent) - before <= 6
+        assert len(desk.sent) - before <= 4
 
 
 def begin(desk, size: int | None, *, crc: bool = True) -> None:

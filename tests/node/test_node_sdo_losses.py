@@ -7,6 +7,7 @@ import struct
 from collections.abc import Iterator
 from itertools import chain, repeat
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -121,6 +122,40 @@ def test_upload_gets_over_a_queue_that_is_full(value: bytes, sizes: list[int], b
                 self.busy = False
 
     assert upload(Busy(value), sizes, repeat(1)) == value
+
+
+@pytest.mark.parametrize(
+    ("bitrate_bps", "refused", "block_ms"),
+    [(1_000_000, 0, 80), (500_000, 0, 80), (250_000, 0, 80), (125_000, 1, 130)],
+)
+def test_upload_into_the_queue_of_a_real_interface(bitrate_bps: int, refused: int, block_ms: int) -> None:
+    """Ten frames wait for the wire, an eleventh is refused. The thread wakes 2 ms late, and rests for 20 ms
+    after a frame was refused, as the runner does."""
+    frame_ns = 135 * 1_000_000_000 // bitrate_bps  # eight bytes, as many stuff bits as there can be
+
+    class Queued(Bench):
+        def _send(self, answer: bytes) -> None:
+            leaves_ns[:] = [left for left in leaves_ns if left > self.t_ns]
+            self.busy = len(leaves_ns) > 10  # one is on the wire
+            if self.busy:
+                refusals.append(self.t_ns)
+            super()._send(answer)
+            leaves_ns.append(max([self.t_ns, *leaves_ns]) + frame_ns)
+
+        def wait(self) -> list[bytes]:
+            self.t_ns = max(self.t_ns, self.server.deadline_ns) + 2_000_000
+            try:
+                return super().wait()
+            except BusError:
+                self.t_ns += 20_000_000
+                return self.take()
+
+    leaves_ns: list[int] = []  # when each of the frames that wait will have left
+    refusals: list[int] = []
+    bench = Queued(bytes(range(256)) * 3)
+    assert upload(bench, [127], repeat(1)) == bytes(range(256)) * 3
+    assert len(refusals) <= refused
+    assert bench.t_ns - START_NS <= block_ms * 1_000_000
 
 
 def download(bench: Bench, value: bytes, announce: bool, fate: Iterator[int], spare_first: bool) -> bytes:

@@ -14,6 +14,20 @@ from skinnode.model.config import BusConfig
 REQUIRE_VCAN = "SKINNODE_REQUIRE_VCAN"
 
 
+FUZZ_FRAMES = 20_000
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--frames", type=int, default=FUZZ_FRAMES, help="frames that a node is fuzzed with")
+
+
+@pytest.fixture
+def fuzz_frames(request: pytest.FixtureRequest) -> int:
+    """How many frames a node is fuzzed with."""
+    frames: int = request.config.getoption("--frames")
+    return frames
+
+
 def has_vcan() -> bool:
     """Whether the kernel has an interface vcan0."""
     return any(name == "vcan0" for _, name in socket.if_nameindex())

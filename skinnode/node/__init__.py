@@ -1,8 +1,19 @@
 """A patch as a CANopen device (CiA 301), and the thread that drives patches on a bus."""
 
+from skinnode.node.lss import NOT_CONFIGURED
+from skinnode.node.memory import FileMemory, Memory, VolatileMemory
 from skinnode.node.nmt import NmtState
 from skinnode.node.node import PatchNode
 from skinnode.node.runner import NodeRunner
 from skinnode.node.source import ResistanceSource
 
-__all__ = ["NmtState", "NodeRunner", "PatchNode", "ResistanceSource"]
+__all__ = [
+    "NOT_CONFIGURED",
+    "FileMemory",
+    "Memory",
+    "NmtState",
+    "NodeRunner",
+    "PatchNode",
+    "ResistanceSource",
+    "VolatileMemory",
+]

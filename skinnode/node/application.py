@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skinnode.model.layout import PRESET_IDS, Float, PatchLayout
 from skinnode.node.abort import AbortCode, Refused
@@ -19,6 +20,7 @@ from skinnode.node.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.device import Services
 from skinnode.node.emcy import EmcyCode
+from skinnode.node.memory import Fault
 from skinnode.node.od import ObjectStore
 from skinnode.node.self_test import self_test
 from skinnode.node.source import SourceFailed, SourceFault
@@ -47,6 +49,8 @@ class PatchApplication:
         unknown = np.full((profile.rows, profile.columns), acquisition.scale.open, dtype=np.uint32)
         first_chunk = pack_scan(unknown, 0, profile)[0]
         self.stream = ScanStream(services.store, services.tpdos, first_chunk, catch_up_ns)
+        self._storage = services.storage
+        self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
         self._operational = False
         self._counter = -1
         self._period_ns = 0
@@ -73,10 +77,14 @@ class PatchApplication:
         return min(self._scan_ns, self.stream.deadline_ns)
 
     def power_on(self, t_ns: int) -> None:
-        """Tare, unless there is a baseline from before."""
-        if not self._acquisition.tared:
+        """Take the baseline from the memory, or tare, unless there is one from before."""
+        remembered = self._remembered()
+        if remembered is not None:
+            self._acquisition.set_baselines(remembered)
+        elif not self._acquisition.tared:
             with contextlib.suppress(SourceFailed):
                 self._tare(t_ns)
+                self._storage.keep_baseline()
 
     def reset(self) -> None:
         """The node was reset: scans are numbered anew and nothing has been told."""
@@ -110,6 +118,28 @@ class PatchApplication:
             self._scan(self._following(), frozenset(), t_ns)
         self.stream.on_timer(t_ns)
 
+    # --- baseline
+
+    def _remembered(self) -> NDArray[np.float32] | None:
+        rows = self._storage.kept.baseline_ohm
+        if not rows:
+            return None
+        try:
+            values = np.array(rows, dtype=np.float32)
+        except ValueError:  # rows of several lengths
+            values = np.full((), np.nan, np.float32)
+        shape = self._profile.rows, self._profile.columns
+        if values.shape == shape and np.isfinite(values).all() and (values >= 0).all():
+            return values
+        self._storage.note(Fault.REFUSED, od.BASELINE_DOMAIN)
+        return None
+
+    def _new_baseline(self) -> None:
+        """A baseline as a whole, measured or written, is kept without a command."""
+        self._baseline_changed = True
+        self._storage.keep_baseline()
+        self._storage.tell(self._now())
+
     # --- scans
 
     def _following(self) -> int:
@@ -139,7 +169,7 @@ class PatchApplication:
         store, acquisition = self._store, self._acquisition
         if not acquisition.tared:  # the source failed when it was to be done
             self._tare(t_ns)
-            self._baseline_changed = True
+            self._new_baseline()
         with self._source_watched(t_ns):
             acquisition.sample(t_ns, store.integer(od.ACQUISITION, od.ACQUISITION_AVERAGING))
         self._tell_faults(acquisition.faults, t_ns)
@@ -234,7 +264,7 @@ class PatchApplication:
         if not ((values > 0) & np.isfinite(values)).all():
             raise Refused(AbortCode.INVALID_VALUE)
         self._acquisition.set_baselines(values.astype(np.float32))
-        self._baseline_changed = True
+        self._new_baseline()
 
     def _connect_row(self, row: int) -> None:
         store, acquisition, width = self._store, self._acquisition, self._profile.code_bits // 8
@@ -273,7 +303,7 @@ class PatchApplication:
                 self._tare(self._now())
             except SourceFailed:
                 raise Refused(AbortCode.HARDWARE) from None
-            self._baseline_changed = True
+            self._new_baseline()
         elif subindex == od.SELF_TEST and store.integer(od.ACQUISITION, od.SELF_TEST):
             store.put(od.ACQUISITION, od.SELF_TEST, 0)
             self._run_self_test(self._now())

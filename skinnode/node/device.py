@@ -13,15 +13,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.error_control import ErrorControl
+from skinnode.node.lss import NOT_CONFIGURED, BitRateChange, LssAddress, LssSlave
+from skinnode.node.memory import Memory
 from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.od import ObjectStore
 from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.node.rpdo import RpdoEngine
 from skinnode.node.sdo import SdoServer
+from skinnode.node.storage import COMMUNICATION, EVERYTHING, Storage
 from skinnode.node.sync import Sync
 from skinnode.node.time_of_day import TimeConsumer
 from skinnode.node.tpdo import TpdoEngine
@@ -32,8 +34,6 @@ from skinnode.wire.dictionary import Object
 HARDWARE_VERSION: Final = "none"
 """A node in software has no board."""
 
-_COMMUNICATION: Final = 0x1000, 0x1FFF
-_EVERYTHING: Final = 0x1000, 0x9FFF
 
 Send = Callable[[int, bytes], None]
 """Takes COB-ID and payload."""
@@ -75,6 +75,7 @@ class Services:
     """What a device offers its application."""
 
     store: ObjectStore
+    storage: Storage
     tpdos: TpdoEngine
     emcy: EmcyProducer
     now: Clock
@@ -84,11 +85,15 @@ class CanopenDevice:
     """One node.
 
     Args:
-        node_id: 1 to 127.
+        node_id: 1 to 127, or 255 for none: it then waits for one. What LSS has stored in the memory counts
+            instead.
         objects: its object dictionary.
         application: made once, with the services of the device.
         send: called with COB-ID and payload of every frame the node sends, in order.
         serial: serial number (0x1018:4), u32.
+        memory: what survives a power cycle; None: nothing does, and the node says so.
+        kind: whose memory it is; see :class:`~skinnode.node.memory.Kept`.
+        set_bit_rate: changes the bit rate (bit/s) for LSS; None where that is not the node's own to do.
 
     Raises ValueError for an argument out of range. The node is silent until :meth:`power_on`.
     """
@@ -101,12 +106,17 @@ class CanopenDevice:
         *,
         send: Send,
         serial: int,
+        memory: Memory | None,
+        kind: str,
+        set_bit_rate: Callable[[int], None] | None,
     ) -> None:
-        if not 1 <= node_id <= 127:
-            raise ValueError(f"node_id: got {node_id}, must be 1 to 127")
+        if not (1 <= node_id <= 127 or node_id == NOT_CONFIGURED):
+            raise ValueError(f"node_id: got {node_id}, must be 1 to 127, or {NOT_CONFIGURED} for none")
         if not 0 <= serial < 1 << 32:
             raise ValueError(f"serial: got {serial}, must be an unsigned number of 32 bits")
+        self._default_node_id = node_id
         self.node_id = node_id
+        """255 while it has none."""
         self.nmt_state = NmtState.INITIALISING
         self._send = send
         self._now_ns = 0
@@ -114,6 +124,9 @@ class CanopenDevice:
         self._sdo = SdoServer(self._store, self._send_sdo)
         self._rejected = RejectedFrames(self._store)
         self._emcy = EmcyProducer(self._store, send)
+        self._storage = Storage(self._store, self._emcy, memory, kind)
+        self._set_bit_rate = set_bit_rate
+        self._bit_rate_change = BitRateChange(set_bit_rate)
         self._error_control = ErrorControl(
             self._store,
             self._emcy,
@@ -131,36 +144,46 @@ class CanopenDevice:
         self._sync = Sync(store, emcy, rejected, send, now)
         self._bus_state = BusState.ACTIVE
         self._handlers: dict[int, Handler] = {}
-        self._application = application(Services(store, self._tpdos, emcy, now))
+        self._application = application(Services(store, self._storage, self._tpdos, emcy, now))
         self._describe(serial)
         self._connect()
+        self._lss = self._lss_slave()
 
     # --- what drives it
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, send the boot-up message, become PRE-OPERATIONAL."""
+        """Start the application, send the boot-up message, become PRE-OPERATIONAL; or wait for a node-ID."""
         self._now_ns = t_ns
+        self._storage.load()
+        self._lss = self._lss_slave()
+        bit_rate_bps = self._storage.kept.bit_rate_bps
+        if bit_rate_bps is not None and self._set_bit_rate is not None:
+            self._set_bit_rate(bit_rate_bps)
         self._application.power_on(t_ns)
-        self._reset(_EVERYTHING, t_ns)
+        self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
         """Fall silent at once."""
         self._enter(NmtState.INITIALISING, self._now_ns)
+        self._bit_rate_change.cancel()
+        self._handlers = {}
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
         """A classic frame with an 11-bit identifier was received; ``data`` of a remote frame says nothing."""
-        if self.nmt_state is NmtState.INITIALISING:
+        if self._bit_rate_change.silent(t_ns):
             return
         self._now_ns = t_ns
-        if remote:
-            if can_id == od.heartbeat_cob_id(self.node_id):
-                self._error_control.on_request(self.nmt_state, t_ns)
-            elif self.nmt_state is NmtState.OPERATIONAL:
-                self._tpdos.on_remote(can_id, t_ns)
-        elif (handler := self._handlers.get(can_id)) is not None:
+        # Before it has booted a node has no handler, or that of LSS alone.
+        if not remote and (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
-        else:
+        elif self.nmt_state is NmtState.INITIALISING:
+            return
+        elif not remote:
             self._rpdos.on_frame(can_id, data, t_ns)
+        elif can_id == od.heartbeat_cob_id(self.node_id):
+            self._error_control.on_request(self.nmt_state, t_ns)
+        elif self.nmt_state is NmtState.OPERATIONAL:
+            self._tpdos.on_remote(can_id, t_ns)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """The CAN controller is in ``state``. What there is to tell of a bus that was off is told once it is
@@ -178,6 +201,8 @@ class CanopenDevice:
 
     def next_deadline_ns(self) -> int | None:
         """When :meth:`on_timer` is to be called; None while there is nothing to wait for."""
+        if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
+            return self._bit_rate_change.deadline_ns
         if self.nmt_state is NmtState.INITIALISING:
             return None
         deadline_ns = min(
@@ -193,7 +218,7 @@ class CanopenDevice:
 
     def on_timer(self, t_ns: int) -> None:
         """Do what is due at ``t_ns``; too early or too often does no harm."""
-        if self.nmt_state is NmtState.INITIALISING:
+        if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:
             return
         self._now_ns = t_ns
         self._error_control.on_timer(self.nmt_state, t_ns)
@@ -221,16 +246,23 @@ class CanopenDevice:
             case None:
                 return
             case NmtCommand.RESET_NODE:
-                self._reset(_EVERYTHING, t_ns)
+                self._reset(EVERYTHING, t_ns)
             case NmtCommand.RESET_COMMUNICATION:
-                self._reset(_COMMUNICATION, t_ns)
+                self._reset(COMMUNICATION, t_ns)
             case _:
                 self._enter(AFTER_COMMAND[command], t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
+        """Initialise and boot, with the node-ID that LSS has given; without one, wait for it."""
         self._enter(NmtState.INITIALISING, t_ns)
-        self._store.restore(*objects)
-        if objects == _EVERYTHING:
+        self._lss.reset_communication()
+        self.node_id = self._lss.node_id
+        if self.node_id == NOT_CONFIGURED:
+            self._handlers = {od.LSS_REQUEST_COB_ID: self._on_lss}
+            return
+        self._store.renumber(self.node_id)
+        self._storage.restore(*objects)
+        if objects == EVERYTHING:
             self._rejected.reset()
             self._time.reset()
         self._emcy.reset()
@@ -243,6 +275,7 @@ class CanopenDevice:
         self._error_control.boot_up(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
         self._tell_passive(t_ns)
+        self._storage.tell(t_ns)
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
         if state is self.nmt_state:
@@ -306,6 +339,28 @@ class CanopenDevice:
         if self.nmt_state.communicates and not self._time.on_time(data, t_ns):
             self._rejected.count(Rejected.TIME)
 
+    def _on_lss(self, data: bytes, t_ns: int) -> None:
+        response = self._lss.on_request(data)
+        if response is not None:
+            self._send(od.LSS_RESPONSE_COB_ID, response)
+        if self._lss.may_boot:
+            self._reset(EVERYTHING, t_ns)
+
+    def _lss_slave(self) -> LssSlave:
+        kept, store = self._storage.kept, self._store
+        own_bit_rate = self._set_bit_rate is not None
+        return LssSlave(
+            LssAddress(*(store.integer(od.IDENTITY, subindex) for subindex in (1, 2, 3, 4))),
+            self._default_node_id if kept.node_id is None else kept.node_id,
+            bit_rates_bps=od.BIT_RATES_BPS if own_bit_rate else (),
+            bit_rate_bps=kept.bit_rate_bps,
+            store=self._storage.keep_lss if self._storage.has_memory else None,
+            activate=self._activate_bit_rate if own_bit_rate else None,
+        )
+
+    def _activate_bit_rate(self, bit_rate_bps: int | None, delay_ms: int) -> None:
+        self._bit_rate_change.begin(bit_rate_bps, delay_ms, self._now_ns)
+
     # --- object dictionary
 
     def _describe(self, serial: int) -> None:
@@ -316,10 +371,6 @@ class CanopenDevice:
 
     def _connect(self) -> None:
         store = self._store
-        for index in (od.STORE, od.RESTORE):
-            # Nothing is kept over a power cycle yet: 0 says so, and commands are refused as CiA 301 wants it.
-            store.bind(index, lambda _: bytes(4))
-            store.guard(index, _cannot_store)
         for index in (od.COB_ID_SYNC, od.CYCLE_PERIOD):
             store.watch(index, lambda _: self._reload_sync())
         store.watch(od.COB_ID_TIME, lambda _: self._reload())
@@ -337,13 +388,10 @@ class CanopenDevice:
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
+        handlers[od.LSS_REQUEST_COB_ID] = self._on_lss
         self._handlers = handlers
 
 
 def _count(objects: Sequence[Object], first: int) -> int:
     """PDOs whose parameters stand from ``first`` on."""
     return sum(first <= item.index < first + od.MAX_PDOS for item in objects)
-
-
-def _cannot_store(_subindex: int, _value: int) -> None:
-    raise Refused(AbortCode.CANNOT_STORE)

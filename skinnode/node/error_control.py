@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 
 from skinnode.node.clock import Clock
-from skinnode.node.emcy import EmcyProducer
+from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from skinnode.node.nmt import NmtState
@@ -35,7 +35,7 @@ class ErrorControl:
         failed: Callable[[int], None],
     ) -> None:
         self._cob_id = 0  # known when there is a node-ID
-        self._store, self._rejected, self._send, self._now = store, rejected, send, now
+        self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
         self._listen = listen
         self._producer = HeartbeatProducer()
         self._guarding = Guarding(store, emcy, failed)
@@ -56,7 +56,7 @@ class ErrorControl:
             od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
             for node_id in self._consumer.node_ids
         }
-        handlers[self._cob_id] = lambda _data, _t_ns: self._rejected.count(Rejected.OWN_ERROR_CONTROL)
+        handlers[self._cob_id] = self._on_own
         return handlers
 
     def reset(self, node_id: int) -> None:
@@ -81,6 +81,12 @@ class ErrorControl:
             self._send(self._cob_id, bytes((state,)))
         self._guarding.on_timer(t_ns)
         self._consumer.on_timer(t_ns)
+
+    def _on_own(self, _: bytes, t_ns: int) -> None:
+        """Somebody else has this node-ID. Told once until a reset, and counted: what to do about it is for
+        people to decide."""
+        self._rejected.count(Rejected.OWN_ERROR_CONTROL)
+        self._emcy.present(EmcyCode.CAN_ID_COLLISION, self._cob_id.to_bytes(2, "little"), t_ns)
 
     def _on_period(self) -> None:
         self._producer.set_period(self._store.integer(od.HEARTBEAT_PRODUCER), self._now())

@@ -13,10 +13,7 @@ from collections.abc import Callable, Collection
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-LSS_REQUEST_COB_ID: Final = 0x7E5
-"""Master to slaves."""
-LSS_RESPONSE_COB_ID: Final = 0x7E4
-"""Slave to master."""
+from skinnode.node.clock import NO_DEADLINE_NS
 
 NOT_CONFIGURED: Final = 0xFF
 """The node-ID of a node that has none."""
@@ -245,6 +242,43 @@ class LssSlave:
         except OSError:
             return _STORE_FAILED
         return _DONE
+
+
+class BitRateChange:
+    """The two delays of *activate bit timing*: silence until one after the change, which comes one after the
+    request.
+
+    ``set_bit_rate`` changes it; None where that is not the node's own to do.
+    """
+
+    def __init__(self, set_bit_rate: Callable[[int], None] | None) -> None:
+        self._set_bit_rate = set_bit_rate
+        self._bit_rate_bps: int | None = None
+        self._change_ns = self._over_ns = NO_DEADLINE_NS
+        self.deadline_ns = NO_DEADLINE_NS
+        """When :meth:`silent` is to be asked next."""
+
+    def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
+        """The request came at ``t_ns``; None for a bit rate that stays as it is."""
+        self._bit_rate_bps = bit_rate_bps
+        self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000
+        self._over_ns = t_ns + 2 * delay_ms * 1_000_000
+
+    def silent(self, t_ns: int) -> bool:
+        """Whether the node has to keep silent and is deaf. Changes the bit rate when it is time."""
+        if self.deadline_ns == NO_DEADLINE_NS:
+            return False
+        if t_ns >= self._change_ns:
+            self._change_ns, self.deadline_ns = NO_DEADLINE_NS, self._over_ns
+            if self._bit_rate_bps is not None and self._set_bit_rate is not None:
+                self._set_bit_rate(self._bit_rate_bps)
+        if t_ns >= self._over_ns:
+            self.deadline_ns = NO_DEADLINE_NS
+        return self.deadline_ns != NO_DEADLINE_NS
+
+    def cancel(self) -> None:
+        """The power is gone."""
+        self.deadline_ns = NO_DEADLINE_NS
 
 
 def _frame(command: int, value: int = 0) -> bytes:

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node.acquisition import Acquisition
 from skinnode.node.application import PatchApplication
 from skinnode.node.device import CanopenDevice, Send, Services
+from skinnode.node.memory import Memory
 from skinnode.node.source import ResistanceSource
 from skinnode.wire.codec import CodeScale
-from skinnode.wire.profile import PatchProfile
+from skinnode.wire.profile import PatchProfile, eds_name
 
 CATCH_UP_NS: Final = 10_000_000
 """Lateness of the driving thread that the pacing of chunks makes up for: two switch intervals of the
@@ -22,14 +24,19 @@ class PatchNode(CanopenDevice):
     """One patch.
 
     Args:
-        node_id: 1 to 127.
+        node_id: 1 to 127, or 255 for none: LSS gives it one. What LSS has stored in the memory counts
+            instead.
         layout: its electrodes; decides the sizes of the object dictionary.
         source: its analogue port, read once per scan.
         send: called with COB-ID and payload of every frame the node sends, in order.
         profile: its wire format. Default: that of the layout, with codes of 16 bits.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) R0 remembered from before, ohm; None to tare at the first power-on.
+        baseline_ohm: (U, K) R0 to begin with, ohm; None to tare at the first power-on. The baseline in the
+            memory counts instead.
         catch_up_ns: see :mod:`skinnode.node.stream`; 0 for a strict inhibit time.
+        memory: keeps configuration, baseline and node-ID over a power cycle; None: a power cycle loses what
+            was written, and the node says so.
+        set_bit_rate: changes the bit rate (bit/s) for LSS; None where that is not the node's own to do.
 
     Raises ValueError or ConfigError for an argument out of range. The node is silent until :meth:`power_on`.
     """
@@ -45,6 +52,8 @@ class PatchNode(CanopenDevice):
         serial: int = 0,
         baseline_ohm: Float | None = None,
         catch_up_ns: int = CATCH_UP_NS,
+        memory: Memory | None = None,
+        set_bit_rate: Callable[[int], None] | None = None,
     ) -> None:
         self.profile = PatchProfile.from_layout(layout) if profile is None else profile
         acquisition = Acquisition(self.profile, source, CodeScale(self.profile.code_bits), baseline_ohm)
@@ -54,7 +63,16 @@ class PatchNode(CanopenDevice):
             self._patch = PatchApplication(layout, self.profile, serial, acquisition, services, catch_up_ns)
             return self._patch
 
-        super().__init__(node_id, self.profile.objects(), application, send=send, serial=serial)
+        super().__init__(
+            node_id,
+            self.profile.objects(),
+            application,
+            send=send,
+            serial=serial,
+            memory=memory,
+            kind=f"{eds_name(self.profile).removesuffix('.eds')} layout {layout.layout_hash:08x}",
+            set_bit_rate=set_bit_rate,
+        )
 
     @property
     def scans_sent(self) -> int:

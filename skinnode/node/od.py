@@ -10,7 +10,7 @@ kept by somebody else (:meth:`ObjectStore.bind_domain`). A refused write changes
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, NamedTuple
 
 from skinnode.node.abort import AbortCode, Refused
@@ -25,6 +25,8 @@ Guard = Callable[[int, int], None]
 """Sub-index and proposed value (the bit pattern of a REAL32); raises Refused."""
 Watcher = Callable[[int], None]
 """Called with the sub-index that has just been written."""
+ChangeWatcher = Callable[[int, int], None]
+"""Called with index and sub-index of a parameter that has another value now."""
 DomainWriter = Callable[[bytes], None]
 """Takes a whole value, or refuses it and changes nothing."""
 
@@ -69,15 +71,17 @@ class ObjectStore:
     def __init__(self, objects: Iterable[Object], node_id: int) -> None:
         self._entries = {(e.index, e.subindex): e for item in objects for e in item.entries}
         self._indices = {index for index, _ in self._entries}
-        self._node_id = node_id
+        self.node_id = node_id
+        """What COB-IDs follow by default; see :meth:`renumber`."""
         self._values = {key: self._at_start(entry) for key, entry in self._entries.items()}
         self._readers: dict[tuple[int, int], Reader] = {}
         self._guards: dict[int, Guard] = {}
         self._watchers: dict[int, Watcher] = {}
+        self._change_watcher: ChangeWatcher = lambda *_: None
         self._domains: dict[int, tuple[Lengths, DomainWriter]] = {}
 
     def _at_start(self, entry: Entry) -> bytes:
-        value = entry.value_at_start(self._node_id)
+        value = entry.value_at_start(self.node_id)
         return bytes(entry.data_type.bits // 8) if value is None else to_bytes(entry, value)
 
     def bind(self, index: int, reader: Reader, *, count: bool = False) -> None:
@@ -101,6 +105,11 @@ class ObjectStore:
     def watch(self, index: int, watcher: Watcher) -> None:
         """Call ``watcher`` after ``index`` was written."""
         self._watchers[index] = watcher
+
+    def watch_changes(self, watcher: ChangeWatcher) -> None:
+        """Call ``watcher`` after a client gave a parameter, a writable object that is not computed, another
+        value."""
+        self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
         """The declaration. Refuses an object or a sub-object that does not exist."""
@@ -136,7 +145,9 @@ class ObjectStore:
             self._domains[index][1](data)
         else:
             self._check(index, subindex, data)
-            self._values[index, subindex] = data
+            before, self._values[index, subindex] = self._values[index, subindex], data
+            if data != before and (index, subindex) not in self._readers:
+                self._change_watcher(index, subindex)
         watcher = self._watchers.get(index)
         if watcher is not None:
             watcher(subindex)
@@ -171,6 +182,27 @@ class ObjectStore:
 
     def restore(self, first: int, last: int) -> None:
         """Writable objects from ``first`` to ``last`` as they were at start."""
+        for key in self._writable(first, last):
+            self._values[key] = self._at_start(self._entries[key])
+
+    def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
+        """Parameters from ``first`` to ``last`` that have another value than after :meth:`restore`; what is
+        computed is no parameter."""
+        return {
+            key: self._values[key]
+            for key in self._writable(first, last)
+            if key not in self._readers and self._values[key] != self._at_start(self._entries[key])
+        }
+
+    def _writable(self, first: int, last: int) -> Iterator[tuple[int, int]]:
         for key, entry in self._entries.items():
             if first <= key[0] <= last and entry.access not in ("ro", "const"):
+                yield key
+
+    def renumber(self, node_id: int) -> None:
+        """The node has another node-ID from now on. COB-IDs that may be written follow with the next
+        :meth:`restore`, the others at once."""
+        self.node_id = node_id
+        for key, entry in self._entries.items():
+            if entry.plus_node_id and entry.access in ("ro", "const"):
                 self._values[key] = self._at_start(entry)

@@ -11,6 +11,7 @@ from typing import Final, Self
 
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.lss import NOT_CONFIGURED
 from skinnode.node.node import PatchNode
 from skinnode.transport.bus_state import BusState, bus_state
 from skinnode.transport.frame import Frame
@@ -36,9 +37,9 @@ PATIENCE_S: Final = 5.0
 class NodeRunner:
     """Powers ``nodes`` on and keeps them going until :meth:`stop`.
 
-    Raises ValueError for no nodes, or for two with the same node-ID. A runner runs once. The nodes belong to
-    the thread from :meth:`start` to :meth:`stop`; only counters may be looked at meanwhile. The port stays
-    open.
+    Raises ValueError for no nodes, or for two with the same node-ID; any number may have none yet. A runner
+    runs once. The nodes belong to the thread from :meth:`start` to :meth:`stop`; only counters may be looked
+    at meanwhile. The port stays open.
 
     ``slack_ns`` is how late timers may be, so that one waking serves several: chunks of one inhibit time each
     then leave two or three at a time, their mean pace unchanged. Frames are served at once whatever the
@@ -52,7 +53,7 @@ class NodeRunner:
         self.nodes = tuple(nodes)
         if not self.nodes:
             raise ValueError("nodes: got none, must be at least one")
-        ids = [node.node_id for node in self.nodes]
+        ids = [node.node_id for node in self.nodes if node.node_id != NOT_CONFIGURED]
         if len(set(ids)) < len(ids):
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
         self.bus_errors = 0

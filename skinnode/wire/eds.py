@@ -15,7 +15,7 @@ from skinnode.wire import indices as od
 from skinnode.wire.dictionary import DataType, Entry, Object, ObjectType
 
 _DATE, _TIME = "01-01-2025", "12:00AM"  # fixed: a generated file must not change by itself
-_BITRATES_KBPS: Final = {10: 0, 20: 0, 50: 0, 125: 1, 250: 1, 500: 1, 800: 0, 1000: 1}
+_BIT_RATES_KBPS: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 _MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 _DUMMY_TYPES: Final = range(1, 8)
 
@@ -31,6 +31,7 @@ class DeviceInfo:
     product_name: str
     product_number: int
     revision_number: int
+    bit_rates_bps: tuple[int, ...]
     rpdos: int
     tpdos: int
 
@@ -84,7 +85,7 @@ def _head(info: DeviceInfo) -> Iterator[str]:
             ("ProductNumber", f"0x{info.product_number:08X}"),
             ("RevisionNumber", f"0x{info.revision_number:08X}"),
             ("OrderCode", ""),
-            *((f"BaudRate_{rate}", str(supported)) for rate, supported in _BITRATES_KBPS.items()),
+            *((f"BaudRate_{rate}", str(int(1000 * rate in info.bit_rates_bps))) for rate in _BIT_RATES_KBPS),
             ("SimpleBootUpMaster", "0"),
             ("SimpleBootUpSlave", "1"),
             ("Granularity", "8"),
@@ -92,7 +93,7 @@ def _head(info: DeviceInfo) -> Iterator[str]:
             ("GroupMessaging", "0"),
             ("NrOfRXPDO", str(info.rpdos)),
             ("NrOfTXPDO", str(info.tpdos)),
-            ("LSS_Supported", "0"),
+            ("LSS_Supported", "1"),
         ],
     )
     yield from _section(

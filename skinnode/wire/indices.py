@@ -21,6 +21,10 @@ DEVICE_NAME: Final = "skinnode patch"
 NMT_COB_ID: Final = 0x000
 SYNC_COB_ID: Final = 0x080
 TIME_COB_ID: Final = 0x100
+LSS_RESPONSE_COB_ID: Final = 0x7E4
+"""Slave to master (CiA 305)."""
+LSS_REQUEST_COB_ID: Final = 0x7E5
+"""Master to slaves."""
 
 
 def emcy_cob_id(node_id: int) -> int:
@@ -67,6 +71,9 @@ def heartbeat_cob_id(node_id: int) -> int:
     """Boot-up, heartbeat and node guarding."""
     return 0x700 + node_id
 
+
+BIT_RATES_BPS: Final = (125_000, 250_000, 500_000, 1_000_000)
+"""What the bit rate of a patch may be set to."""
 
 # --- communication objects (CiA 301)
 DEVICE_TYPE: Final = 0x1000
@@ -128,6 +135,8 @@ SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
+COMMANDS: Final = frozenset({(ACQUISITION, SELF_TEST), (ACQUISITION, TARE), (ACQUISITION, SINGLE_SCAN)})
+"""Written to have something done: no parameters, so nothing to store or to verify."""
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 SELF_TEST_RESULT: Final = 0x2023

@@ -351,6 +351,7 @@ def eds_text(profile: PatchProfile) -> str:
         product_name=od.DEVICE_NAME,
         product_number=od.PRODUCT_CODE,
         revision_number=od.REVISION_NUMBER,
+        bit_rates_bps=od.BIT_RATES_BPS,
         rpdos=profile.rpdos,
         tpdos=profile.tpdos,
     )

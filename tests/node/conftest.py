@@ -32,13 +32,13 @@ class Source:
 class Desk:
     """A node, what it sent (identifier, payload, time), and the time."""
 
-    def __init__(self, layout: PatchLayout, **options: Any) -> None:
+    def __init__(self, layout: PatchLayout, node_id: int = NODE_ID, **options: Any) -> None:
         self.layout = layout
         self.source = Source(layout)
         self.t_ns = 1_000 * MS
         self.sent: list[tuple[int, bytes, int]] = []
         self.bus_refuses = False
-        self.node = PatchNode(NODE_ID, layout, self.source, send=self._send, **options)
+        self.node = PatchNode(node_id, layout, self.source, send=self._send, **options)
 
     def _send(self, can_id: int, data: bytes) -> None:
         if self.bus_refuses:
@@ -68,7 +68,8 @@ class Desk:
 
     def sdo(self, request: str) -> str:
         """The one frame that answers an SDO request."""
-        answers = [data for can_id, data in self.frame(0x600 + NODE_ID, request) if can_id == 0x580 + NODE_ID]
+        node_id = self.node.node_id
+        answers = [data for can_id, data in self.frame(0x600 + node_id, request) if can_id == 0x580 + node_id]
         assert len(answers) == 1, answers
         return answers[0]
 

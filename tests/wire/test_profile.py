@@ -115,7 +115,7 @@ def test_the_head_names_the_device() -> None:
     assert information.revision_number == od.REVISION_NUMBER
     assert information.allowed_baudrates == {125_000, 250_000, 500_000, 1_000_000}
     assert (information.nr_of_RXPDO, information.nr_of_TXPDO) == (4, 4)
-    assert not information.LSS_supported
+    assert information.LSS_supported
 
 
 # --- what CiA 301 prescribes

@@ -8,7 +8,10 @@ import pytest
 
 from skinnode.errors import BusError
 from skinnode.node import NmtState
+from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.od import ObjectStore
 from skinnode.transport.bus_state import BusState
+from skinnode.wire.communication import communication_objects
 
 
 def test_open_wire_is_told_once_and_its_end_too(operational) -> None:
@@ -182,6 +185,53 @@ def test_what_was_told_to_nobody_is_not_told_later(operational) -> None:
     desk.run(1000)
     assert [can_id for can_id, _ in desk.take() if can_id == 0x084] == []
     assert desk.read(0x1003, 0) == 2
+
+
+def test_what_waits_is_forgotten_with_the_cob_id(operational) -> None:
+    desk = operational
+    desk.write(0x1015, 0, 1000, 2)  # 100 ms
+    desk.frame(0x80)
+    desk.frame(0x80, "01 02")
+    set_cob_id(desk, 0x8000_0084)
+    set_cob_id(desk, 0x084)
+    desk.run(1000)
+    assert desk.take() == []
+
+
+class TestLastingErrors:
+    """What the parts of a node may rely on: errors are told when they come, change and go."""
+
+    @pytest.fixture
+    def told(self) -> list[str]:
+        return []
+
+    @pytest.fixture
+    def emcy(self, told: list[str]) -> EmcyProducer:
+        store = ObjectStore(communication_objects([], [], 8), 4)
+        producer = EmcyProducer(store, lambda can_id, data: told.append(f"{can_id:03x} {data.hex(' ')}"))
+        producer.allow(True, 0)
+        return producer
+
+    def test_told_once(self, emcy: EmcyProducer, told: list[str]) -> None:
+        for t_ns in range(5):
+            emcy.present(EmcyCode.HARDWARE, b"\x01", t_ns)
+        assert told == ["084 00 50 81 01 00 00 00 00"]
+
+    def test_told_again_with_something_new_to_say(self, emcy: EmcyProducer, told: list[str]) -> None:
+        emcy.present(EmcyCode.HARDWARE, b"\x01", 0)
+        emcy.present(EmcyCode.HARDWARE, b"\x02", 1)
+        emcy.over(EmcyCode.HARDWARE, 2)
+        assert told[1:] == ["084 00 50 81 02 00 00 00 00", "084 00 00 00 00 50 00 00 00"]
+
+    def test_register_holds_what_is_left(self, emcy: EmcyProducer, told: list[str]) -> None:
+        emcy.present(EmcyCode.HARDWARE, b"", 0)
+        emcy.present(EmcyCode.HEARTBEAT, b"\x05", 1, 5)
+        emcy.present(EmcyCode.HEARTBEAT, b"\x06", 2, 6)
+        assert emcy.register == 0x91
+        for t_ns, who in ((3, 5), (4, 6)):
+            emcy.over(EmcyCode.HEARTBEAT, t_ns, who)
+            emcy.over(EmcyCode.HEARTBEAT, t_ns, who)  # says nothing
+        assert told[3:] == ["084 00 00 91 30 81 00 00 00", "084 00 00 81 30 81 00 00 00"]
 
 
 @pytest.mark.parametrize("value", [1, 8, 9, 255])

@@ -4,6 +4,7 @@ frames written by hand."""
 from __future__ import annotations
 
 import binascii
+import contextlib
 import io
 import itertools
 import struct
@@ -32,27 +33,28 @@ class Steady:
         return np.full(LAYOUT.shape, 1234.5)
 
 
-@pytest.fixture
-def channel() -> Iterator[str]:
-    """A virtual bus with a node of node-ID 4 on it."""
-    config = BusConfig(channel=uuid.uuid4().hex)
+@contextlib.contextmanager
+def node_on(config: BusConfig) -> Iterator[None]:
+    """A node of node-ID 4 on a bus."""
     with CanPort(config) as port:
         node = PatchNode(4, LAYOUT, Steady(), send=port.send, serial=7)
         with NodeRunner(port, [node]):
-            yield config.channel
+            yield
 
 
 @pytest.fixture
-def sdo(channel: str) -> Iterator[canopen.sdo.SdoClient]:
+def sdo() -> Iterator[canopen.sdo.SdoClient]:
+    config = BusConfig(channel=uuid.uuid4().hex)
     network = canopen.Network()
     network.NOTIFIER_CYCLE = 0.05  # how long the library takes to disconnect
-    network.connect(interface="virtual", channel=channel)
+    network.connect(interface="virtual", channel=config.channel)
     eds = io.StringIO(eds_text(PatchProfile.from_layout(LAYOUT)))
     eds.name = "patch.eds"
     remote = network.add_node(4, canopen.import_od(eds, 4))
     remote.sdo.RESPONSE_TIMEOUT = WAIT_S
     try:
-        yield remote.sdo
+        with node_on(config):
+            yield remote.sdo
     finally:
         network.disconnect()
 
@@ -167,8 +169,8 @@ class Client:
 
 
 @pytest.fixture
-def client(channel: str) -> Iterator[Client]:
-    with can.Bus(interface="virtual", channel=channel) as bus:
+def client(any_bus: BusConfig) -> Iterator[Client]:
+    with can.Bus(interface=any_bus.interface, channel=any_bus.channel) as bus, node_on(any_bus):
         yield Client(bus)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import chain, repeat
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.errors import BusError
@@ -98,6 +98,7 @@ def upload(bench: Bench, sizes: list[int], fate: Iterator[int]) -> bytes:
     return value
 
 
+@settings(deadline=None, max_examples=200)
 @given(values, block_sizes, fates)
 def test_upload_arrives_whole(value: bytes, sizes: list[int], fate: list[int]) -> None:
     bench = Bench(value)
@@ -105,6 +106,7 @@ def test_upload_arrives_whole(value: bytes, sizes: list[int], fate: list[int]) -
     assert bench.server.deadline_ns == NO_DEADLINE_NS
 
 
+@settings(deadline=None, max_examples=200)
 @given(values, block_sizes, st.lists(st.booleans(), max_size=100))
 def test_upload_gets_over_a_queue_that_is_full(value: bytes, sizes: list[int], busy: list[bool]) -> None:
     """The interface refuses some frames; the server sends them again, later."""
@@ -186,6 +188,7 @@ def download(bench: Bench, value: bytes, announce: bool, fate: Iterator[int], sp
     raise AssertionError("no end")
 
 
+@settings(deadline=None, max_examples=200)
 @given(values, st.booleans(), fates)
 def test_download_arrives_whole_or_is_aborted(value: bytes, announce: bool, fate: list[int]) -> None:
     bench = Bench(length=len(value))
@@ -199,6 +202,7 @@ def test_download_arrives_whole_or_is_aborted(value: bytes, announce: bool, fate
     assert bench.server.deadline_ns == NO_DEADLINE_NS
 
 
+@settings(deadline=None, max_examples=200)
 @given(values, st.booleans(), fates)
 def test_download_arrives_whole_if_blocks_reach_their_ends(
     value: bytes, announce: bool, fate: list[int]
@@ -208,6 +212,7 @@ def test_download_arrives_whole_if_blocks_reach_their_ends(
     assert bench.written == [value]
 
 
+@settings(deadline=None, max_examples=200)
 @given(values, st.integers(-20, 20), st.booleans(), st.booleans())
 def test_download_of_another_length_is_refused(
     value: bytes, difference: int, announce: bool, crc: bool

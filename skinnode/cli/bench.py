@@ -134,6 +134,36 @@ def path(
         draw(plot, figures)
 
 
+@app.command()
+def node(
+    json: JsonFile = None,
+    seconds: Annotated[float, typer.Option(min=0.2, help="Length of each measurement on the bus.")] = 10.0,
+    rounds: Rounds = 31,
+    interface: Annotated[str, typer.Option(help="Of python-can; virtual is in the process.")] = "virtual",
+    channel: Annotated[str | None, typer.Option(help="Default: one that nobody else has.")] = None,
+) -> None:
+    """A node's punctuality and cost: pacing of chunks, SYNC to first chunk, heartbeat on a full bus, µs a
+    frame."""
+    from skinnode.cli import _bench_node as bench
+
+    _prepare(json)
+    figures = bench.run(seconds, rounds, interface, channel)
+    _print_machine(figures)
+    typer.echo(f"{'ms':30}{'p50':>8}{'p99':>8}{'max':>8}{'asked':>8}{'n':>8}{'frames/s heard':>16}")
+    for row in figures["rows"]:
+        late_ms = [row[key] for key in ("p50_ms", "p99_ms", "max_ms")]
+        spread = "".join("       -" if value is None else f"{value:8.3f}" for value in late_ms)
+        typer.echo(f"{row['what']:30}{spread}{row['goal_ms']:8.1f}{row['n']:8}{row['load_hz']:16.0f}")
+    typer.echo(f"\n{'handled by the node':30}{'µs':>8}")
+    for row in figures["handling"]:
+        typer.echo(f"{row['what']:30}{row['us']:8.1f}")
+    typer.echo(
+        "\nexact: for a board; thrifty: for many nodes on one machine, in bursts at the same mean pace.\n"
+        "Other work of this machine is in the figures."
+    )
+    _write(json, figures)
+
+
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
     """Refuse what could not be written, before the work; say why the first run takes longer."""
     from skinnode.cli._files import require_writable

@@ -1,5 +1,6 @@
 """A patch as a CANopen device (CiA 301), and the thread that drives patches on a bus."""
 
+from skinnode.node.clock import EXACT, THRIFTY, Pacing
 from skinnode.node.lss import NOT_CONFIGURED
 from skinnode.node.memory import FileMemory, Memory, VolatileMemory
 from skinnode.node.nmt import NmtState
@@ -8,11 +9,14 @@ from skinnode.node.runner import NodeRunner
 from skinnode.node.source import ResistanceSource
 
 __all__ = [
+    "EXACT",
     "NOT_CONFIGURED",
+    "THRIFTY",
     "FileMemory",
     "Memory",
     "NmtState",
     "NodeRunner",
+    "Pacing",
     "PatchNode",
     "ResistanceSource",
     "VolatileMemory",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skinnode.model.layout import PRESET_IDS, Float, PatchLayout
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.acquisition import Acquisition, Mask, WireFaults
-from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.clock import NO_DEADLINE_NS, Pacing
 from skinnode.node.device import Services
 from skinnode.node.emcy import EmcyCode
 from skinnode.node.memory import Fault
@@ -41,14 +41,14 @@ class PatchApplication:
         serial: int,
         acquisition: Acquisition,
         services: Services,
-        catch_up_ns: int,
+        pacing: Pacing,
     ) -> None:
         self._profile, self._acquisition = profile, acquisition
         self._store, self._now = services.store, services.now
         self._emcy = services.emcy
         unknown = np.full((profile.rows, profile.columns), acquisition.scale.open, dtype=np.uint32)
         first_chunk = pack_scan(unknown, 0, profile)[0]
-        self.stream = ScanStream(services.store, services.tpdos, first_chunk, catch_up_ns)
+        self.stream = ScanStream(services.store, services.tpdos, first_chunk, pacing.catch_up_ns)
         self._storage = services.storage
         self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
         self._operational = False

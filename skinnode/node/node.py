@@ -4,20 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
 
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node.acquisition import Acquisition
 from skinnode.node.application import PatchApplication
+from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.device import CanopenDevice, Send, Services
 from skinnode.node.memory import Memory
 from skinnode.node.source import ResistanceSource
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile, eds_name
-
-CATCH_UP_NS: Final = 10_000_000
-"""Lateness of the driving thread that the pacing of chunks makes up for: two switch intervals of the
-interpreter. At the default pace no more than 15 frames come at once."""
 
 
 class PatchNode(CanopenDevice):
@@ -33,7 +29,7 @@ class PatchNode(CanopenDevice):
         serial: serial number (0x1018:4 and 0x2000:11), u32.
         baseline_ohm: (U, K) R0 to begin with, ohm; None to tare at the first power-on. The baseline in the
             memory counts instead.
-        catch_up_ns: see :mod:`skinnode.node.stream`; 0 for a strict inhibit time.
+        pacing: :data:`~skinnode.node.clock.EXACT` for a board, THRIFTY where many nodes share a machine.
         memory: keeps configuration, baseline and node-ID over a power cycle; None: a power cycle loses what
             was written, and the node says so.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None where that is not the node's own to do.
@@ -51,16 +47,17 @@ class PatchNode(CanopenDevice):
         profile: PatchProfile | None = None,
         serial: int = 0,
         baseline_ohm: Float | None = None,
-        catch_up_ns: int = CATCH_UP_NS,
+        pacing: Pacing = THRIFTY,
         memory: Memory | None = None,
         set_bit_rate: Callable[[int], None] | None = None,
     ) -> None:
         self.profile = PatchProfile.from_layout(layout) if profile is None else profile
         acquisition = Acquisition(self.profile, source, CodeScale(self.profile.code_bits), baseline_ohm)
+        self.pacing = pacing
         self._patch: PatchApplication
 
         def application(services: Services) -> PatchApplication:
-            self._patch = PatchApplication(layout, self.profile, serial, acquisition, services, catch_up_ns)
+            self._patch = PatchApplication(layout, self.profile, serial, acquisition, services, pacing)
             return self._patch
 
         super().__init__(

@@ -20,10 +20,6 @@ from skinnode.transport.port import CanPort
 _IDLE_S: Final = 0.1
 """Longest wait for a frame: how soon the thread sees that it should end."""
 
-TIMER_SLACK_NS: Final = 2_000_000
-"""How late timers may be. Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 13 % of a core of a small machine
-when the thread wakes for every chunk and 7 % with 2 ms; a bus sees bursts of three frames a node for it."""
-
 _RETRY_S: Final = 0.02
 """Pause after an error of the bus: a queue that was full has drained by then."""
 
@@ -39,23 +35,19 @@ class NodeRunner:
 
     Raises ValueError for no nodes, or for two with the same node-ID; any number may have none yet. A runner
     runs once. The nodes belong to the thread from :meth:`start` to :meth:`stop`; only counters may be looked
-    at meanwhile. The port stays open.
-
-    ``slack_ns`` is how late timers may be, so that one waking serves several: chunks of one inhibit time each
-    then leave two or three at a time, their mean pace unchanged. Frames are served at once whatever the
-    slack. Use 0, and nodes with ``catch_up_ns = 0``, where the inhibit time must hold between any two frames.
+    at meanwhile. The port stays open. Timers are kept as closely as the most exact of the nodes wants it.
     """
 
-    def __init__(self, port: CanPort, nodes: Iterable[PatchNode], *, slack_ns: int = TIMER_SLACK_NS) -> None:
+    def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
         self._port = port
         self._fd = port.config.fd
-        self._slack_ns = slack_ns
         self.nodes = tuple(nodes)
         if not self.nodes:
             raise ValueError("nodes: got none, must be at least one")
         ids = [node.node_id for node in self.nodes if node.node_id != NOT_CONFIGURED]
         if len(set(ids)) < len(ids):
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
+        self._slack_ns = min(node.pacing.slack_ns for node in self.nodes)
         self.bus_errors = 0
         """Errors of the bus that the nodes got over."""
         self._bus_state = BusState.ACTIVE

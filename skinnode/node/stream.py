@@ -10,6 +10,10 @@ and distances that only ever grow would let a scan outgrow its SYNC period; so l
 is made up for, with several frames at once if need be, while the mean rate is never exceeded (the generic
 cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the shortest distance is strict.
 
+Whoever drives the node hands it the time of a SYNC, and sampling takes a while after that. So the node asks
+for a turn of the timer right after the first chunk of a scan, which says what time it is by then; the second
+one keeps its distance from that.
+
 A scan that is offered while one is being sent waits for it to end, and there is room for one to wait. Chunks
 of two scans are never sent in turns, and a scan once begun is sent whole unless the node leaves OPERATIONAL
 or its chunk TPDO is disabled; then its summary says so, or there is none.
@@ -54,6 +58,7 @@ class ScanStream:
         self._carrier: Tpdo | None = None  # of the chunks of the scan being sent
         self._verbatim = False  # whether it carries nothing but the record as it is
         self._chunks_sent = 0
+        self._just_begun = False
         self.chunk = chunk
         """The chunk record as last sent."""
         self.summary = bytes(8)
@@ -72,7 +77,7 @@ class ScanStream:
         """When :meth:`on_timer` has something to do."""
         if self._scan is None:
             return NO_DEADLINE_NS
-        return self._carrier.ready_ns if self._carrier is not None else 0
+        return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
 
     # --- as the owner of TPDOs
 
@@ -107,12 +112,21 @@ class ScanStream:
         """Send ``scan``, at once or after the one being sent. Must not be called while :attr:`full`."""
         if self._scan is None:
             self._begin(scan, t_ns)
+            self._send_due(t_ns)
+            self._just_begun = True
         else:
             self._next_scan = scan
-        self.on_timer(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
         """Send everything that is due at ``t_ns``."""
+        carrier = self._carrier
+        if self._just_begun and carrier is not None:
+            earliest_ns = t_ns - self._catch_up_ns + carrier.parameters.inhibit_ns
+            carrier.ready_ns = max(carrier.ready_ns, earliest_ns)
+        self._just_begun = False
+        self._send_due(t_ns)
+
+    def _send_due(self, t_ns: int) -> None:
         while self._scan is not None and self._stream(t_ns):
             ended, self._scan, self._carrier = self._scan, None, None
             following, self._next_scan = self._next_scan, None

@@ -50,6 +50,25 @@ def test_solve_compares_with_every_peer_at_the_same_accuracy(tmp_path):
         assert row["who"] in output
 
 
+def test_node_tells_how_late_it_was_and_what_a_frame_costs(tmp_path):
+    """That something was measured: times are no business of a test."""
+    file = tmp_path / "figures.json"
+    result = CliRunner().invoke(app, ["node", "--seconds", "0.3", "--rounds", "1", "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    data = json.loads(file.read_text(encoding="utf-8"))
+    rows = {row["what"]: row for row in data["rows"]}
+    assert rows["chunk pacing, exact"]["n"] >= 99  # of three scans of a hundred chunks
+    assert rows["SYNC to first chunk, exact"]["n"] >= 1  # of three
+    assert rows["heartbeat on an idle bus"]["load_hz"] == 0
+    assert rows["heartbeat on a full bus"]["load_hz"] > 100
+    assert rows["heartbeat on a full bus"]["n"] > 0
+    assert all(row["p50_ms"] <= row["p99_ms"] <= row["max_ms"] for row in rows.values())
+    assert {row["what"]: row["us"] > 0 for row in data["handling"]} == dict.fromkeys(
+        ("frame of somebody else", "SDO upload", "RPDO", "remote request", "SYNC and 100 chunks"), True
+    )
+    assert "chunk pacing, exact" in result.output
+
+
 def test_a_solver_that_misses_the_accuracy_is_drawn_without_a_time(tmp_path):
     file = tmp_path / "solve.svg"
     rows = [

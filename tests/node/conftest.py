@@ -11,7 +11,7 @@ import pytest
 from skinnode.errors import BusError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node import PatchNode
+from skinnode.node import Pacing, PatchNode
 
 NODE_ID = 4
 MS = 1_000_000
@@ -135,7 +135,7 @@ def make(layout: PatchLayout) -> Callable[..., Desk]:
 @pytest.fixture
 def desk(make: Callable[..., Desk]) -> Desk:
     """A node in PRE-OPERATIONAL, inhibit time strict."""
-    return make(catch_up_ns=0)
+    return make(pacing=Pacing(slack_ns=0, catch_up_ns=0))
 
 
 @pytest.fixture

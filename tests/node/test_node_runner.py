@@ -176,6 +176,55 @@ def test_canopen_library_as_manager(virtual: BusConfig, layout: PatchLayout, tmp
             network.disconnect()
 
 
+def test_canopen_library_configures_spare_pdos(virtual: BusConfig, layout: PatchLayout, tmp_path) -> None:
+    """Its own procedure, for a TPDO by SYNC, one by event timer and an RPDO; its own decoding."""
+    with CanPort(virtual) as port:
+        nodes = nodes_on(port, layout, 4)
+        eds = tmp_path / "patch.eds"
+        eds.write_text(eds_text(nodes[0].profile), encoding="ascii")
+        network = canopen.Network()
+        network.connect(interface="virtual", channel=virtual.channel)
+        try:
+            remote = network.add_node(4, str(eds))
+            with NodeRunner(port, nodes):
+                eventually(lambda: remote.nmt.state == "PRE-OPERATIONAL")
+                remote.tpdo.read()
+                remote.rpdo.read()
+                codes, errors, mode = remote.tpdo[3], remote.tpdo[4], remote.rpdo[2]
+                for pdo, kind, variables in (
+                    (codes, 1, [(0x2100, 1), (0x2100, 6), (0x2101, 1), (0x2101, 6)]),
+                    (errors, 255, [(0x1001, 0), (0x2011, 1)]),
+                    (mode, 255, [(0x2020, 1)]),
+                ):
+                    pdo.clear()
+                    for index, subindex in variables:
+                        pdo.add_variable(index, subindex)
+                    pdo.trans_type = kind
+                    pdo.event_timer = 20 if pdo is errors else None
+                    pdo.enabled = True
+                    pdo.save()
+                received = {pdo: threading.Event() for pdo in (codes, errors)}
+                for pdo, event in received.items():
+                    pdo.add_callback(lambda _, event=event: event.set())
+                remote.nmt.state = "OPERATIONAL"
+                assert received[errors].wait(WAIT_S)
+                assert [v.raw for v in errors] == [0, 0]
+                network.sync.transmit()
+                assert received[codes].wait(WAIT_S)
+                assert [v.raw for v in codes] == [49149] * 4  # R/R0 = 1
+                mode[0].raw = 1
+                mode.transmit()
+                eventually(lambda: remote.sdo[0x2020][1].raw == 1)
+                codes.clear()
+                for _ in range(5):
+                    codes.add_variable(0x2100, 1)
+                with pytest.raises(canopen.SdoAbortedError) as caught:
+                    codes.save()
+                assert caught.value.code == 0x06040042
+        finally:
+            network.disconnect()
+
+
 def test_a_node_survives_its_source(virtual: BusConfig, layout: PatchLayout) -> None:
     """From power-on without a converter to the first scan with one: emergencies, no silence."""
     with CanPort(virtual) as port, can.Bus(interface="virtual", channel=virtual.channel) as manager:

@@ -10,6 +10,7 @@ import pytest
 
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
+from skinnode.node import Pacing
 from skinnode.wire.codec import CodeScale, encode
 from skinnode.wire.profile import PatchProfile
 
@@ -104,7 +105,7 @@ def test_inhibit_time_paces_the_chunks(operational) -> None:
     ],
 )
 def test_late_thread(make: Callable, catch_up_ms: float, distances_us: list[int]) -> None:
-    desk = make(catch_up_ns=round(catch_up_ms * 1e6))
+    desk = make(pacing=Pacing(slack_ns=0, catch_up_ns=round(catch_up_ms * 1e6)))
     desk.write(0x1800, 1, 0x80000184, 4)
     desk.write(0x1800, 3, 5, 2)
     desk.write(0x1800, 1, 0x184, 4)
@@ -113,11 +114,22 @@ def test_late_thread(make: Callable, catch_up_ms: float, distances_us: list[int]
     desk.sent.clear()
     start_ns = desk.t_ns
     desk.node.on_frame(0x80, b"", desk.t_ns)
+    desk.run(0)
     desk.t_ns += 2_500_000
     desk.node.on_timer(desk.t_ns)
     desk.run(10)
     times = [start_ns] + [t_ns for can_id, _, t_ns in desk.sent if can_id == CHUNK]
     assert [int(d) // 1000 for d in np.diff(times)] == distances_us
+
+
+def test_time_that_sampling_takes_is_kept_from_the_inhibit_time(operational) -> None:
+    """The thread hands over a SYNC with the time it came, and is 0.4 ms later when the first chunk is out."""
+    desk = operational
+    start_ns = desk.t_ns
+    desk.node.on_frame(0x80, b"\x01", desk.t_ns)
+    desk.t_ns += 400_000
+    desk.run(10)
+    assert desk.times(CHUNK, start_ns) == [0, 0.9, 1.4, 1.9]
 
 
 def test_reserved_codes(operational) -> None:
@@ -551,7 +563,8 @@ class TestCanFd:
 
     @pytest.fixture
     def fd(self, make: Callable, layout: PatchLayout):
-        desk = make(profile=PatchProfile.from_layout(layout, 16, "fd"), catch_up_ns=0)
+        profile = PatchProfile.from_layout(layout, 16, "fd")
+        desk = make(profile=profile, pacing=Pacing(slack_ns=0, catch_up_ns=0))
         desk.start()
         return desk
 

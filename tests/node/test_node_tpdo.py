@@ -254,7 +254,7 @@ def test_chunks_of_a_synchronous_tpdo_are_sent_at_its_turns(operational, kind: i
 def test_fixed_pdos_of_four_codes_each(make: Callable, layout) -> None:
     """The encoding without chunks: every code has a place of its own in some PDO."""
     profile = dataclasses.replace(PatchProfile.from_layout(layout), tpdos=5)
-    desk = make(profile=profile, catch_up_ns=0)
+    desk = make(profile=profile)
     desk.write(0x1800, 1, 0x80000184, 4)
     desk.write(0x1801, 1, 0x80000284, 4)
     for number in range(3):

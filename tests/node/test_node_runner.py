@@ -225,6 +225,48 @@ def test_canopen_library_configures_spare_pdos(virtual: BusConfig, layout: Patch
             network.disconnect()
 
 
+def test_canopen_library_guards_a_node_and_tells_it_the_time(
+    virtual: BusConfig, layout: PatchLayout, tmp_path
+) -> None:
+    with CanPort(virtual) as port:
+        nodes = nodes_on(port, layout, 4)
+        eds = tmp_path / "patch.eds"
+        eds.write_text(eds_text(nodes[0].profile), encoding="ascii")
+        network = canopen.Network()
+        network.connect(interface="virtual", channel=virtual.channel)
+        try:
+            remote = network.add_node(4, str(eds))
+            answers: list[int] = []
+            network.subscribe(0x704, lambda _id, data, _time: answers.append(data[0]))
+            with NodeRunner(port, nodes):
+                eventually(lambda: remote.nmt.state == "PRE-OPERATIONAL")
+                remote.sdo[0x100C].raw = 100
+                remote.sdo[0x100D].raw = 10
+                remote.nmt.state = "OPERATIONAL"
+                remote.nmt.start_node_guarding(0.02)
+                eventually(lambda: len(answers) >= 5)
+                assert answers[:5] == [0x00, 0x05, 0x85, 0x05, 0x85]  # boot-up first
+                assert remote.nmt.state == "OPERATIONAL"
+                assert remote.emcy.log == []
+                remote.nmt.stop_node_guarding()
+                eventually(lambda: bool(remote.emcy.active))
+                assert [(e.code, e.register) for e in remote.emcy.active] == [(0x8130, 0x11)]
+                remote.nmt.start_node_guarding(0.02)
+                eventually(lambda: not remote.emcy.active)
+                assert remote.nmt.state == "PRE-OPERATIONAL"
+                remote.nmt.stop_node_guarding()
+
+                remote.sdo[0x1012].raw = 0x8000_0100
+                moment_s = 1_700_000_000.25  # 2023-11-14 22:13:20.25 UTC
+                network.time.transmit(moment_s)
+                eventually(lambda: remote.sdo[0x2022][3].raw == 1)
+                days, ms = remote.sdo[0x2022][1].raw, remote.sdo[0x2022][2].raw
+                told_s = 441_763_200 + days * 86_400 + ms / 1000  # 1984-01-01 in Unix time
+                assert moment_s <= told_s < moment_s + WAIT_S
+        finally:
+            network.disconnect()
+
+
 def test_a_node_survives_its_source(virtual: BusConfig, layout: PatchLayout) -> None:
     """From power-on without a converter to the first scan with one: emergencies, no silence."""
     with CanPort(virtual) as port, can.Bus(interface="virtual", channel=virtual.channel) as manager:

@@ -25,7 +25,6 @@ _ALL, _COMMUNICATION_ONLY, _APPLICATION_ONLY = 1, 2, 3
 
 _PDO_END: Final = 0x1C00
 _CAN_ID_MASK: Final = 0x7FF
-_BIT_30, _BIT_31 = 1 << 30, 1 << 31
 
 Key = tuple[int, int]
 """Index and sub-index."""
@@ -195,13 +194,6 @@ def _unverified(kept: Kept) -> Kept:
 
 # --- writing in an order that the standard's rules allow
 
-_OFF: Final = {
-    od.COB_ID_SYNC: (_BIT_30, 0),
-    od.COB_ID_TIME: (_BIT_30 | _BIT_31, 0),
-    od.COB_ID_EMCY: (0, _BIT_31),
-}
-"""Bits of a COB-ID that are to be cleared, and set, for its service to be off."""
-
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
 """The counter of SYNC may not change while there is a cycle period, the producer starts when both are there,
 and any change takes 0x1020 back."""
@@ -209,8 +201,8 @@ and any change takes 0x1020 back."""
 
 def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list[Key]:
     """Write ``values`` over the defaults: a PDO is switched off, mapped, given its parameters and switched
-    on; other COB-IDs change while their service is off. Returns index and sub-index of what is not allowed,
-    which stays at its default: of a mapping all of it."""
+    on; EMCY is switched off before it gets another COB-ID. Returns index and sub-index of what is not
+    allowed, which stays at its default: of a mapping all of it."""
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
     pdos = {index & ~0x200 for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
@@ -218,12 +210,12 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
         refused += _write_pdo(store, known, pdo)
     others = [key for key in known if not od.RPDO1_PARAMETER <= key[0] < _PDO_END]
     for key in sorted(others, key=lambda key: (key[0] in _LATE and 1 + _LATE.index(key[0]), key)):
-        value = values[key]
-        clear, put = _OFF.get(key[0], (0, 0))
-        steps = [_with_bits(value, clear, put), value] if clear or put else [value]
-        if not _accepted(store, [(key, step) for step in steps]):
-            store.restore(key[0], key[0])
+        emcy = key[0] == od.COB_ID_EMCY
+        off = [(key, _switched_off(store.raw(*key)))] if emcy else []
+        if not _accepted(store, [*off, (key, values[key])]):
             refused.append(key)
+            if emcy:
+                store.restore(key[0], key[0])
     return refused
 
 
@@ -233,7 +225,7 @@ def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int) -> Ite
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)
     mapped = sorted(item for item in values.items() if item[0][0] == pdo + 0x200 and item[0] != count)
     default = store.raw(*cob_id)
-    off = _with_bits(default, 0, od.PDO_INVALID)
+    off = _switched_off(default)
     if mapped or count in values:
         entries = values.get(count) or store.raw(*count)
         if not _accepted(store, [(cob_id, off), (count, bytes(1)), *mapped, (count, entries)]):
@@ -256,5 +248,5 @@ def _accepted(store: ObjectStore, steps: Iterable[tuple[Key, bytes]]) -> bool:
     return True
 
 
-def _with_bits(cob_id: bytes, clear: int, put: int) -> bytes:
-    return (int.from_bytes(cob_id, "little") & ~clear | put).to_bytes(len(cob_id), "little")
+def _switched_off(cob_id: bytes) -> bytes:
+    return (int.from_bytes(cob_id, "little") | od.PDO_INVALID).to_bytes(4, "little")

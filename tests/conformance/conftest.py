@@ -12,7 +12,7 @@ from skinnode.conformance import Dut, connect
 from skinnode.model.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node import NodeRunner, PatchNode
+from skinnode.node import NodeRunner, PatchNode, VolatileMemory
 from skinnode.transport import CanPort
 
 NODE_ID = 4
@@ -34,7 +34,7 @@ def patch_on(channel: str, wrap: Callable[[CanPort], CanPort] = lambda port: por
     layout = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=6)
     with CanPort(BusConfig(channel=channel)) as bare:
         port = wrap(bare)
-        node = PatchNode(NODE_ID, layout, Source(layout), send=port.send)
+        node = PatchNode(NODE_ID, layout, Source(layout), send=port.send, memory=VolatileMemory())
         with NodeRunner(port, [node]):
             yield node
 

@@ -17,8 +17,8 @@ NOT_APPLICABLE = {
 }
 """What a patch does not have, and the words it is said with. Everything else has to pass."""
 
-PENDING = {"OD-02", "OD-08", "SYNC-08", "SYNC-10", *(f"OTHER-0{number}" for number in range(1, 10))}
-"""Cases of services that the node is still to get: storing parameters and restoring defaults."""
+PENDING = {"OD-08"}
+"""The EDS still has a default, 0, for values that only the patch knows, as its baseline."""
 
 PLAN = {
     "EDS": 1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import random
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -141,6 +142,36 @@ class TestOnADesk:
         for length in (0, 1, 7):
             assert desk.frame(0x7E5, "04 01 00 00 00 00 00 00"[: 3 * length]) == []
         assert desk.frame(0x7E5, "5e 00 00 00 00 00 00 00") == []  # still waiting
+
+    def test_whatever_comes(self, blank) -> None:
+        """Requests right and wrong, resets and power cycles in any order: the node-ID is always one that was
+        asked for, and boot-up messages name it."""
+        desk, chance = blank, random.Random(5)
+        asked = {NOT_CONFIGURED}
+        booted = 0
+        for _ in range(20_000):
+            kind = chance.random()
+            if kind < 0.02:
+                desk.node.power_off()
+                desk.power_on()
+                frames = desk.take()
+            elif kind < 0.04:
+                frames = desk.frame(0, f"{chance.choice((0x81, 0x82)):02x} 00")
+            else:
+                command = chance.choice(
+                    (0x04, 0x04, 0x11, 0x13, 0x15, 0x17, 0x4C, 0x51, chance.randrange(256))
+                )
+                argument = chance.choice((0, 1, chance.randrange(256)))
+                data = bytes((command, argument)) + bytes(chance.choice((6, 6, 6, 5)))
+                if command == 0x11 and len(data) == 8:
+                    asked.add(argument)
+                frames = desk.frame(0x7E5, data.hex())
+            assert len(frames) <= 1
+            for can_id, data_hex in frames:
+                booted += can_id != 0x7E4
+                assert can_id == 0x7E4 or (can_id, data_hex) == (0x700 + desk.node.node_id, "00")
+            assert desk.node.node_id in asked & {*range(1, 128), NOT_CONFIGURED}
+        assert booted > 100
 
 
 class TestBitRate:

@@ -193,6 +193,51 @@ class TestPdos:
         assert after[0x1800, 1] == 0x1B4
         assert desk.read(0x1017, 0) == 100
 
+    def test_rpdo_mapping_survives(self, desk) -> None:
+        desk.write(0x1400, 1, 0x8000_0204, 4)
+        desk.write(0x1400, 2, 1, 1)
+        desk.write(0x1600, 0, 0, 1)
+        desk.write(0x1600, 1, 0x2020_0108, 4)  # send mode
+        desk.write(0x1600, 0, 1, 1)
+        desk.write(0x1400, 1, 0x3F0, 4)
+        desk.write(0x1010, 2, SAVE, 4)
+        cycle(desk)
+        desk.start()
+        assert desk.frame(0x3F0, "01") == []
+        assert desk.read(0x2020, 1) == 0  # synchronous
+        desk.frame(0x80)
+        assert desk.read(0x2020, 1) == 1
+
+    def test_spare_pdos_survive(self, desk) -> None:
+        for number in (2, 3):
+            desk.write(0x1A00 + number, 1, 0x1001_0008, 4)
+            desk.write(0x1A00 + number, 0, 1, 1)
+            desk.write(0x1800 + number, 2, 1, 1)
+            desk.write(0x1800 + number, 1, 0x390 + number, 4)
+        desk.write(0x1010, 1, SAVE, 4)
+        cycle(desk)
+        desk.start()
+        assert [each for each in desk.frame(0x80) if each[0] & 0x7F0 == 0x390] == [
+            (0x392, "00"),
+            (0x393, "00"),
+        ]
+
+
+def test_sync_producer_survives(desk) -> None:
+    """Its period, counter and COB-ID depend on each other, and it starts with the node."""
+    desk.write(0x1019, 0, 10, 1)
+    desk.write(0x1006, 0, 20_000, 4)  # 20 ms
+    desk.write(0x1005, 0, 0x90, 4)
+    desk.write(0x1005, 0, 0x4000_0090, 4)
+    desk.write(0x1010, 1, SAVE, 4)
+    desk.node.power_off()
+    desk.power_on()
+    desk.run(60)
+    frames = desk.take()
+    assert frames[0] == (0x704, "00")
+    assert [data for can_id, data in frames if can_id == 0x90] == ["01", "02", "03"]
+    assert emergencies(frames) == []
+
 
 @pytest.mark.parametrize(
     ("key", "value", "told"),
@@ -223,12 +268,21 @@ def test_value_that_is_not_allowed_any_more(
     assert desk.read(0x1018, 4) == 0
 
 
+def test_what_is_refused_leaves_its_neighbours_alone(desk, memory: Breakable) -> None:
+    kept = memory.load()
+    assert kept is not None
+    twice = struct.pack("<I", 0x007F_0064)  # one node monitored twice
+    memory.save(replace(kept, communication=Parameters(4, {(0x1016, 1): twice, (0x1016, 2): twice})))
+    assert emergencies(cycle(desk)) == ["00 63 81 04 16 10 02 00"]
+    assert [desk.read(0x1016, subindex) for subindex in (1, 2)] == [0x007F_0064, 0]
+
+
 def test_every_parameter_survives(desk) -> None:
     """Each that can be written alone, at another value than its default, all at once."""
     chosen = {
         (0x1005, 0): (0x90, 4),
         (0x1012, 0): (0x8000_00A0, 4),
-        (0x1014, 0): (0x8000_00A5, 4),
+        (0x1014, 0): (0xA5, 4),
         (0x1015, 0): (7, 2),
         (0x1016, 1): (0x007F_0064, 4),
         (0x1016, 2): (0x0001_0064, 4),
@@ -241,6 +295,7 @@ def test_every_parameter_survives(desk) -> None:
         (0x2021, 1): (500, 2),
         (0x2021, 2): (3, 1),
     }
+    desk.write(0x1014, 0, 0x8000_0084, 4)
     for key, (value, size) in chosen.items():
         desk.write(*key, value, size)
     desk.write(0x1010, 1, SAVE, 4)

@@ -101,7 +101,8 @@ class VolatileMemory:
 
 
 class FileMemory:
-    """A file that people can read: JSON with a checksum. One node has it for itself.
+    """A file that people can read: JSON with a checksum. One node has it for itself. Saving waits for the
+    medium, some milliseconds in which the node, and others driven by its thread, do nothing else.
 
     It is replaced as a whole (written beside itself, flushed to the medium, renamed), so that a process that
     is killed and a power supply that fails at any moment leave the old content or the new. A file that is

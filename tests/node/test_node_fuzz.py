@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from skinnode.node import VolatileMemory
+
 MS = 1_000_000
 
 # Frames that get somewhere, so that their mutations do too.
@@ -60,6 +62,9 @@ GOOD = [
     (0x604, "2f 20 20 01 01 00 00 00"),
     (0x604, "23 00 22 01 00 00 7a 44"),
     (0x604, "80 08 10 00 00 00 04 05"),
+    (0x604, "23 10 10 01 73 61 76 65"),
+    (0x604, "23 10 10 02 73 61 76 65"),
+    (0x604, "23 11 10 01 6c 6f 61 64"),
     (0x704, ""),
     (0x705, "05"),
 ]
@@ -136,7 +141,7 @@ def allowed_changes(dictionary: Dictionary, sent: list[tuple[int, bytes]]) -> se
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_any_frame(make: Callable, seed: int, fuzz_frames: int) -> None:
-    desk = make()
+    desk = make(memory=VolatileMemory())
     chance = random.Random(-seed)
     dictionary = Dictionary(desk)
     count = fuzz_frames // len(SEEDS)

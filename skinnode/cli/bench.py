@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(help="Measure the solver against its peers on this machine.", no_args_is_help=True)
+app = typer.Typer(help="Measure solver and node on this machine.", no_args_is_help=True)
 
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to FILE as well.")

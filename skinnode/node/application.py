@@ -112,11 +112,11 @@ class PatchApplication:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Take the scan that is due, if one is, and send what is due of those taken."""
+        """Send what is due of the scans taken, and take the one that is due, if one is."""
+        self.stream.on_timer(t_ns)
         if t_ns >= self._scan_ns:
             self._scan_ns = max(self._scan_ns + self._period_ns, t_ns)
             self._scan(self._following(), frozenset(), t_ns)
-        self.stream.on_timer(t_ns)
 
     # --- baseline
 

@@ -222,12 +222,12 @@ class CanopenDevice:
             return
         self._now_ns = t_ns
         self._error_control.on_timer(self.nmt_state, t_ns)
-        sync = self._sync.on_timer(t_ns)
-        if sync is not None:
-            self._synchronise(sync, t_ns)
         self._application.on_timer(t_ns)
         self._tpdos.on_timer(t_ns)
         self._rpdos.on_timer(t_ns)
+        sync = self._sync.on_timer(t_ns)
+        if sync is not None:
+            self._synchronise(sync, t_ns)
         self._emcy.on_timer(t_ns)
         self._sdo.on_timer(t_ns)
 

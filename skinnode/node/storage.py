@@ -206,8 +206,11 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
     pdos = {index & ~0x200 for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
-    for pdo in sorted(pdos):
-        refused += _write_pdo(store, known, pdo)
+    defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
+    for pdo, default in defaults.items():  # all of them first: one may have another one's default COB-ID
+        _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
+    for pdo, default in defaults.items():
+        refused += _write_pdo(store, known, pdo, default)
     others = [key for key in known if not od.RPDO1_PARAMETER <= key[0] < _PDO_END]
     for key in sorted(others, key=lambda key: (key[0] in _LATE and 1 + _LATE.index(key[0]), key)):
         emcy = key[0] == od.COB_ID_EMCY
@@ -219,12 +222,12 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
     return refused
 
 
-def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int) -> Iterator[Key]:
-    """Write the two records of the PDO with parameters at ``pdo``; yields what was refused."""
+def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
+    """Write the two records of the PDO with parameters at ``pdo``; yields what was refused. ``default``: its
+    COB-ID, where there is no other."""
     cob_id, count = (pdo, od.PDO_COB_ID), (pdo + 0x200, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)
     mapped = sorted(item for item in values.items() if item[0][0] == pdo + 0x200 and item[0] != count)
-    default = store.raw(*cob_id)
     off = _switched_off(default)
     if mapped or count in values:
         entries = values.get(count) or store.raw(*count)

@@ -29,7 +29,7 @@ from typing import Protocol
 from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import REMOTE, SYNC_REMOTE, PdoRecords
+from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
 from skinnode.wire import indices as od
 
 Send = Callable[[int, bytes], None]
@@ -185,7 +185,10 @@ class TpdoEngine:
         self._plan(tpdo)
 
     def _taken(self, cob_id: int) -> bool:
-        return cob_id in self._by_cob_id
+        # Not from the parameters taken over, which are older than the store while it is restored.
+        numbers = range(od.TPDO1_PARAMETER, od.TPDO1_PARAMETER + len(self._tpdos))
+        words = [self._store.integer(index, od.PDO_COB_ID) for index in numbers]
+        return any(not word & INVALID_BIT and word & COB_ID_MASK == cob_id for word in words)
 
     # --- events
 

@@ -262,7 +262,8 @@ def test_deadlines_always_lie_ahead_after_they_were_served(make: Callable) -> No
     for can_id, data, remote in mutated(random.Random(3), 5000):
         desk.node.on_frame(can_id, data, desk.t_ns, remote)
         desk.t_ns += 500_000
-        desk.node.on_timer(desk.t_ns)
+        for _ in range(2):  # the first may ask to be told the time after it has sampled
+            desk.node.on_timer(desk.t_ns)
         due_ns = desk.node.next_deadline_ns()
         assert due_ns is None or due_ns > desk.t_ns
         desk.sent.clear()

@@ -12,6 +12,7 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, eds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from skinnode.node import VolatileMemory
 from skinnode.wire.profile import eds_text
 
 REGISTER, COUNTER, TIME, CODE = 0x1001_0008, 0x2011_0108, 0x2011_0420, 0x2100_0110
@@ -223,6 +224,21 @@ def test_no_sequence_of_writes_leaves_a_pdo_that_is_on_and_inconsistent(
         desk.node.on_frame(0x80, b"", desk.t_ns)
         desk.run(10)
     assert all(len(data) == lengths[can_id] for can_id, data, _ in desk.sent if can_id in lengths)
+
+
+def test_identifiers_that_were_swapped_and_saved_are_those_after_a_reset(make: Callable) -> None:
+    desk = make(memory=VolatileMemory())
+    for parameter in (0x1800, 0x1801):
+        desk.write(parameter, 1, 0x8000_0400, 4)
+    desk.write(0x1800, 1, 0x284, 4)
+    desk.write(0x1801, 1, 0x184, 4)
+    desk.configure_pdo(0x1803, REGISTER, cob_id=0x3A0)
+    desk.write(0x1010, 1, int.from_bytes(b"save", "little"), 4)
+    desk.write(0x1803, 1, 0x8000_03A0, 4)
+    desk.configure_pdo(0x1802, REGISTER, cob_id=0x3A0)  # not saved
+    assert desk.frame(0, "81 04") == [(0x704, "00")]  # and no emergency
+    cob_ids = [desk.read(0x1800 + number, 1) for number in range(4)]
+    assert cob_ids == [0x284, 0x184, 0x8000_0384, 0x3A0]
 
 
 @functools.cache

@@ -132,6 +132,23 @@ def test_time_that_sampling_takes_is_kept_from_the_inhibit_time(operational) -> 
     assert desk.times(CHUNK, start_ns) == [0, 0.9, 1.4, 1.9]
 
 
+@pytest.mark.parametrize("own", ["timer", "SYNC"])
+def test_so_it_is_when_the_node_starts_the_scan_itself(operational, own: str) -> None:
+    desk = operational
+    desk.write(0x1801, 1, 0x80000284, 4)
+    if own == "timer":
+        desk.write(0x2021, 1, 20, 2)
+    else:
+        desk.write(0x1006, 0, 20_000, 4)
+        desk.write(0x1005, 0, 0x4000_0080, 4)
+    start_ns = desk.t_ns
+    desk.t_ns += 20_000_000
+    desk.node.on_timer(desk.t_ns)
+    desk.t_ns += 400_000
+    desk.run(10)
+    assert desk.times(CHUNK, start_ns) == [20, 20.9, 21.4, 21.9]
+
+
 def test_reserved_codes(operational) -> None:
     desk = operational
     ohm = desk.source.ohm.copy()

@@ -5,14 +5,10 @@ Exit status: 0 ended as asked (Ctrl-C, SIGTERM or ``--seconds``), 2 could not ru
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -48,10 +44,11 @@ def simulate(
     Bring them up with `skinnode host` and the same file in another terminal.
     """
     from skinnode.model.config import load_hand
+    from skinnode.signals import until_told
     from vcan_sim.fleet import Fleet
 
     plan = load_hand(hand).on(interface, channel)
-    with _until_told() as ended, Fleet(plan) as fleet:
+    with until_told() as ended, Fleet(plan) as fleet:
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         _say(f"{len(plan.patches)} patches of {plan.name!r} on {where}; Ctrl-C ends")
         _watch(fleet, ended.wait, seconds)
@@ -65,22 +62,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     except (SkinError, OSError) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)
-
-
-@contextmanager
-def _until_told() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, so that both end the program the ordinary way."""
-    told = threading.Event()
-
-    def tell(_signal: int, _frame: FrameType | None) -> None:
-        told.set()
-
-    kept = {number: signal.signal(number, tell) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield told
-    finally:
-        for number, handler in kept.items():
-            signal.signal(number, handler)
 
 
 def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:

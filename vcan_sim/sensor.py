@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final
@@ -90,6 +91,15 @@ class SimulatedPatch:
         self._read_ns[t_ns // 1000 & 0xFFFF_FFFF] = t_ns
         if len(self._read_ns) > REMEMBERED_READINGS:
             self._read_ns.popitem(last=False)
+
+
+def simulated(layout: PatchLayout) -> SimulatedPatch:
+    """A patch that a sphere presses, over which it slides and from which it lifts, from its first reading on:
+    the source ``simulated`` of ``skinnode node``. The first touch comes after 0.8 s, so that a tare at
+    power-on sees an untouched patch."""
+    source = SimulatedPatch(Scene(layout))
+    source.start(time.monotonic_ns())
+    return source
 
 
 class _Forward:

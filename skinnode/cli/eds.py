@@ -3,33 +3,95 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from skinnode.cli._layouts import HELP as LAYOUT_HELP
+
+if TYPE_CHECKING:
+    from skinnode.wire.profile import PatchProfile
+
+_DEFAULT_SIZES = {
+    "--upper-wires": 10,
+    "--lower-wires": 30,
+    "--upper-electrodes": 10,
+    "--lower-electrodes": 10,
+}
 
 
 def eds(
     upper_wires: Annotated[
-        int, typer.Option(min=1, max=254, help="Upper wires U, the rows of a frame.")
-    ] = 10,
+        int | None, typer.Option(min=1, max=254, help="Upper wires U, the rows of a frame; default 10.")
+    ] = None,
     upper_electrodes: Annotated[
-        int, typer.Option(min=1, max=255, help="Electrodes of an upper wire N.")
-    ] = 10,
-    lower_wires: Annotated[int, typer.Option(min=1, max=254, help="Lower wires K, the columns.")] = 30,
-    lower_electrodes: Annotated[int, typer.Option(min=1, max=255, help="Electrodes of a lower wire M.")] = 10,
+        int | None, typer.Option(min=1, max=255, help="Electrodes of an upper wire N; default 10.")
+    ] = None,
+    lower_wires: Annotated[
+        int | None, typer.Option(min=1, max=254, help="Lower wires K, the columns; default 30.")
+    ] = None,
+    lower_electrodes: Annotated[
+        int | None, typer.Option(min=1, max=255, help="Electrodes of a lower wire M; default 10.")
+    ] = None,
+    layout: Annotated[
+        str | None, typer.Option(help=f"Sizes from a layout instead: {LAYOUT_HELP}", metavar="LAYOUT")
+    ] = None,
     code_bits: Annotated[int, typer.Option(help="Width of a code: 16 or 24.", metavar="16|24")] = 16,
+    fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")] = False,
+    dcf: Annotated[
+        bool, typer.Option("--dcf", help="The configuration of one device; needs --node-id.")
+    ] = False,
+    node_id: Annotated[
+        int | None, typer.Option(min=1, max=127, help="Node-ID of the DCF.", metavar="N")
+    ] = None,
+    bitrate: Annotated[
+        int | None, typer.Option(help="Bits per second in the DCF; default 1000000.", metavar="BPS")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Write to this file instead.", metavar="FILE")
     ] = None,
 ) -> None:
-    """Print the EDS of a patch.
+    """Print the EDS or the DCF of a patch (CiA 306).
 
-    It depends on nothing but the sizes and the code width. The files of the reference patches are in eds/.
+    An EDS depends on nothing but the sizes, the code width and the bus. The files
+    of the reference patches are in eds/.
     """
-    from skinnode.wire.profile import PatchProfile, eds_text
+    from skinnode.cli._files import require_writable, write_text
+    from skinnode.errors import ConfigError
+    from skinnode.wire.profile import dcf_text, eds_text
 
-    text = eds_text(PatchProfile(upper_wires, lower_wires, upper_electrodes, lower_electrodes, code_bits))
+    sizes = {
+        "--upper-wires": upper_wires,
+        "--lower-wires": lower_wires,
+        "--upper-electrodes": upper_electrodes,
+        "--lower-electrodes": lower_electrodes,
+    }
+    profile = _profile(
+        {name: size for name, size in sizes.items() if size is not None}, layout, code_bits, fd
+    )
+    if dcf and node_id is None:
+        raise ConfigError("--node-id", None, "1 to 127, for --dcf")
+    for option, value in (("--node-id", node_id), ("--bitrate", bitrate)):
+        if value is not None and not dcf:
+            raise ConfigError(option, value, "nothing without --dcf: an EDS is of no node in particular")
+    if output is not None:
+        require_writable("--output", output)
+    text = eds_text(profile) if node_id is None else dcf_text(profile, node_id, bitrate or 1_000_000)
     if output is None:
         typer.echo(text, nl=False)
     else:
-        output.write_text(text, encoding="ascii", newline="\n")
+        write_text("--output", output, text)
+
+
+def _profile(sizes: dict[str, int], layout: str | None, code_bits: int, fd: bool) -> PatchProfile:
+    from skinnode.cli._layouts import find_layout, import_from_here
+    from skinnode.errors import ConfigError
+    from skinnode.wire.profile import PatchProfile
+
+    if layout is None:
+        rows, columns, upper, lower = (_DEFAULT_SIZES | sizes).values()
+        return PatchProfile(rows, columns, upper, lower, code_bits, bus="fd" if fd else "classic")
+    if sizes:
+        raise ConfigError(next(iter(sizes)), next(iter(sizes.values())), "nothing beside --layout")
+    import_from_here()
+    return PatchProfile.from_layout(find_layout(layout), code_bits, "fd" if fd else "classic")

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
@@ -49,6 +46,7 @@ def host(
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
     from skinnode.model.config import load_hand
+    from skinnode.signals import until_told
 
     plan = load_hand(hand).on(interface, channel)
     report = _JsonReport() if as_json else _TextReport()
@@ -56,7 +54,7 @@ def host(
         report.note("compiling the kernels, once: takes some seconds")
     for patch in plan.patches:  # compiles; nothing is open yet, so Ctrl-C still ends the program by itself
         check_solvable(patch, plan.solver)
-    with _until_told() as told:
+    with until_told() as told:
         status = _run(plan, seconds, report, told)
     if status:
         raise typer.Exit(status)
@@ -101,22 +99,6 @@ def _faults(running: Host) -> list[str]:
             if count:
                 found.append(f"{name}: {count} {what}")
     return found
-
-
-@contextmanager
-def _until_told() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, so that both end the program the ordinary way."""
-    told = threading.Event()
-
-    def tell(_signal: int, _frame: FrameType | None) -> None:
-        told.set()
-
-    kept = {number: signal.signal(number, tell) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield told
-    finally:
-        for number, handler in kept.items():
-            signal.signal(number, handler)
 
 
 def _watch(running: Host, told: threading.Event, seconds: float | None, report: _Report) -> None:

@@ -297,19 +297,35 @@ def load_hand(path: Path | str) -> HandConfig:
     type, value out of range, and everything HandConfig checks.
     """
     path = Path(path)
+    return parse_hand(_read_toml(path, "hand file"), folder=path.parent, where=str(path))
+
+
+def load_layout(path: Path | str) -> PatchLayout:
+    """Read a layout file: a TOML file with the keys of ``[patches.layout]``. Raises ConfigError as
+    :func:`load_hand`, and for an impossible geometry."""
+    path = Path(path)
+    table = _read_toml(path, "layout file")
+    try:
+        return LayoutConfig.model_validate(table).build()
+    except ValidationError as error:
+        raise _first_error(error, str(path), LayoutConfig) from None
+    except ValueError as error:
+        raise ConfigError("layout", table.get("preset", "staggered"), str(error), where=str(path)) from None
+
+
+def _read_toml(path: Path, what: str) -> dict[str, Any]:
     try:
         text = path.read_bytes().decode()
     except OSError as error:
-        raise ConfigError("hand file", str(path), f"a file that can be read ({error.strerror})") from None
+        raise ConfigError(what, str(path), f"a file that can be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
     try:
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise _syntax_error(str(path), text, str(error)) from None
-    return parse_hand(table, folder=path.parent, where=str(path))
 
 
 def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: str = "") -> HandConfig:
@@ -368,8 +384,8 @@ def _dotted(location: tuple[int | str, ...]) -> str:
     return "".join(parts).removeprefix(".")
 
 
-def _first_error(error: ValidationError, where: str) -> ConfigError:
-    """The first of pydantic's errors in the words of this project."""
+def _first_error(error: ValidationError, where: str, table: type[BaseModel] = HandConfig) -> ConfigError:
+    """The first of pydantic's errors about a ``table`` in the words of this project."""
     found = error.errors()
     # A misspelt key that is required is missing as well; its misspelling says more.
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
@@ -377,7 +393,7 @@ def _first_error(error: ValidationError, where: str) -> ConfigError:
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, ConfigError):  # from a check of ours that knows its key
         return type(cause)(cause.key, cause.got, cause.allowed, where=where)
-    keys, allowed = _place(location)
+    keys, allowed = _place(location, table)
     if kind == "extra_forbidden":
         unknown = str(location[-1])
         close = difflib.get_close_matches(unknown, keys, n=1)
@@ -392,9 +408,9 @@ def _first_error(error: ValidationError, where: str) -> ConfigError:
     return ConfigError(_dotted(location), got, allowed, where=where)
 
 
-def _place(location: tuple[int | str, ...]) -> tuple[list[str], str | None]:
-    """The keys of the table that holds ``location``, and what is allowed at ``location`` itself."""
-    table: type[BaseModel] = HandConfig
+def _place(location: tuple[int | str, ...], table: type[BaseModel]) -> tuple[list[str], str | None]:
+    """The keys of the table in ``table`` that holds ``location``, and what is allowed at ``location``
+    itself."""
     allowed: str | None = None
     for depth, part in enumerate(location):
         if isinstance(part, int):

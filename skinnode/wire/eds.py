@@ -1,4 +1,5 @@
-"""An object dictionary as an electronic data sheet, the INI dialect of CiA 306.
+"""An object dictionary as an electronic data sheet (EDS), or as the configuration of one device (DCF): the
+INI dialects of CiA 306.
 
 REAL32 defaults are written as the hexadecimal IEEE 754 pattern, as conforming tools expect them. The canopen
 library wants decimals there and leaves such a default out; 0 reads the same in both.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from skinnode.wire import indices as od
@@ -36,10 +37,25 @@ class DeviceInfo:
     tpdos: int
 
 
-def render_eds(info: DeviceInfo, objects: Iterable[Object]) -> str:
-    """The EDS as text with ``\\n`` line ends. Depends on nothing but its arguments."""
+@dataclass(frozen=True, slots=True)
+class Commissioning:
+    """What makes an EDS the DCF of one device."""
+
+    node_id: int
+    bitrate_kbps: int
+    node_name: str
+    eds_name: str
+    """File that it was made from."""
+
+
+def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
+    """The EDS, or the DCF of ``device``, as text with ``\\n`` line ends. Depends on nothing but its
+    arguments.
+
+    A DCF gives every object that can be written its value at start on that node.
+    """
     listed = tuple(objects)
-    lines = [*_head(info)]
+    lines = [*_head(info, device)]
     mandatory = [item for item in listed if item.index in _MANDATORY]
     manufacturer = [item for item in listed if 0x2000 <= item.index < 0x6000]
     optional = [item for item in listed if item not in mandatory and item not in manufacturer]
@@ -51,7 +67,7 @@ def render_eds(info: DeviceInfo, objects: Iterable[Object]) -> str:
         numbered = [(str(number), f"0x{item.index:04X}") for number, item in enumerate(group, 1)]
         lines += _section(title, [("SupportedObjects", str(len(group))), *numbered])
         for item in group:
-            lines += _object(item)
+            lines += _object(item, device)
     return "\n".join(lines)
 
 
@@ -59,7 +75,7 @@ def _section(title: str, options: Iterable[tuple[str, str]]) -> list[str]:
     return [f"[{title}]", *(f"{key}={value}" for key, value in options), ""]
 
 
-def _head(info: DeviceInfo) -> Iterator[str]:
+def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     yield from _section(
         "FileInfo",
         [
@@ -74,6 +90,7 @@ def _head(info: DeviceInfo) -> Iterator[str]:
             ("ModificationTime", _TIME),
             ("ModificationDate", _DATE),
             ("ModifiedBy", "skinnode"),
+            *([("LastEDS", device.eds_name)] if device is not None else []),
         ],
     )
     yield from _section(
@@ -96,6 +113,18 @@ def _head(info: DeviceInfo) -> Iterator[str]:
             ("LSS_Supported", "1"),
         ],
     )
+    if device is not None:
+        yield from _section(
+            "DeviceComissioning",  # spelt like this in CiA 306
+            [
+                ("NodeID", str(device.node_id)),
+                ("NodeName", device.node_name),
+                ("Baudrate", str(device.bitrate_kbps)),
+                ("NetNumber", "0"),
+                ("NetworkName", ""),
+                ("CANopenManager", "0"),
+            ],
+        )
     yield from _section(
         "DummyUsage", [(f"Dummy{kind:04X}", str(int(kind in od.DUMMY_BITS))) for kind in _DUMMY_TYPES]
     )
@@ -104,10 +133,10 @@ def _head(info: DeviceInfo) -> Iterator[str]:
     )
 
 
-def _object(item: Object) -> Iterator[str]:
+def _object(item: Object, device: Commissioning | None) -> Iterator[str]:
     title = f"{item.index:04X}"
     if item.type in (ObjectType.VAR, ObjectType.DOMAIN):
-        yield from _section(title, _options(item.entries[0], item.type))
+        yield from _section(title, _options(item.entries[0], item.type, device))
         return
     yield from _section(
         title,
@@ -118,10 +147,10 @@ def _object(item: Object) -> Iterator[str]:
         ],
     )
     for entry in item.entries:
-        yield from _section(f"{title}sub{entry.subindex:X}", _options(entry, ObjectType.VAR))
+        yield from _section(f"{title}sub{entry.subindex:X}", _options(entry, ObjectType.VAR, device))
 
 
-def _options(entry: Entry, kind: ObjectType) -> Iterator[tuple[str, str]]:
+def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> Iterator[tuple[str, str]]:
     yield "ParameterName", entry.name
     yield "ObjectType", f"0x{kind:X}"
     yield "DataType", f"0x{entry.data_type:04X}"
@@ -132,7 +161,18 @@ def _options(entry: Entry, kind: ObjectType) -> Iterator[tuple[str, str]]:
         yield "HighLimit", str(entry.high)
     if entry.default is not None:
         yield "DefaultValue", _default(entry)
+    if device is not None and _is_configuration(entry):
+        value = entry.value_at_start(device.node_id)
+        yield "ParameterValue", _default(replace(entry, default=value, plus_node_id=False))
     yield "PDOMapping", str(int(entry.mappable))
+
+
+def _is_configuration(entry: Entry) -> bool:
+    """Whether whoever configures a device by its DCF has to write this: not commands, and not what the patch
+    has measured."""
+    measured = entry.index == od.ERROR_FIELD or od.BASELINE <= entry.index < od.COORDINATES
+    command = entry.index in (od.STORE, od.RESTORE)
+    return entry.access not in ("ro", "const") and entry.default is not None and not (measured or command)
 
 
 def _default(entry: Entry) -> str:

@@ -22,7 +22,7 @@ from skinnode.model.layout import PatchLayout
 from skinnode.wire import indices as od
 from skinnode.wire.communication import PdoDefault, communication_objects, spare_pdo
 from skinnode.wire.dictionary import DataType, Entry, Object, array, record, var
-from skinnode.wire.eds import DeviceInfo, render_eds
+from skinnode.wire.eds import Commissioning, DeviceInfo, render_eds
 from skinnode.wire.timing import fd_length
 
 if TYPE_CHECKING:
@@ -342,9 +342,29 @@ def eds_name(profile: PatchProfile) -> str:
 
 def eds_text(profile: PatchProfile) -> str:
     """The electronic data sheet (CiA 306) of a patch; the same bytes for the same profile, always."""
+    return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
+
+
+def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
+    """The device configuration file (CiA 306) of a patch with this node-ID on a bus of this bit rate; the
+    same bytes for the same arguments, always.
+
+    Raises ConfigError for a node-ID that is not 1 to 127 or a bit rate that a patch does not have.
+    """
+    if not 1 <= node_id <= 127:
+        raise ConfigError("node_id", node_id, "1 to 127")
+    if bitrate_bps not in od.BIT_RATES_BPS:
+        raise ConfigError("bitrate_bps", bitrate_bps, f"one of {', '.join(map(str, od.BIT_RATES_BPS))}")
+    name = eds_name(profile)
+    file_name = f"{name.removesuffix('.eds')}-node{node_id}.dcf"
+    device = Commissioning(node_id, bitrate_bps // 1000, f"patch {node_id}", name)
+    return render_eds(_device_info(profile, file_name), profile.objects(), device)
+
+
+def _device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
     variant = ", PDO over CAN FD" if profile.bus == "fd" else ""
-    info = DeviceInfo(
-        file_name=eds_name(profile),
+    return DeviceInfo(
+        file_name=file_name,
         description=f"{profile.rows} x {profile.columns} wires, {profile.code_bits}-bit codes{variant}",
         vendor_name="skinnode",
         vendor_number=od.VENDOR_ID,
@@ -355,7 +375,6 @@ def eds_text(profile: PatchProfile) -> str:
         rpdos=profile.rpdos,
         tpdos=profile.tpdos,
     )
-    return render_eds(info, profile.objects())
 
 
 REFERENCE_PROFILES: Final = (

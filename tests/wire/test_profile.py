@@ -21,7 +21,14 @@ from skinnode.model.layout import PatchLayout
 from skinnode.wire import indices as od
 from skinnode.wire.codec import pack_command, pack_scan, pack_summary
 from skinnode.wire.dictionary import DataType, Entry, ObjectType
-from skinnode.wire.profile import DEFAULT_PERIOD_MS, REFERENCE_PROFILES, PatchProfile, eds_name, eds_text
+from skinnode.wire.profile import (
+    DEFAULT_PERIOD_MS,
+    REFERENCE_PROFILES,
+    PatchProfile,
+    dcf_text,
+    eds_name,
+    eds_text,
+)
 
 EDS = Path(__file__).parents[2] / "eds"
 NODE_ID = 5
@@ -307,3 +314,61 @@ def test_the_command_refuses_what_the_wire_cannot_carry() -> None:
     assert isinstance(command("--upper-wires=200", "--lower-wires=200").exception, ConfigError)
     assert isinstance(command("--code-bits=12").exception, ConfigError)
     assert command("--upper-wires=0").exit_code == 2
+
+
+def test_the_command_prints_a_dcf() -> None:
+    result = command("--dcf", "--node-id=9", "--bitrate=500000", "--fd", "--code-bits=24")
+    assert result.exit_code == 0
+    assert result.output == dcf_text(REFERENCE_PROFILES[3], 9, 500_000)
+
+
+def test_the_command_takes_the_sizes_of_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "patch.toml"
+    file.write_text('preset = "aligned"\nupper_wires = 3\nupper_electrodes = 4\nlower_electrodes = 5\n')
+    assert command("--layout", str(file)).output == eds_text(PatchProfile(3, 12, 4, 5))
+    assert command("--layout=symmetric", "--fd").output == eds_text(REFERENCE_PROFILES[2])
+    (tmp_path / "my_layouts.py").write_text(
+        "import numpy as np\nfrom skinnode import PatchLayout\n\n"
+        "def odd():\n    lower = np.zeros((5, 2, 3))\n    lower[..., 2] = -1e-3\n"
+        "    return PatchLayout(np.zeros((7, 3, 3)), lower)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    assert command("--layout=my_layouts:odd").output == eds_text(PatchProfile(7, 5, 3, 2))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--dcf"], "--node-id: got None, allowed: 1 to 127, for --dcf"),
+        (["--node-id=4"], "--node-id: got 4, allowed: nothing without --dcf"),
+        (["--bitrate=500000"], "--bitrate: got 500000, allowed: nothing without --dcf"),
+        (["--layout=aligned", "--lower-wires=4"], "--lower-wires: got 4, allowed: nothing beside --layout"),
+        (["--layout=wavy"], "--layout: got 'wavy', allowed: aligned, symmetric, staggered, FILE.toml or"),
+        (["--layout=no.toml"], "layout file: got 'no.toml', allowed: a file that can be read"),
+        (["--layout=json:dumps"], "--layout: got 'json:dumps', allowed: a function that returns a layout"),
+        (["--layout=os:getcwd"], "--layout: got 'os:getcwd', allowed: a PatchLayout, or a function"),
+        (["--layout=nowhere:x"], "--layout: got 'nowhere:x', allowed: MODULE:NAME that can be imported"),
+        (["--output=/no/such/folder/x.eds"], "--output: got '/no/such/folder/x.eds', allowed: a file in an"),
+    ],
+)
+def test_the_command_refuses_in_one_line(
+    arguments: list[str], says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    error = command(*arguments).exception
+    assert isinstance(error, ConfigError)
+    assert str(error).startswith(says)
+    assert "\n" not in str(error)
+
+
+def test_a_layout_file_is_read_strictly(tmp_path: Path) -> None:
+    file = tmp_path / "patch.toml"
+    for text, says in (
+        ("pitch = 1", "pitch: got 1, allowed: no such key (did you mean pitch_m?)"),
+        ("upper_wires = 0", "upper_wires: got 0, allowed: an integer from 1 to 254"),
+        ("upper_wires = = 3", "line 1, column 15: got 'upper_wires = = 3', allowed: TOML"),
+    ):
+        file.write_text(text)
+        error = command("--layout", str(file)).exception
+        assert str(error).startswith(f"{file}: {says}")

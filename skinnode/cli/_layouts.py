@@ -1,0 +1,48 @@
+"""``--layout``: the geometry of a patch, however the user has it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+from skinnode.errors import ConfigError
+
+if TYPE_CHECKING:
+    from skinnode.model.layout import PatchLayout
+
+OPTION = "--layout"
+HELP = "aligned, symmetric or staggered; FILE.toml with the keys of [patches.layout]; or MODULE:NAME."
+
+
+def import_from_here() -> None:
+    """Let MODULE:NAME be a file in the working directory, as ``python -m`` does."""
+    sys.path.insert(0, os.getcwd())
+
+
+def find_layout(text: str) -> PatchLayout:
+    """The layout that ``text`` names: see HELP. MODULE:NAME is a PatchLayout, or a function that returns one.
+
+    Raises ConfigError where there is none.
+    """
+    from skinnode.model.config import load_layout
+    from skinnode.model.layout import PRESETS, PatchLayout
+    from skinnode.node.find_source import load
+
+    if text in PRESETS:
+        return PatchLayout.preset(text)
+    if text.endswith(".toml"):
+        return load_layout(text)
+    if ":" not in text:
+        raise ConfigError(OPTION, text, f"{', '.join(PRESETS)}, FILE.toml or MODULE:NAME")
+    found = load(text, OPTION)
+    try:
+        layout = found if isinstance(found, PatchLayout) else found()
+    except Exception as error:
+        what = " ".join(str(error).split())
+        raise ConfigError(
+            OPTION, text, f"a function that returns a layout ({type(error).__name__}: {what})"
+        ) from error
+    if not isinstance(layout, PatchLayout):
+        raise ConfigError(OPTION, text, f"a PatchLayout, or a function that returns one, not {layout!r:.80}")
+    return layout

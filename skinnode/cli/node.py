@@ -1,0 +1,183 @@
+"""``skinnode node``: a Linux board with a converter is a patch of skin on a CAN bus."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.cli._layouts import HELP as LAYOUT_HELP
+
+if TYPE_CHECKING:
+    from skinnode.node import NodeRunner
+    from skinnode.transport import CanPort
+
+
+def node(
+    source: Annotated[
+        str,
+        typer.Option(help="What measures: MODULE:NAME, or a name that a package registered.", metavar="NAME"),
+    ],
+    node_id: Annotated[
+        int | None,
+        typer.Option(min=1, max=127, help="Node-ID; with --store LSS may give it.", metavar="N"),
+    ] = None,
+    layout: Annotated[str, typer.Option(help=LAYOUT_HELP, metavar="LAYOUT")] = "staggered",
+    interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",
+    channel: Annotated[str, typer.Option(help="Channel of the interface.", metavar="NAME")] = "can0",
+    bitrate: Annotated[
+        int, typer.Option(min=10_000, max=1_000_000, help="Bits per second.", metavar="BPS")
+    ] = 1_000_000,
+    fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD, with bit-rate switch.")] = False,
+    data_bitrate: Annotated[
+        int, typer.Option(min=10_000, max=8_000_000, help="Of CAN FD frames.", metavar="BPS")
+    ] = 5_000_000,
+    code_bits: Annotated[int, typer.Option(help="Width of a code: 16 or 24.", metavar="16|24")] = 16,
+    serial: Annotated[
+        int, typer.Option(min=0, max=0xFFFF_FFFF, help="Serial number (0x1018:4).", metavar="N")
+    ] = 0,
+    store: Annotated[
+        Path | None,
+        typer.Option(help="Keeps configuration, baseline and node-ID while it is off.", metavar="FILE"),
+    ] = None,
+    strict_timing: Annotated[
+        bool, typer.Option("--strict-timing", help="Timers to 0.2 ms instead of 2 ms; takes CPU.")
+    ] = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
+) -> None:
+    """Run one patch as a CANopen node; its resistances come from your source.
+
+    A source is a class, or a function, that takes the layout and gives an object
+    whose read(t_ns) returns (U, K) ohms. `--source simulated` needs no hardware.
+    Ctrl-C ends it. A line a second says how it does. Exit status 1 if the source
+    failed, scans were skipped or frames not sent; 2 if it could not run.
+    """
+    from skinnode.cli._files import require_writable
+    from skinnode.cli._layouts import find_layout, import_from_here
+    from skinnode.errors import ConfigError
+    from skinnode.model.config import BusConfig
+    from skinnode.node import NodeRunner, PatchNode
+    from skinnode.node.clock import EXACT, THRIFTY
+    from skinnode.node.find_source import make_source
+    from skinnode.node.lss import NOT_CONFIGURED
+    from skinnode.node.memory import FileMemory
+    from skinnode.signals import until_told
+    from skinnode.transport import CanPort
+    from skinnode.wire.profile import PatchProfile
+
+    if node_id is None and store is None:
+        raise ConfigError("--node-id", None, "1 to 127, or --store FILE and a node-ID by LSS")
+    if store is not None:
+        require_writable("--store", store)
+    import_from_here()
+    patch = find_layout(layout)
+    profile = PatchProfile.from_layout(patch, code_bits, "fd" if fd else "classic")
+    bus = BusConfig(
+        name=channel,
+        interface=interface,
+        channel=channel,
+        bitrate_bps=bitrate,
+        fd=fd,
+        data_bitrate_bps=data_bitrate,
+    )
+    measuring = make_source(source, patch, "--source")
+    with until_told() as told, CanPort(bus) as port:
+        board = PatchNode(
+            NOT_CONFIGURED if node_id is None else node_id,
+            patch,
+            measuring,
+            send=port.send,
+            profile=profile,
+            serial=serial,
+            memory=None if store is None else FileMemory(store),
+            pacing=EXACT if strict_timing else THRIFTY,
+        )
+        with NodeRunner(port, [board]) as runner:
+            where = f"{interface} {channel}{', CAN FD' if fd else ''}"
+            sizes = f"{profile.rows} × {profile.columns} wires, {code_bits}-bit codes"
+            who = f"node {node_id}" if node_id is not None else "node without a node-ID of its own"
+            _note(f"{who} ({sizes}, source {source}) on {where}; Ctrl-C ends", as_json)
+            _watch(runner, port, told, seconds, as_json)
+        faults = _faults(_progress(runner, port, 0.0))
+    for fault in faults:
+        _note(f"fault: {fault}", as_json)
+    if faults:
+        raise typer.Exit(1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """Where the node stands; all counts from its start."""
+
+    elapsed_s: float
+    node_id: int | None
+    """None while LSS has not given one."""
+    state: str
+    scans: int
+    frames: int
+    overruns: int
+    source_failures: int
+    source_error: str
+    bus_errors: int
+
+
+def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
+    from skinnode.node.lss import NOT_CONFIGURED
+
+    (board,) = runner.nodes
+    return _Progress(
+        round(elapsed_s, 3),
+        None if board.node_id == NOT_CONFIGURED else board.node_id,
+        board.nmt_state.name.lower().replace("_", "-"),
+        board.scans_sent,
+        port.sent,
+        board.overruns,
+        board.source_failures,
+        board.source_error,
+        runner.bus_errors,
+    )
+
+
+def _faults(end: _Progress) -> list[str]:
+    """What was not as it should be, one line each."""
+    counted = (
+        (end.source_failures, f"failures of the source, the last: {end.source_error}"),
+        (end.overruns, "scans skipped, for the ones before were still to be sent"),
+        (end.bus_errors, "errors of the bus; frames were not sent"),
+    )
+    return [f"{count} {what}" for count, what in counted if count]
+
+
+def _watch(
+    runner: NodeRunner, port: CanPort, told: threading.Event, seconds: float | None, as_json: bool
+) -> None:
+    """A line a second until told to end, time is up, or the thread of the node has ended."""
+    start_s = time.monotonic()
+    end_s = float("inf") if seconds is None else start_s + seconds
+    before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0
+    while not told.wait(max(0.0, min(due_s, end_s) - time.monotonic())) and not runner.failed:
+        now_s = time.monotonic()
+        now = _progress(runner, port, now_s - start_s)
+        print(json.dumps(asdict(now)) if as_json else _line(before, now), flush=True)
+        before, due_s = now, due_s + 1.0
+        if now_s >= end_s:
+            return
+
+
+def _line(before: _Progress, now: _Progress) -> str:
+    scans, frames = now.scans - before.scans, now.frames - before.frames
+    worse = "".join(f"  fault: {fault}" for fault in _faults(now))
+    who = now.node_id or "no node-ID"
+    return f"{now.elapsed_s:6.1f} s  {who}  {now.state}  {scans} scans  {frames} frames{worse}"
+
+
+def _note(text: str, as_json: bool) -> None:
+    print(json.dumps({"note": text}) if as_json else text, flush=True)

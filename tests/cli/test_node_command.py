@@ -1,0 +1,294 @@
+"""``skinnode node`` as its user meets it: a process on a bus, a source of the user's own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from skinnode.errors import ConfigError
+from skinnode.model.config import BusConfig
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import PatchLayout
+from skinnode.node.find_source import GROUP, load, make_source
+from skinnode.transport import CanPort, Frame
+
+ROOT = Path(__file__).parents[2]
+SKINNODE = str(Path(sys.executable).with_name("skinnode"))
+WAIT_S = 10.0
+
+SOURCES = '''
+import numpy as np
+
+LIST = [1, 2]
+
+class Board:
+    """Fails from the third scan on, sixteen readings of a tare and one of the start before them."""
+
+    def __init__(self, layout):
+        self.ohm = np.full(layout.shape, 12e3)
+        self.reads = 0
+
+    def read(self, t_ns):
+        self.reads += 1
+        if self.reads > 19:
+            raise OSError("the converter\\n does not answer")
+        return self.ohm
+
+def transposed(layout):
+    board = Board(layout)
+    board.ohm = board.ohm.T
+    return board
+
+def broken(layout):
+    raise RuntimeError("no board at 0x48")
+
+def dead(layout):
+    board = Board(layout)
+    board.reads = 100
+    return board
+
+def needs_more(layout, port):
+    return Board(layout)
+
+def gives_nothing(layout):
+    return None
+'''
+
+
+@pytest.fixture
+def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a module of sources, which is the working directory."""
+    (tmp_path / "my_sources.py").write_text(SOURCES)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    yield tmp_path
+    sys.modules.pop("my_sources", None)
+
+
+def arguments(group: str, *more: str, node_id: int | None) -> list[str]:
+    bus = ["--interface", "udp_multicast", "--channel", group]
+    return [SKINNODE, "node", *bus, *more, *([] if node_id is None else ["--node-id", str(node_id)])]
+
+
+@contextmanager
+def running(group: str, *more: str, node_id: int | None = 4, cwd: Path) -> Iterator[subprocess.Popen[str]]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    process = subprocess.Popen(
+        arguments(group, *more, node_id=node_id),
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=20)
+
+
+class Master:
+    """A CAN master in a few lines, on the multicast group."""
+
+    def __init__(self, port: CanPort) -> None:
+        self.port = port
+
+    def send(self, can_id: int, data: str) -> None:
+        self.port.send(can_id, bytes.fromhex(data))
+
+    def next(self, *can_ids: int) -> Frame:
+        while True:
+            frame = self.port.recv(WAIT_S)
+            assert frame is not None
+            if frame.can_id in can_ids:
+                return frame
+
+
+@pytest.fixture
+def master(multicast_group: str) -> Iterator[Master]:
+    with CanPort(BusConfig(interface="udp_multicast", channel=multicast_group, fd=True)) as port:
+        yield Master(port)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_of_the_users_own_source(
+    sources: Path, multicast_group: str, master: Master, number: signal.Signals
+) -> None:
+    options = ["--source", "my_sources:Board", "--layout", "aligned", "--serial", "77", "--json"]
+    with running(multicast_group, *options, cwd=sources) as process:
+        assert bytes(master.next(0x704).data) == b"\0"
+        master.send(0x604, "40 18 10 04 00 00 00 00")
+        assert bytes(master.next(0x584).data) == bytes.fromhex("43 18 10 04 4d 00 00 00")
+        master.send(0x000, "01 04")
+        for scan in range(2):
+            master.send(0x080, "")
+            assert bytes(master.next(0x284).data)[:4] == bytes((scan, 0, 100, 0))
+        master.send(0x080, "")  # from here on the source fails
+        assert bytes(master.next(0x084).data)[:2] == b"\x00\xff"
+        assert bytes(master.next(0x284).data)[:4] == b"\x02\x10\0\0"
+        master.send(0x604, "40 01 10 00 00 00 00 00")
+        assert bytes(master.next(0x584).data)[4] == 0x81
+        process.stdout.readline()  # what runs where
+        process.stdout.readline()  # the first second
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (1, "")  # the source failed
+    *seconds, fault = [json.loads(line) for line in out.splitlines()]
+    assert fault == {
+        "note": "fault: 1 failures of the source, the last: source.read(): OSError: "
+        "the converter does not answer"
+    }
+    for second in seconds:
+        assert (second["state"], second["source_failures"]) == ("operational", 1)
+
+
+def test_over_can_fd(sources: Path, multicast_group: str, master: Master) -> None:
+    options = ["--source", "my_sources:Board", "--fd", "--code-bits", "24", "--strict-timing"]
+    with running(multicast_group, *options, cwd=sources) as process:
+        master.next(0x704)
+        master.send(0x000, "01 04")
+        master.send(0x080, "")
+        chunks = [master.next(0x184) for _ in range(20)]
+        assert {(frame.fd, len(frame.data)) for frame in chunks} == {(True, 64)}
+        assert bytes(master.next(0x284).data)[2] == 20
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+    assert "10 × 30 wires, 24-bit codes" in out.splitlines()[0]
+    assert "CAN FD" in out.splitlines()[0]
+
+
+def test_ends_by_itself_and_says_how_it_does(sources: Path, multicast_group: str) -> None:
+    with running(multicast_group, "--source", "my_sources:Board", "--seconds", "1.2", cwd=sources) as process:
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (0, "")
+    head, *seconds = out.splitlines()
+    assert head.startswith("node 4 (10 × 30 wires, 16-bit codes, source my_sources:Board) on udp_multicast")
+    assert [line.split("  ", 1)[1].strip() for line in seconds] == [
+        "1.0 s  4  pre-operational  0 scans  1 frames",
+        "1.2 s  4  pre-operational  0 scans  0 frames",
+    ]
+
+
+def test_what_was_stored_is_there_at_the_next_start(
+    sources: Path, multicast_group: str, master: Master
+) -> None:
+    options = ["--source", "my_sources:Board", "--store", "patch.json"]
+    for start in range(2):
+        with running(multicast_group, *options, cwd=sources) as process:
+            master.next(0x704)
+            master.send(0x604, "40 20 20 02 00 00 00 00")
+            assert bytes(master.next(0x584).data)[4] == (2, 99)[start]
+            if not start:
+                for request in ("2b 20 20 02 63 00 00 00", "23 10 10 01 73 61 76 65"):
+                    master.send(0x604, request)
+                    assert bytes(master.next(0x584).data)[0] == 0x60
+            process.send_signal(signal.SIGTERM)
+            _, err = process.communicate(timeout=20)
+            assert (process.returncode, err) == (0, "")
+    assert (sources / "patch.json").is_file()
+
+
+def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:
+    """Switch state global, configure node-ID 9, store, waiting state (CiA 305); then as after a power cut."""
+    options = ["--source", "my_sources:Board", "--store", "patch.json", "--serial", "5"]
+    with running(multicast_group, *options, node_id=None, cwd=sources) as process:
+        assert "without a node-ID" in process.stdout.readline()
+        master.send(0x7E5, "04 01 00 00 00 00 00 00")
+        master.send(0x7E5, "11 09 00 00 00 00 00 00")
+        assert bytes(master.next(0x7E4).data)[:2] == b"\x11\0"
+        master.send(0x7E5, "17 00 00 00 00 00 00 00")
+        assert bytes(master.next(0x7E4).data)[:2] == b"\x17\0"
+        master.send(0x7E5, "04 00 00 00 00 00 00 00")
+        assert bytes(master.next(0x709).data) == b"\0"
+    with running(multicast_group, *options, node_id=None, cwd=sources):
+        assert bytes(master.next(0x709).data) == b"\0"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ([], "error: --node-id: got None, allowed: 1 to 127, or --store FILE and a node-ID by LSS"),
+        (["--store", "/no/such/folder/x"], "error: --store: got '/no/such/folder/x', allowed: a file in an"),
+        (["--node-id", "4", "--layout", "wavy"], "error: --layout: got 'wavy', allowed: aligned"),
+        (["--node-id", "4", "--code-bits", "12"], "error: code_bits: got 12, allowed: 16 or 24"),
+    ],
+)
+def test_options_that_cannot_be(sources: Path, options: list[str], says: str) -> None:
+    command = [SKINNODE, "node", "--source", "my_sources:Board", "--interface", "virtual", *options]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(says)
+
+
+BAD = [
+    ("my_sources:transposed", "(source.read(): got shape (30, 10), must be (10, 30))"),
+    ("my_sources:dead", "(source.read(): OSError: the converter does not answer)"),
+    ("my_sources:broken", "(RuntimeError: no board at 0x48)"),
+    ("my_sources:needs_more", "(TypeError: needs_more() missing 1 required positional argument: 'port')"),
+    ("my_sources:gives_nothing", "one that gives an object with read(t_ns), not None"),
+    ("my_sources:LIST", "a class or a function that takes the layout"),
+    ("my_sources:absent", "(AttributeError: module 'my_sources' has no attribute 'absent')"),
+    ("absent:x", "(ModuleNotFoundError: No module named 'absent')"),
+    ("nobody", "allowed: MODULE:NAME, or a registered source ("),
+]
+
+
+@pytest.mark.parametrize(("name", "says"), BAD)
+def test_a_source_that_is_none_is_one_line(sources: Path, name: str, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_source(name, PatchLayout.preset("staggered"), "--source")
+    line = str(caught.value)
+    assert line.startswith(f"--source: got {name!r}, allowed: ")
+    assert says in line
+    assert "\n" not in line
+
+
+def test_a_bad_source_ends_with_status_2_before_a_frame_is_sent(
+    sources: Path, multicast_group: str, master: Master
+) -> None:
+    with running(multicast_group, "--source", "my_sources:dead", cwd=sources) as process:
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (2, "")
+    (line,) = err.splitlines()
+    assert line.startswith("error: --source: got 'my_sources:dead', allowed: one that reads (")
+    assert master.port.recv(0.05) is None
+
+
+def test_an_installed_package_registers_a_source(sources: Path, multicast_group: str, master: Master) -> None:
+    """By the metadata of its distribution, as pip lays it down."""
+    info = sources / "skin_board-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: skin-board\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{GROUP}]\nboard7 = my_sources:Board\nbad = my_sources:nil\n")
+    source = make_source("board7", PatchLayout.preset("aligned"))
+    assert source.read(0).shape == (10, 30)
+    with pytest.raises(ConfigError, match=r"board7.*\)"):
+        make_source("board8", PatchLayout.preset("aligned"))
+    with pytest.raises(ConfigError, match=r"source bad: got 'my_sources:nil'"):
+        make_source("bad", PatchLayout.preset("aligned"))
+
+
+def test_the_simulator_is_registered_and_presses_the_patch() -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][GROUP]
+    assert declared == {"simulated": "vcan_sim.sensor:simulated"}
+    layout = PatchLayout.preset("staggered")
+    source = load(declared["simulated"], "--source")(layout)
+    now_ns = time.monotonic_ns()
+    rest, pressed = source.read(now_ns), source.read(now_ns + 2_500_000_000)  # 1.4 s of press after 0.8 s
+    ratio = pressed / rest
+    assert abs(rest / resistance_ohm(layout, layout.upper_m) - 1).max() < 1e-4
+    assert ratio.min() < 0.997

@@ -12,8 +12,9 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, eds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from skinnode.model.layout import PatchLayout
 from skinnode.node import VolatileMemory
-from skinnode.wire.profile import eds_text
+from skinnode.wire.profile import PatchProfile, eds_text
 
 REGISTER, COUNTER, TIME, CODE = 0x1001_0008, 0x2011_0108, 0x2011_0420, 0x2100_0110
 MODE, TARE = 0x2020_0108, 0x2021_0420
@@ -132,6 +133,35 @@ def test_inhibit_time_and_start_value_only_while_off(desk, subindex: int, size: 
     assert download(desk, 0x1802, 4, 1, 1) == ABORTS["no sub-index"]  # reserved
     desk.write(0x1802, 1, 0x8000_0384, 4)
     desk.write(0x1802, subindex, 1, size)
+
+
+class TestCanFd:
+    """Up to 64 bytes and 64 objects."""
+
+    @pytest.fixture
+    def fd(self, make: Callable, layout: PatchLayout):
+        return make(profile=PatchProfile.from_layout(layout, 16, "fd"))
+
+    def test_longest_tpdo(self, fd) -> None:
+        for slot in range(1, 18):
+            fd.write(0x1A02, slot, TIME, 4)
+        assert download(fd, 0x1A02, 0, 17, 1) == ABORTS["too long"]
+        assert download(fd, 0x1A02, 0, 65, 1) == ABORTS["too long"]
+        fd.write(0x1A02, 0, 16, 1)
+        fd.write(0x1802, 2, 253, 1)
+        fd.write(0x1802, 1, 0x384, 4)
+        fd.start()
+        (frame,) = fd.frame(0x384, remote=True)
+        assert frame == (0x384, " ".join(["00"] * 64))
+
+    def test_padding_of_an_rpdo_is_not_too_long(self, fd) -> None:
+        """Nine bytes travel in a frame of twelve."""
+        fd.configure_pdo(0x1402, TARE, TARE, MODE, cob_id=0x404, kind=255)
+        fd.start()
+        assert fd.frame(0x404, "00 " * 8 + "01 00 00 00") == []
+        assert fd.read(0x2020, 1) == 1
+        assert [data[:5] for _, data in fd.frame(0x404, "00 " * 16)] == ["20 82"]
+        assert [data[:5] for _, data in fd.frame(0x404, "00 " * 8)] == ["10 82"]
 
 
 def test_two_tpdos_may_not_share_an_identifier(desk) -> None:

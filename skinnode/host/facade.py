@@ -170,7 +170,10 @@ class Host:
                     stack.callback(_stand_by, links[patch.bus], monitors[patch.name])
                 _start(hand, links, monitors)
             except BusError:
-                if publisher.failure is not None:  # the nodes fell silent because the bus failed
+                for link in links.values():
+                    if link.failure is not None:  # the nodes fell silent because the bus failed
+                        raise link.failure from link.failure.__cause__
+                if publisher.failure is not None:
                     raise publisher.failure from publisher.failure.__cause__
                 raise
             senders = [link.send for link in links.values()]
@@ -248,7 +251,8 @@ def _lane(
         node_id=patch.node_id,
         on_reject=link.reject,
     )
-    lane = Lane(facts, solver, assembler, workers, publisher, ticks.find, monitors[patch.name].on_scan)
+    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, monitors[patch.name].on_scan)
+    lane.resume(solver, lane.withholdings, anew=True)
     link.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
     link.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
     link.poll_with(lane.poll)

@@ -31,6 +31,10 @@ _WAIT_S: Final = 0.02
 """How long the mainline waits for a frame before it looks at the clock for scans that lack something."""
 
 
+_REOPEN_S: Final = 0.1
+"""Pause before an interface that failed is opened again."""
+
+
 @dataclass(frozen=True, slots=True)
 class BusStats:
     """What passed on a bus since the host opened it."""
@@ -46,6 +50,8 @@ class BusStats:
     """Frames that found the receive queue full."""
     malformed: int
     """Frames of a known COB-ID with a length that it does not have."""
+    outages: int
+    """Times the interface failed and was opened again."""
     bits: int
     """Exact length of all data frames, received and sent, up to a tenth of a second ago."""
     load: float
@@ -56,7 +62,8 @@ class BusLink:
     """An open bus. Its threads run from construction to :meth:`close`.
 
     ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once, from
-    the mainline, if the bus fails or a handler does. Raises BusError where the interface does not open.
+    the mainline, if a handler fails. Raises BusError where the interface does not open. An interface that
+    fails later is opened again and again until it is back.
     """
 
     def __init__(
@@ -71,6 +78,11 @@ class BusLink:
         self._foreign = self._ignored = self._malformed = self._received = 0
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
         self._outgoing: deque[tuple[int, bytes]] = deque()
+        self._jobs: deque[Callable[[], None]] = deque()
+        self.failure: BusError | None = None
+        """Why the bus is away; None while it is there."""
+        self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
+        self._outages = self._dropped_before = 0
         self._marks: deque[tuple[int, int]] = deque([(time.monotonic_ns(), 0)], maxlen=_MARKS)
         self._load = 0.0
         self._stop = threading.Event()
@@ -105,6 +117,10 @@ class BusLink:
         """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
         self._pollers = (*self._pollers, poller)
 
+    def call(self, job: Callable[[], None]) -> None:
+        """Have ``job`` done by the mainline, before any frame that is received from now on."""
+        self._jobs.append(job)
+
     def reject(self, error: CodecError) -> None:
         """Count a frame that is not what its COB-ID promises; log the first of a COB-ID. Mainline only."""
         self._malformed += 1
@@ -120,7 +136,8 @@ class BusLink:
             sent=self._port.sent,
             foreign=self._foreign,
             ignored=self._ignored,
-            dropped=self._receiver.dropped,
+            dropped=self._dropped_before + self._receiver.dropped,
+            outages=self._outages,
             malformed=self._malformed,
             bits=self._marks[-1][1],
             load=self._load,
@@ -148,18 +165,41 @@ class BusLink:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                self._turn()
-        except BusError as error:
-            self._on_failure(error)
+                try:
+                    heard = self._turn()
+                    if self.failure is not None and (heard or time.monotonic() > self._due_s):
+                        self.failure = None
+                        _log.warning("%s: the bus is back", self.config.name)
+                except BusError as error:
+                    self._reopen(error)
         except Exception as error:  # a defect of ours: it must reach the user, not die with the thread
             _log.debug("bus %s", self.config.name, exc_info=True)
             failure = SkinError(f"bus {self.config.name!r}: {type(error).__name__}: {error}")
             failure.__cause__ = error
             self._on_failure(failure)
 
-    def _turn(self) -> None:
-        """One batch of frames to their handlers."""
+    def _reopen(self, error: BusError) -> None:
+        """Open the interface again; one that does not open, or fails at once, is tried after a pause."""
+        if self.failure is None:
+            self._outages += 1
+            self.failure = error
+            _log.warning("%s; tried again until it is back", error)
+        self._receiver.close()
+        while not self._stop.wait(_REOPEN_S):
+            try:
+                self._port.reopen()
+            except BusError:
+                continue
+            self._dropped_before += self._receiver.dropped
+            self._receiver = Receiver(self._port)
+            self._due_s = time.monotonic() + _REOPEN_S
+            return
+
+    def _turn(self) -> bool:
+        """One batch of frames to their handlers; whether there was any."""
         batch = self._receiver.get_batch(_WAIT_S)
+        while self._jobs:
+            self._jobs.popleft()()
         for frame in batch:
             if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
                 self._ignored += 1
@@ -177,6 +217,7 @@ class BusLink:
             poll(now_ns)
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
+        return bool(batch)
 
     def _mark(self, now_ns: int) -> None:
         """Work out the bits so far; the meter has one owner, so nobody else may ask it."""

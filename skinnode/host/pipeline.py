@@ -76,9 +76,12 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LaneStats:
-    """What became of a patch's scans: ``offered`` = ``solved`` + ``skipped`` + at most two in work."""
+    """What became of a patch's scans: those assembled = ``offered`` + ``withheld``, and ``offered`` =
+    ``solved`` + ``skipped`` + at most two in work."""
 
     offered: int
+    withheld: int
+    """Came while the patch was being brought up or its baseline being read: nobody could decode them."""
     solved: int
     skipped: int
     """Overtaken by a newer scan before a worker was free."""
@@ -90,23 +93,27 @@ class LaneStats:
 
 
 class Lane:
-    """One patch on its way through the host."""
+    """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
+    them."""
 
     def __init__(
         self,
-        facts: NodeFacts,
-        solver: Solver,
+        patch: str,
         assembler: ScanAssembler,
         workers: Workers,
         publisher: Publisher,
         tick: Callable[[int], Tick | None],
         on_scan: Callable[[int], None],
     ) -> None:
-        self.facts = facts
-        self._solver, self._assembler, self._workers, self._publisher = solver, assembler, workers, publisher
+        self._patch = patch
+        self._solver: Solver | None = None  # None: withhold
+        self._assembler, self._workers, self._publisher = assembler, workers, publisher
         self._tick, self._on_scan = tick, on_scan
-        self._box: deque[tuple[Scan, ScanStamp]] = deque(maxlen=1)
+        self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque(maxlen=1)
         self._token: deque[None] = deque([None])
+        self.withholdings = 0
+        """How often scans began to be withheld."""
+        self._withheld = 0
         self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
         self._newest = 0
 
@@ -130,15 +137,34 @@ class Lane:
         if scan is not None:
             self._offer(scan)
 
+    def withhold(self) -> None:
+        """Let no scan through from now on, the one under way included."""
+        self._solver = None
+        self.withholdings += 1
+
+    def resume(self, solver: Solver, withholdings: int, *, anew: bool) -> None:
+        """Let scans through from now on, decoded and solved by ``solver``; unless there was another reason to
+        withhold them since there were ``withholdings``. ``anew``: the node was started, and what was
+        assembled before belongs to another stream."""
+        if withholdings != self.withholdings:
+            return
+        self._solver = solver
+        if anew:
+            self._assembler.reset()
+
     def close(self) -> None:
         """Take no scan that is still in the box. Called when the mainline has ended."""
         self._box.clear()
 
     def _offer(self, scan: Scan) -> None:
         self._on_scan(scan.t_last_ns)
+        solver = self._solver
+        if solver is None:
+            self._withheld += 1
+            return
         tick = self._tick(scan.counter)
         stamp = ScanStamp(
-            patch=self.facts.config.name,
+            patch=self._patch,
             scan=scan.scan if tick is None else tick.number,
             counter=scan.counter,
             device_time_us=scan.device_time_us or 0,  # None: the summary was lost
@@ -146,12 +172,12 @@ class Lane:
             t_receive_ns=scan.t_last_ns,
         )
         self._offered, self._newest = self._offered + 1, stamp.scan
-        self._box.append((scan, stamp))  # a deque of one: pushes out a scan that nobody took
+        self._box.append((scan, stamp, solver))  # a deque of one: pushes out a scan that nobody took
         self._call_worker()
 
     def settled(self, scan: int) -> bool:
-        """Whether ``scan`` or a newer one has come, and nothing is left to solve."""
-        return self._newest >= scan and not self._box and bool(self._token)
+        """Whether ``scan`` or a newer one has come, or none is let through, and nothing is left to solve."""
+        return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 
     # --- worker
 
@@ -165,13 +191,13 @@ class Lane:
     def _work(self) -> None:
         self._taken += 1  # before it leaves the box, so that no reader of the counters sees it nowhere
         try:
-            scan, stamp = self._box.popleft()
+            scan, stamp, solver = self._box.popleft()
         except IndexError:  # the lane was closed
             self._taken -= 1
             return
         try:
-            frame = self._solver.decode(scan, stamp)
-            field = self._solver.solve(frame)
+            frame = solver.decode(scan, stamp)
+            field = solver.solve(frame)
             self._solved += 1
             self._untrusted += not field.trusted
             self._invalid += int(frame.valid.size - np.count_nonzero(frame.valid))
@@ -190,6 +216,7 @@ class Lane:
         offered, waiting = self._offered, len(self._box)
         return LaneStats(
             offered=offered,
+            withheld=self._withheld,
             solved=self._solved,
             skipped=max(0, offered - waiting - self._taken),
             untrusted=self._untrusted,

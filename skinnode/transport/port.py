@@ -93,6 +93,8 @@ class CanPort:
         self._closed = False
         self._counting = threading.Lock()  # sent is counted by several threads; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
+        self._dropped_before = 0  # by readers before the present one
+        self._away = False
         self._bus = self._open()
         self._reader = self._socket_reader() if config.interface == _SOCKETCAN else None
         # Frames sent to a multicast group come back, and every member has the same address and port. The one
@@ -157,7 +159,7 @@ class CanPort:
     @property
     def dropped(self) -> int:
         """Frames that the kernel had no room for; 0 on interfaces other than socketcan, which do not tell."""
-        return 0 if self._reader is None else self._reader.dropped
+        return self._dropped_before + (0 if self._reader is None else self._reader.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier: a classic one with up to 8 bytes of ``data``; with more, on
@@ -187,7 +189,7 @@ class CanPort:
         try:
             self._bus.send(message, self._send_timeout_s)
         except (can.CanError, OSError, ValueError) as error:
-            if self._closed or self.config.interface != _VIRTUAL:
+            if self._closed or self._away or self.config.interface != _VIRTUAL:
                 with self._counting:
                     self._errors += 1
                 raise BusError(f"{self._where}: 0x{can_id:03X} not sent ({_why(error)})") from error
@@ -232,6 +234,18 @@ class CanPort:
                 self._malformed += 1
             # The endpoint's own frame, or none at all: wait for what is left of the time.
             timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
+
+    def reopen(self) -> None:
+        """Close the interface and open it again, after it failed; the counters go on. What is sent meanwhile
+        raises BusError, and so does this where the interface does not open: try again later. A thread that
+        receives must have ended before."""
+        if not self._away:
+            self._away = True
+            self._dropped_before, self._reader = self.dropped, None
+            self._bus.shutdown()
+        self._bus = self._open()
+        self._reader = self._socket_reader() if self.config.interface == _SOCKETCAN else None
+        self._away = False
 
     def close(self) -> None:
         """Close the interface. Closing twice is fine; a thread that receives must have ended before."""

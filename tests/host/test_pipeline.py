@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from skinnode.errors import SkinError
-from skinnode.host.bringup import NodeFacts
 from skinnode.host.pipeline import Lane
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Workers
-from skinnode.model.config import PatchConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, SolveStats
 from skinnode.model.layout import PatchLayout
@@ -70,10 +68,10 @@ def ticks() -> Ticks:
 
 @pytest.fixture
 def lane(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[Lane]:
-    facts = NodeFacts(PatchConfig(name="thumb", node_id=11), LAYOUT, PROFILE, CodeScale(), REST_OHM, 0)
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(2, "solve") as workers:
-        lane = Lane(facts, stub, assembler, workers, publisher, ticks.find, lambda t_ns: None)
+        lane = Lane("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None)
+        lane.resume(stub, 0, anew=True)
         yield lane
         stub.go.set()
         lane.close()
@@ -163,3 +161,22 @@ def test_scans_from_many_turns_are_all_accounted_for(lane: Lane, stub: Stub, pub
     assert newest is not None
     assert newest.stamp is not None
     assert newest.stamp.counter == 499 % 240 + 1
+
+
+def test_scans_are_withheld_until_somebody_says_how_to_decode_them(
+    lane: Lane, stub: Stub, publisher: Publisher
+) -> None:
+    fields = publisher.subscribe(10, 10.0, None)
+    stub.go.set()
+    feed(lane, 1, 0)
+    lane.withhold()
+    feed(lane, 2, MS)
+    known = lane.withholdings
+    lane.withhold()
+    lane.resume(stub, known, anew=False)  # what it knows was out of date by then
+    feed(lane, 3, 2 * MS)
+    lane.resume(stub, lane.withholdings, anew=False)
+    feed(lane, 4, 3 * MS)
+    assert [field.stamp.counter for field in (fields.get(10), fields.get(10))] == [1, 4]
+    assert eventually(lambda: lane.stats().solved == 2)
+    assert (lane.stats().withheld, lane.stats().offered) == (2, 2)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
     from skinnode.model.layout import PatchLayout
     from skinnode.model.status import Status
-    from skinnode.solve.homotopy import solve_path
+    from skinnode.solve.homotopy import PathResult, solve_path
     from skinnode.solve.posterior import Posterior
     from skinnode.solve.schedule import Adaptive, Periodic, Uniform
     from skinnode.solve.system import solve_system
@@ -38,6 +38,7 @@ _HOME = {
     "Adaptive": "skinnode.solve.schedule",
     "Periodic": "skinnode.solve.schedule",
     "Uniform": "skinnode.solve.schedule",
+    "PathResult": "skinnode.solve.homotopy",
     "solve_path": "skinnode.solve.homotopy",
     "Posterior": "skinnode.solve.posterior",
     "solve_system": "skinnode.solve.system",
@@ -50,6 +51,7 @@ __all__ = [
     "FieldFrame",
     "Host",
     "PatchLayout",
+    "PathResult",
     "Periodic",
     "Posterior",
     "ResistanceFrame",

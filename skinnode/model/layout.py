@@ -85,6 +85,14 @@ class PatchLayout:
         object.__setattr__(self, "lower_m", lower)
         object.__setattr__(self, "resistivity_ohm_per_m", float(self.resistivity_ohm_per_m))
 
+    def __repr__(self) -> str:
+        """One line; the electrodes are in the arrays."""
+        (wires, electrodes), (lower, charges) = self.upper_m.shape[:2], self.lower_m.shape[:2]
+        return (
+            f"PatchLayout({self.name!r}, {wires} upper wires of {electrodes}, {lower} lower of {charges}, "
+            f"pitch {1e3 * self.pitch_m:.3g} mm)"
+        )
+
     @classmethod
     def preset(
         cls,

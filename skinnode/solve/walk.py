@@ -64,6 +64,8 @@ class Walk:
         self.error_estimate = np.full(self.wires, math.inf)
         """(U,) pitches."""
         self._inverse = np.zeros_like(self.solver.inverse)
+        self._side = np.zeros(self.wires, np.int64)  # sign of det J where the last sample was solved
+        self._path_end = problem.rest
         self._knots = np.concatenate([problem.a_rest[None], a])
         self._weight = np.ones_like(problem.a_rest)
         self._everywhere = np.full(self.wires, wires.SOLVE, np.uint8)
@@ -114,6 +116,7 @@ class Walk:
         """Solve the last sample for good, on the wires in ``todo`` (U,) or all."""
         todo = np.ones(self.wires, bool) if todo is None else todo
         self._take(todo, tolerance, most_steps, None)
+        self._path_end = self.solver.x.copy()
         self._crossed |= todo & (self.solver.report[:, wires.BRANCH] * self._branch < 0)
         self.status[(self.status == op.CONVERGED) & self._crossed] = op.ILL_CONDITIONED
 
@@ -153,7 +156,7 @@ class Walk:
             return
         solver = self.solver
         x, inverse = solver.x.copy(), self._inverse.copy()
-        kept = self.status.copy(), self.residual.copy(), self.error_estimate.copy()
+        kept = self.status.copy(), self.residual.copy(), self.error_estimate.copy(), self._side.copy()
         evaluations = np.zeros(self.wires, np.int64)
         for u in np.flatnonzero(todo).tolist():
             covariance = self.smoothness.covariance[u]
@@ -174,7 +177,8 @@ class Walk:
         was, came = kept[0] == op.CONVERGED, self.status == op.CONVERGED
         back = todo & was & ~(came & smoother)
         solver.x[back], self._inverse[back] = x[back], inverse[back]
-        for now, then in zip((self.status, self.residual, self.error_estimate), kept, strict=True):
+        after = self.status, self.residual, self.error_estimate, self._side
+        for now, then in zip(after, kept, strict=True):
             now[back] = then[back]
         self.status[back & ~came] = op.ILL_CONDITIONED
 
@@ -185,18 +189,21 @@ class Walk:
     def doubt_rough(self, tolerance: float, most_steps: int) -> None:
         """Take CONVERGED from a rough root that is not the smoothest to be found, and move no wire."""
         todo = self._rough() & (self.status == op.CONVERGED)
-        x, inverse, status = self.solver.x.copy(), self._inverse.copy(), self.status.copy()
+        x, inverse, side, status = (
+            each.copy() for each in (self.solver.x, self._inverse, self._side, self.status)
+        )
         residual, error_estimate = self.residual, self.error_estimate
         self.residual, self.error_estimate = residual.copy(), error_estimate.copy()
         self.guide(todo, tolerance, most_steps)
         apart = np.abs(self.solver.x - x).max(axis=1) > SAME * np.abs(x - self.problem.rest).max(axis=1)
         status[todo & (apart | (self.status != op.CONVERGED))] = op.ILL_CONDITIONED
-        self.solver.x[:], self._inverse[:], self.status[:] = x, inverse, status
+        self.solver.x[:], self._inverse[:], self._side[:], self.status[:] = x, inverse, side, status
         self.residual, self.error_estimate = residual, error_estimate
 
     def consult(self, x: Float, std: Float, tolerance: float, most_steps: int) -> None:
         """Hold every root against an estimate of the whole patch, ``x`` and ``std`` (U, n), pitches. Where
-        they disagree, and where there is no root, one is looked for from the estimate on."""
+        they disagree, and where there is no root, one is looked for from the estimate on. It may lie across a
+        fold, which the skin itself can pass, where the samples led to the same root."""
         solver, reach = self.solver, AGREE * std
         self._estimate = x, reach
         agreed = (np.abs(solver.x - x) <= reach).all(axis=1)
@@ -208,7 +215,7 @@ class Walk:
             self.status[todo & converged] = op.ILL_CONDITIONED
             return
         solver.x[todo] = x[todo]
-        self._take(todo, tolerance, most_steps, op.LEVENBERG_MARQUARDT)
+        self._take(todo, tolerance, most_steps, op.LEVENBERG_MARQUARDT, self._at_path_end)
         agreed = (np.abs(solver.x - x) <= reach).all(axis=1)
         found = (self.status == op.CONVERGED) & agreed
         self.status[todo & (self.status == op.CONVERGED) & ~found] = op.ILL_CONDITIONED
@@ -231,10 +238,11 @@ class Walk:
         """
         solver, rest = self.solver, self.problem.rest
         found = solver.x.copy()
+        twins = np.where((self.status == op.CONVERGED)[:, None], self._twins(), found)
         root = found.copy()
         size, least = np.abs(root - rest).max(axis=1), energy(root - rest)
         close, better = np.zeros(self.wires, bool), np.zeros(self.wires, bool)
-        for start in starts:
+        for start in (twins, *starts):
             todo = self.status == op.CONVERGED
             call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
             solver.x[:] = start
@@ -267,24 +275,28 @@ class Walk:
         if self.problem.layout.shape[1] != self.problem.layout.unknowns:
             return  # more equations than unknowns: a fold leaves no second root
         solver = self.solver
-        root, a = solver.x.copy(), self._knots[-1]
-        todo = np.zeros(self.wires, bool)
-        for u in np.flatnonzero(self.status == op.CONVERGED).tolist():
-            twin = near_twin(self.problem, root[u], a[u], self._inverse[u])
-            size = np.abs(root[u] - self.problem.rest[u]).max()
-            if np.abs(twin - root[u]).max() < TWIN_REACH * size:
-                solver.x[u], todo[u] = twin, True
+        root, twins = solver.x.copy(), self._twins()
+        size = np.abs(root - self.problem.rest).max(axis=1)
+        todo = np.abs(twins - root).max(axis=1) < TWIN_REACH * size
+        solver.x[todo] = twins[todo]
         if todo.any():
             call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
             self._call(call, self.samples - 1.0, 0, TWIN_TOLERANCE, TWIN_STEPS, op.LEVENBERG_MARQUARDT)
-            other = solver.report[:, wires.BRANCH] * self._rest_branch < 0
+            other = solver.report[:, wires.BRANCH] * self._side < 0
             other &= todo & ~self.problem.out_of_reach(solver.x)
             if self._estimate is not None:  # and the patch speaks for it
                 x, reach = self._estimate
                 other &= (np.abs(solver.x - x) <= reach).all(axis=1)
-            twins = self.smoothness.roughness(solver.x) < TWIN_ROUGHNESS * self.smoothness.roughness(root)
-            self.status[other & twins] = op.ILL_CONDITIONED
+            smooth = self.smoothness.roughness(solver.x) < TWIN_ROUGHNESS * self.smoothness.roughness(root)
+            self.status[other & smooth] = op.ILL_CONDITIONED
         solver.x[:] = root
+
+    def _twins(self) -> Float:
+        """(U, n) estimates of the roots across the nearest folds, NaN of wires that are not CONVERGED."""
+        twins = np.full_like(self.solver.x, math.nan)
+        for u in np.flatnonzero(self.status == op.CONVERGED).tolist():
+            twins[u] = near_twin(self.problem, self.solver.x[u], self._knots[-1, u], self._inverse[u])
+        return twins
 
     # -- the log ---------------------------------------------------------------------------------------
 
@@ -302,13 +314,23 @@ class Walk:
 
     # -- inside ----------------------------------------------------------------------------------------
 
-    def _take(self, todo: Mask, tolerance: float, most_steps: int, operator: int | None) -> None:
-        """Solve the last sample for the wires in ``todo`` and keep what came of it."""
+    def _take(
+        self,
+        todo: Mask,
+        tolerance: float,
+        most_steps: int,
+        operator: int | None,
+        also: Callable[[], Mask] | None = None,
+    ) -> None:
+        """Solve the last sample for the wires in ``todo`` and keep what came of it; a root across a fold is
+        not CONVERGED, unless ``also`` says so, (U,)."""
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self._call(call, self.samples - 1.0, wires.COVARIANCE, tolerance, most_steps, operator)
         solver = self.solver
         self.status[todo] = solver.report[todo, wires.STATUS]
-        self.status[todo & (self.status == op.CONVERGED) & ~self._on_branch()] = op.ILL_CONDITIONED
+        good = self._on_branch() if also is None else self._on_branch() | also()
+        self.status[todo & (self.status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
+        self._side[todo] = solver.report[todo, wires.BRANCH]
         self.residual[todo] = solver.measure[todo, wires.RESIDUAL]
         self.error_estimate[todo] = solver.measure[todo, wires.ERROR_ESTIMATE]
         self._inverse[todo] = solver.inverse[todo]
@@ -349,6 +371,12 @@ class Walk:
                 np.where(asked, optimality, math.nan),
             )
         )
+
+    def _at_path_end(self) -> Mask:
+        """(U,) wires at the position in reach to which the samples led."""
+        apart = np.abs(self.solver.x - self._path_end).max(axis=1)
+        size = np.abs(self._path_end - self.problem.rest).max(axis=1)
+        return np.asarray((apart <= SAME * size) & ~self.problem.out_of_reach(self.solver.x))
 
     def _rough(self) -> Mask:
         """(U,) wires whose displacement is too rough for a press."""

@@ -23,7 +23,7 @@ def press_samples(layout: sk.PatchLayout, depth: float, samples: int) -> np.ndar
     )
 
 
-def wire_errors(path: sk.solve.homotopy.PathResult, truth: np.ndarray) -> np.ndarray:
+def wire_errors(path: sk.PathResult, truth: np.ndarray) -> np.ndarray:
     wires = len(truth)
     error = (path.displacement_m - truth).reshape(wires, -1)
     return np.linalg.norm(error, axis=1) / np.linalg.norm(truth.reshape(wires, -1), axis=1)
@@ -121,6 +121,24 @@ def test_a_layout_that_cannot_be_inverted_is_never_called_converged():
         for operator in OPERATORS:
             path = sk.solve_path(layout, [frame_ohm(layout, moved * t) for t in (0.5, 1)], operator=operator)
             assert path.status != (sk.Status.CONVERGED,), operator
+
+
+def test_a_fold_that_the_skin_itself_passes_is_followed():
+    """On thick layers a deep press turns the sign of det J of some wires; ten samples lead across."""
+    layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=4e-3)
+
+    def sides(displacement: np.ndarray) -> np.ndarray:
+        slopes = sk.jacobian(layout, layout.upper_m + displacement).reshape(10, 30, 30)
+        return np.linalg.slogdet(slopes)[0]
+
+    passed = 0
+    for centre in ((18.3e-3, 17.1e-3), (12e-3, 20e-3), (22e-3, 9e-3)):
+        press = [hertz_press(layout, 0.07 * k, centre_m=centre) for k in range(1, 11)]
+        path = sk.solve_path(layout, [frame_ohm(layout, moved) for moved in press])
+        converged = np.array([status is sk.Status.CONVERGED for status in path.status])
+        assert (wire_errors(path, press[-1])[converged] < 1e-6).all()
+        passed += np.count_nonzero(converged & (sides(press[-1]) != sides(np.zeros_like(press[-1]))))
+    assert passed >= 3
 
 
 @pytest.mark.parametrize("operator", OPERATORS)

@@ -79,9 +79,8 @@ def as_html(report: Report, title: str, when: datetime.datetime) -> str:
     ]
     for area, results in areas.items():
         name = AREA_NAMES.get(area, area)
-        body.append(
-            f'<h2 id="{escape(area)}">{escape(name)} <span>{escape(area)}, {len(results)} cases</span></h2>'
-        )
+        count = f"{len(results)} case{'s' if len(results) > 1 else ''}"
+        body.append(f'<h2 id="{escape(area)}">{escape(name)} <span>{escape(area)}, {count}</span></h2>')
         body += map(_case, results)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'

@@ -98,7 +98,7 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
         problems += _put_back(dut, before)
     if silent < SILENT_CASES:
         _reset(dut)
-    return Report(tuple(results), tuple(problems), dut.eds.source)
+    return Report(tuple(results), tuple(dict.fromkeys(problems)), dut.eds.source)
 
 
 def run_case(dut: Dut, case: Case) -> Result:

@@ -204,10 +204,10 @@ def _summary_record() -> Object:
         od.SUMMARY,
         "Scan summary",
         (
-            Entry(od.SUMMARY, od.SUMMARY_SCAN, "Summary scan counter", _U8, "ro", 0, mappable=True),
-            Entry(od.SUMMARY, od.SUMMARY_FLAGS, "Flags", _U8, "ro", 0, mappable=True),
-            Entry(od.SUMMARY, od.SUMMARY_CHUNKS, "Chunks sent", _U16, "ro", 0, mappable=True),
-            Entry(od.SUMMARY, od.SUMMARY_TIME, "Device time us", _U32, "ro", 0, mappable=True),
+            Entry(od.SUMMARY, od.SUMMARY_SCAN, "Summary scan counter", _U8, "ro", mappable=True),
+            Entry(od.SUMMARY, od.SUMMARY_FLAGS, "Flags", _U8, "ro", mappable=True),
+            Entry(od.SUMMARY, od.SUMMARY_CHUNKS, "Chunks sent", _U16, "ro", mappable=True),
+            Entry(od.SUMMARY, od.SUMMARY_TIME, "Device time us", _U32, "ro", mappable=True),
         ),
     )
 
@@ -250,10 +250,10 @@ def _time_record() -> Object:
         od.TIME_OF_DAY,
         "Time of day",
         (
-            Entry(od.TIME_OF_DAY, od.TIME_DAYS, "Days since 1984-01-01", _U16, "ro", 0, mappable=True),
-            Entry(od.TIME_OF_DAY, od.TIME_MS, "Milliseconds after midnight", _U32, "ro", 0, mappable=True),
-            Entry(od.TIME_OF_DAY, od.TIME_MESSAGES, "TIME messages", _U32, "ro", 0),
-            Entry(od.TIME_OF_DAY, od.TIME_DEVICE_US, "Device time us of the last TIME", _U32, "ro", 0),
+            Entry(od.TIME_OF_DAY, od.TIME_DAYS, "Days since 1984-01-01", _U16, "ro", mappable=True),
+            Entry(od.TIME_OF_DAY, od.TIME_MS, "Milliseconds after midnight", _U32, "ro", mappable=True),
+            Entry(od.TIME_OF_DAY, od.TIME_MESSAGES, "TIME messages", _U32, "ro"),
+            Entry(od.TIME_OF_DAY, od.TIME_DEVICE_US, "Device time us of the last TIME", _U32, "ro"),
         ),
     )
 
@@ -275,13 +275,13 @@ def _self_test_record() -> Object:
     return record(
         od.SELF_TEST_RESULT,
         "Self-test result",
-        [Entry(od.SELF_TEST_RESULT, sub, name, data_type, "ro", 0) for sub, name, data_type in fields],
+        [Entry(od.SELF_TEST_RESULT, sub, name, data_type, "ro") for sub, name, data_type in fields],
     )
 
 
 def _wire_faults(index: int, name: str, wires: int) -> Object:
     labels = [f"{kind} from wire {first}" for first in range(0, wires, 32) for kind in ("Open", "Shorted")]
-    return array(index, name, labels, _U32, "ro", 0, mappable=True)
+    return array(index, name, labels, _U32, "ro", mappable=True)
 
 
 def _descriptor_record(profile: PatchProfile) -> Object:
@@ -320,13 +320,13 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
         _self_test_record(),
         _wire_faults(od.UPPER_WIRE_FAULTS, "Faults of upper wires", profile.rows),
         _wire_faults(od.LOWER_WIRE_FAULTS, "Faults of lower wires", profile.columns),
-        array(od.REJECTED_FRAMES, "Rejected frames", _REJECTED, _U32, "ro", 0),
+        array(od.REJECTED_FRAMES, "Rejected frames", _REJECTED, _U32, "ro"),
         *(
             array(od.CODES + r, f"Codes of upper wire {r}", columns, profile.code_type, "ro", mappable=True)
             for r in range(profile.rows)
         ),
         *(
-            array(od.BASELINE + r, f"Baseline of upper wire {r}", columns, _REAL32, "rw", 0)
+            array(od.BASELINE + r, f"Baseline of upper wire {r}", columns, _REAL32, "rw")
             for r in range(profile.rows)
         ),
         var(od.COORDINATES, "Electrode coordinates", DataType.DOMAIN, "ro"),

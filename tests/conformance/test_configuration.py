@@ -1,0 +1,56 @@
+"""What the cases store and restore is put back: the configuration that a node was found with."""
+
+from __future__ import annotations
+
+import struct
+
+from skinnode.conformance import Dut, Verdict, run_cases, select
+
+FOUND = {
+    (0x1005, 0): struct.pack("<I", 0x90),
+    (0x1006, 0): struct.pack("<I", 5_000_000),
+    (0x1014, 0): struct.pack("<I", 0x85),
+    (0x1015, 0): struct.pack("<H", 7),
+    (0x1016, 2): struct.pack("<I", 0x33 << 16 | 500),
+    (0x1019, 0): b"\x0a",
+    (0x1800, 1): struct.pack("<I", 0x1A4),
+    (0x1800, 3): struct.pack("<H", 20),
+    (0x1A01, 0): b"\x02",
+    (0x1A01, 1): struct.pack("<I", 0x20110408 + 0x18),
+    (0x1A01, 2): struct.pack("<I", 0x20110108),
+    (0x2020, 2): struct.pack("<H", 9),
+}
+"""A configuration that is not the default one."""
+
+
+def configure(dut: Dut) -> None:
+    write, off = dut.sdo.write, (1 << 31).to_bytes(4, "little")
+    write(0x1019, 0, FOUND[0x1019, 0])
+    write(0x1014, 0, off)
+    write(0x1801, 1, struct.pack("<I", 1 << 31 | 0x284))
+    write(0x1A01, 0, b"\0")
+    for key in ((0x1A01, 1), (0x1A01, 2), (0x1A01, 0)):
+        write(*key, FOUND[key])
+    write(0x1801, 1, struct.pack("<I", 0x284))
+    write(0x1800, 1, struct.pack("<I", 1 << 31 | 0x1A4))
+    for key in FOUND.keys() - {(0x1019, 0)}:
+        if key[0] != 0x1A01 and key != (0x1800, 1):
+            write(*key, FOUND[key])
+    write(0x1800, 1, FOUND[0x1800, 1])
+    write(0x1010, 1, b"save")
+    dut.prepare()
+
+
+def test_a_stored_configuration_is_found_again(dut: Dut) -> None:
+    configure(dut)
+    try:
+        before = {key: dut.sdo.read(*key) for key in FOUND}
+        assert before == FOUND
+        report = run_cases(dut, select(("OTHER-02", "OTHER-04", "OTHER-08", "SYNC-10")))
+        assert [result.verdict for result in report.results] == [Verdict.PASSED] * 4
+        assert report.problems == ()
+        dut.prepare()
+        assert {key: dut.sdo.read(*key) for key in FOUND} == FOUND
+    finally:
+        dut.sdo.write(0x1011, 1, b"load")
+        dut.prepare()

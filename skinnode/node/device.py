@@ -216,6 +216,12 @@ class CanopenDevice:
         )
         return None if deadline_ns == NO_DEADLINE_NS else deadline_ns
 
+    @property
+    def silent_from_ns(self) -> int:
+        """From when on :meth:`on_timer` calls a master or a monitored node silent. Whoever drives this hands
+        over what came before that first."""
+        return self._error_control.silent_from_ns
+
     def on_timer(self, t_ns: int) -> None:
         """Do what is due at ``t_ns``; too early or too often does no harm."""
         if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:

@@ -48,7 +48,12 @@ class ErrorControl:
     @property
     def deadline_ns(self) -> int:
         """When :meth:`on_timer` has something to do."""
-        return min(self._producer.deadline_ns, self._guarding.deadline_ns, self._consumer.deadline_ns)
+        return min(self._producer.deadline_ns, self.silent_from_ns)
+
+    @property
+    def silent_from_ns(self) -> int:
+        """When somebody who is listened for is called silent."""
+        return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:
         """What is listened to: data frames by COB-ID."""

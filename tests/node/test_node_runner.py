@@ -345,6 +345,49 @@ def test_bus_that_goes_away_and_comes_back(virtual: BusConfig, layout: PatchLayo
             eventually(lambda: (0x704, "05") in heard())
 
 
+def test_heartbeats_that_came_while_the_thread_was_kept_busy_were_not_missed(
+    virtual: BusConfig, layout: PatchLayout
+) -> None:
+    class Slow(Steady):
+        def __init__(self, layout: PatchLayout) -> None:
+            super().__init__(layout)
+            self.reading, self.go_on = threading.Event(), threading.Event()
+            self.go_on.set()
+
+        def read(self, t_ns: int) -> Float:
+            self.reading.set()
+            assert self.go_on.wait(WAIT_S)
+            return super().read(t_ns)
+
+    with CanPort(virtual) as port, CanPort(virtual) as manager:
+        source = Slow(layout)
+        node = PatchNode(4, layout, source, send=port.send)
+        heard: list[tuple[int, str]] = []
+
+        def listen() -> list[tuple[int, str]]:
+            while (frame := manager.recv(0.0)) is not None:
+                heard.append((frame.can_id, frame.data.hex(" ")))
+            return heard
+
+        with NodeRunner(port, [node]):
+            eventually(lambda: (0x704, "00") in listen())
+            manager.send(0x604, bytes.fromhex("2316100190017f00"))  # node 127 within 400 ms
+            manager.send(0x000, bytes((1, 0)))
+            source.reading.clear()
+            source.go_on.clear()
+            manager.send(0x77F, b"\x05")
+            manager.send(0x080, b"")
+            assert source.reading.wait(WAIT_S)
+            for _ in range(12):
+                time.sleep(0.05)
+                manager.send(0x77F, b"\x05")
+            source.go_on.set()
+            manager.send(0x604, bytes.fromhex("4000100000000000"))
+            eventually(lambda: (0x584, "43 00 10 00 00 00 00 00") in listen())
+            assert [data for can_id, data in listen() if can_id == 0x084] == []
+            eventually(lambda: (0x084, "30 81 11 7f 00 00 00 00") in listen())  # it did listen
+
+
 def test_frames_that_are_not_classic_data_are_no_frames_to_a_node(
     virtual: BusConfig, layout: PatchLayout
 ) -> None:

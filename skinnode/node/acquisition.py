@@ -90,8 +90,9 @@ class Acquisition:
         self.forget_sent()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0."""
+        """Set one R0. Whoever does so sees to the others: the node will not tare by itself."""
         self.baseline_ohm[row, column] = value_ohm
+        self.tared = True
         self.forget_sent()
 
     def set_baselines(self, values_ohm: NDArray[np.float32]) -> None:

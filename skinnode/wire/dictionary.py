@@ -60,7 +60,7 @@ class Entry:
     access: str
     """ro, rw, wo, const, or rww: read and written, and mappable into an RPDO."""
     default: Value | None = None
-    """None where only the device knows (a serial number)."""
+    """None where only the device knows: a serial number, a measurement. Zero at start."""
     plus_node_id: bool = False
     """The value at start-up is ``default`` plus the node-ID: COB-IDs."""
     mappable: bool = False

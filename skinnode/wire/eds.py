@@ -168,11 +168,9 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Whether whoever configures a device by its DCF has to write this: not commands, and not what the patch
-    has measured."""
-    measured = entry.index == od.ERROR_FIELD or od.BASELINE <= entry.index < od.COORDINATES
-    command = entry.index in (od.STORE, od.RESTORE)
-    return entry.access not in ("ro", "const") and entry.default is not None and not (measured or command)
+    """Whether whoever configures a device by its DCF has to write this: not commands and histories."""
+    refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
+    return entry.access not in ("ro", "const") and entry.default is not None and not refused
 
 
 def _default(entry: Entry) -> str:

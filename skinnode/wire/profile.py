@@ -7,6 +7,8 @@ PDO over CAN FD: a chunk is a part of one upper wire: u8 wire, u8 scan counter, 
 codes of 16 bits (or 20 of 24). All chunks of a patch are of one length, that of the mapping padded to the
 next one CAN FD has; a patch of more columns sends each wire in several, as even as they can be.
 
+What a patch measures, counts or sends has no default: it is no setting.
+
 ``python -m skinnode.wire.profile eds/`` writes the reference EDS files again.
 """
 

@@ -118,6 +118,17 @@ def test_tare_is_made_up_for_if_the_source_was_not_there_at_power_on(make: Calla
     assert abs(first - round(0.75 * 65532)) <= 1
 
 
+def test_a_baseline_written_meanwhile_is_not_tared_over(make: Callable, rest_ohm) -> None:
+    desk = make(ohm=np.ones(3))
+    (pattern,) = struct.unpack("<I", struct.pack("<f", 2 * rest_ohm[0, 0]))
+    desk.write(0x2200, 1, pattern, 4)
+    desk.source.ohm = rest_ohm
+    desk.start()
+    desk.frame(0x80)
+    assert desk.read(0x2200, 1) == pattern
+    assert desk.read(0x2200, 2) == 0
+
+
 class TestSelfTest:
     """0x2021:3 runs it, 0x2023 says what it found."""
 

@@ -164,7 +164,7 @@ def test_longer_frames_on_a_bus_of_can_fd(config: BusConfig, fd_port) -> None:
 
 
 def test_python_can_sees_an_fd_frame_with_bit_rate_switch(config: BusConfig, fd_port) -> None:
-    options = {"fd": True} if config.interface == "udp_multicast" else {}
+    options = {} if config.interface == "virtual" else {"fd": True}
     with can.Bus(interface=config.interface, channel=config.channel, **options) as other:
         port = fd_port()
         port.send(0x185, bytes(64))

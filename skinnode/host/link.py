@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
@@ -14,7 +14,7 @@ from typing import Final, Self
 from skinnode.errors import BusError, CodecError, SkinError
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.model.config import BusConfig
-from skinnode.transport import CanPort, Receiver
+from skinnode.transport import CanPort, Frame, Receiver
 from skinnode.wire.indices import sdo_response_cob_id
 from skinnode.wire.timing import BusLoad
 
@@ -74,6 +74,7 @@ class BusLink:
         self._on_failure = on_failure
         self._handlers = dict(handlers)
         self._pollers: tuple[Callable[[int], None], ...] = ()
+        self._listeners: tuple[Callable[[Sequence[Frame]], None], ...] = ()
         self._complained: set[int] = set()
         self._foreign = self._ignored = self._malformed = self._received = 0
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
@@ -112,6 +113,15 @@ class BusLink:
 
         self.handle(sdo_response_cob_id(node_id), on_response)
         return RemoteOd(self.network, node_id)
+
+    def ask_remote(self, can_id: int) -> None:
+        """Send a remote frame, as guarding does, from any thread. Raises BusError."""
+        self._port.send(can_id, b"", remote=True)
+
+    def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
+        """From now on ``listener`` gets every batch of frames whole, of all kinds, before any handler does,
+        on the mainline."""
+        self._listeners = (*self._listeners, listener)
 
     def poll_with(self, poller: Callable[[int], None]) -> None:
         """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
@@ -200,6 +210,9 @@ class BusLink:
         batch = self._receiver.get_batch(_WAIT_S)
         while self._jobs:
             self._jobs.popleft()()
+        if batch:
+            for listener in self._listeners:
+                listener(batch)
         for frame in batch:
             if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
                 self._ignored += 1

@@ -82,7 +82,10 @@ class RemoteOd:
 
     def write(self, index: int, subindex: int, kind: str, value: float) -> None:
         """Write and believe it."""
-        data = struct.pack(_PLAIN[kind], value)
+        self.write_bytes(index, subindex, struct.pack(_PLAIN[kind], value))
+
+    def write_bytes(self, index: int, subindex: int, data: bytes) -> None:
+        """Write the value as it is to travel."""
         self._transfer(index, subindex, "write", lambda: self._client.download(index, subindex, data))
 
     def configure(self, index: int, subindex: int, kind: str, value: float) -> None:

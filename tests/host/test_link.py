@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Sequence
 
 import pytest
 
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host.link import BusLink
 from skinnode.model.config import HandConfig
-from skinnode.transport import CanPort
+from skinnode.transport import CanPort, Frame
 from skinnode.wire.timing import exact_bits
 
 from .conftest import eventually
@@ -110,3 +111,21 @@ def test_short_sdo_answer_is_rejected_and_the_next_one_counts(hand: HandConfig, 
         assert str(link.first_malformed) == (
             "COB-ID 0x585: got 3 bytes (4b 17 10), allowed: 8 bytes (SDO response)"
         )
+
+
+def test_listener_gets_frames_of_all_kinds(hand: HandConfig, listener: CanPort) -> None:
+    got: queue.SimpleQueue[tuple[int, bytes, bool]] = queue.SimpleQueue()
+
+    def note(frames: Sequence[Frame]) -> None:
+        for frame in frames:
+            got.put((frame.can_id, frame.data, frame.remote))
+
+    with BusLink(hand.buses[0], {}, fail) as link:
+        link.listen(note)
+        listener.send(0x705, remote=True, data=b"")
+        listener.send(0x3F0, b"x")
+        assert [got.get(timeout=10) for _ in range(2)] == [(0x705, b"", True), (0x3F0, b"x", False)]
+        link.ask_remote(0x706)
+        frame = listener.recv(10)
+    assert frame is not None
+    assert (frame.can_id, frame.remote) == (0x706, True)

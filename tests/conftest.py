@@ -6,7 +6,10 @@ import os
 import random
 import socket
 import uuid
+from collections.abc import Callable
+from typing import Any
 
+import can
 import pytest
 
 from skinnode.model.config import BusConfig
@@ -72,3 +75,22 @@ def any_bus(request: pytest.FixtureRequest, multicast_group: str) -> BusConfig:
 def crossing_bus(request: pytest.FixtureRequest, multicast_group: str) -> BusConfig:
     """Each interface that crosses processes."""
     return bus_on(request.param, multicast_group)
+
+
+@pytest.fixture
+def plain_bus() -> Callable[..., can.BusABC]:
+    """Opens python-can's own bus, apart from our transport."""
+    return _plain_bus
+
+
+def _plain_bus(config: BusConfig, **options: Any) -> can.BusABC:
+    """python-can's own bus at another end of ``config``. On multicast it is told to hear its own group only:
+    python-can binds to any address, and would hear every group that anyone on the machine has joined."""
+    bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
+    if config.interface == "udp_multicast":
+        tuned = socket.socket(fileno=os.dup(bus.fileno()))
+        tuned.setsockopt(socket.IPPROTO_IP, 49, 0)  # IP_MULTICAST_ALL
+        tuned.close()
+        while bus.recv(0.0) is not None:  # of other groups, before it was told
+            pass
+    return bus

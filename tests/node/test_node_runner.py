@@ -75,9 +75,9 @@ def collect(bus: can.BusABC, done: Callable[[list[can.Message]], bool]) -> list[
     return messages
 
 
-def test_python_can_only(config: BusConfig, layout: PatchLayout) -> None:
+def test_python_can_only(config: BusConfig, layout: PatchLayout, plain_bus) -> None:
     """Boot-up, SDO, start, SYNC, chunks, summary, heartbeat: two nodes, raw frames."""
-    with can.Bus(interface=config.interface, channel=config.channel) as manager, CanPort(config) as port:
+    with plain_bus(config) as manager, CanPort(config) as port:
         nodes = nodes_on(port, layout, 4, 5)
         with NodeRunner(port, nodes) as runner:
 

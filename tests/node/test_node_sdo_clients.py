@@ -169,8 +169,8 @@ class Client:
 
 
 @pytest.fixture
-def client(any_bus: BusConfig) -> Iterator[Client]:
-    with can.Bus(interface=any_bus.interface, channel=any_bus.channel) as bus, node_on(any_bus):
+def client(any_bus: BusConfig, plain_bus) -> Iterator[Client]:
+    with plain_bus(any_bus) as bus, node_on(any_bus):
         yield Client(bus)
 
 

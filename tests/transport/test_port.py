@@ -80,9 +80,9 @@ def test_every_endpoint_hears_every_other(open_port) -> None:
     assert [receive(port).can_id for port in ports[1:]] == [5, 5]
 
 
-def test_plain_python_can_at_the_other_end(config: BusConfig, open_port) -> None:
+def test_plain_python_can_at_the_other_end(config: BusConfig, open_port, plain_bus) -> None:
     ours = open_port()
-    with can.Bus(interface=config.interface, channel=config.channel) as theirs:
+    with plain_bus(config) as theirs:
         theirs.send(can.Message(arbitration_id=0x1ABCDEF, is_extended_id=True, data=b"x"))
         frame = receive(ours)
         assert (frame.can_id, frame.extended) == (0x1ABCDEF, True)
@@ -163,9 +163,9 @@ def test_longer_frames_on_a_bus_of_can_fd(config: BusConfig, fd_port) -> None:
         ours.send(0x185, bytes(65))
 
 
-def test_python_can_sees_an_fd_frame_with_bit_rate_switch(config: BusConfig, fd_port) -> None:
+def test_python_can_sees_an_fd_frame_with_bit_rate_switch(config: BusConfig, fd_port, plain_bus) -> None:
     options = {} if config.interface == "virtual" else {"fd": True}
-    with can.Bus(interface=config.interface, channel=config.channel, **options) as other:
+    with plain_bus(config, **options) as other:
         port = fd_port()
         port.send(0x185, bytes(64))
         message = other.recv(WAIT_S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -208,6 +209,14 @@ def test_code_width_differs(make_hand: Callable[..., HandConfig]) -> None:
     wide = PatchProfile.from_layout(LAYOUT, 24)
     assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, profile=wide))) == (
         "node 5: patch 'p0' on can0: code bits: got 24, allowed: 16 as in the hand file"
+    )
+
+
+def test_frames_of_the_bus_differ(make_hand: Callable[..., HandConfig]) -> None:
+    """The hand file says CAN FD, the node sends its PDOs in classic frames."""
+    hand = make_hand(patches=1, buses=[{"name": "can0", "channel": uuid.uuid4().hex, "fd": True}])
+    assert str(failure_of(hand, lambda port: node(port, 5))) == (
+        "node 5: patch 'p0' on can0: bytes of a PDO: got 8, allowed: 64 as in the hand file"
     )
 
 

@@ -623,3 +623,12 @@ class TestCanFd:
         fd.write(0x1A01, 0, 0, 1)
         fd.write(0x1A01, 64, 0x20110310, 4)  # one more byte
         assert fd.sdo("2f 01 1a 00 40 00 00 00").endswith("42 00 04 06")
+
+    def test_frames_of_every_length_do_no_harm(self, fd) -> None:
+        lengths = (0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+        for length in lengths:
+            for can_id in range(0x800):
+                fd.node.on_frame(can_id, bytes(length), fd.t_ns)
+        fd.run(1000)
+        fd.frame(0, "01 00")
+        assert [can_id for can_id, _ in scan(fd, "")][-3:] == [CHUNK, CHUNK, SUMMARY]

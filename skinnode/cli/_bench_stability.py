@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import itertools
+import multiprocessing
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Final
 
 import numpy as np
@@ -24,13 +29,24 @@ def run(
     *,
     cases: Sequence[Case] | None = None,
     only: Sequence[str] | None = None,
+    jobs: int = 1,
     report: Callable[[dict[str, Any]], object] = lambda row: None,
 ) -> dict[str, Any]:
-    """The figures; ``report`` gets each row when it is ready. ``only``: the methods to run."""
-    rows = []
-    for case in all_cases() if cases is None else cases:
-        chosen = [name for name in case.methods if only is None or name in only]
-        for row in _rows(case, chosen, seeds):
+    """The figures; ``report`` gets each row when it is ready. ``only``: the methods to run.
+
+    Where no ``cases`` are given all of them are shared out to so many processes, ``jobs``; the streams of a
+    case, and so its rows, do not depend on that.
+    """
+    rows: list[dict[str, Any]] = []
+    with contextlib.ExitStack() as stack:
+        found: Iterable[list[dict[str, Any]]]
+        if cases is None and jobs > 1:
+            spawn = multiprocessing.get_context("spawn")
+            pool = stack.enter_context(ProcessPoolExecutor(jobs, spawn))
+            found = pool.map(functools.partial(_numbered, seeds, only), range(len(all_cases())))
+        else:
+            found = (_rows(case, only, seeds) for case in (all_cases() if cases is None else cases))
+        for row in itertools.chain.from_iterable(found):
             rows.append(row)
             report(row)
     return {
@@ -42,8 +58,14 @@ def run(
     }
 
 
-def _rows(case: Case, chosen: Sequence[str], seeds: int) -> list[dict[str, Any]]:
+def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
+    """The rows of one of all cases, in a process of its own: a case has closures, which do not travel."""
+    return _rows(all_cases()[number], only, seeds)
+
+
+def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
     """One row a method; all of them get the same streams."""
+    chosen = [name for name in case.methods if only is None or name in only]
     solvers = {name: methods.of(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]

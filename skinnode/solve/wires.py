@@ -35,6 +35,7 @@ from skinnode.solve.linear import Index, dot, largest
 from skinnode.solve.operators import (
     ACCEPTED,
     CONVERGED,
+    EPS,
     ERROR,
     ILL_CONDITIONED,
     LIMIT,
@@ -83,6 +84,9 @@ SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 
 
+DATA_ROUNDING: Final = 2.0
+"""Relative error of an a F, in eps: R, the gain, their product and F are rounded to half an eps each."""
+
 # Normal deviates of the quantiles used
 Z_95: Final = 1.645
 Z_HOLD: Final = 2.326
@@ -102,6 +106,18 @@ def chi2_quantile(dof: float, z: float) -> float:
 
 
 _chi2_quantile = njit_part(chi2_quantile)
+
+
+@njit_part
+def _data_rounding(inverse: Float, weight: Float) -> float:
+    """What rounding of the resistances leaves open of the largest coordinate: ``inverse`` (n, K) ∂x/∂r."""
+    top = 0.0
+    for j in range(inverse.shape[0]):
+        row, total = inverse[j], 0.0
+        for k in range(row.size):
+            total += abs(row[k]) * weight[k]
+        top = max(top, total)
+    return DATA_ROUNDING * EPS * top
 
 
 @njit_part
@@ -330,7 +346,8 @@ def solve_wires(
                 measure[u, CHI2] = square if tall else 0.0
                 if tasks & COVARIANCE:
                     share = certify(w, inverse_u)
-                    measure[u, ERROR_ESTIMATE] = share * max(1.0, largest(w.x))
+                    error = share * max(1.0, largest(w.x)) + _data_rounding(inverse_u, w_u)
+                    measure[u, ERROR_ESTIMATE] = error
                     if not share <= ROOT_SHARE:
                         status = ILL_CONDITIONED
                     else:

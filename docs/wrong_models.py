@@ -115,7 +115,7 @@ def _error(field: sk.FieldFrame, truth: Float) -> tuple[float, float, float, flo
     if not used.any():
         return np.nan, 0.0, np.nan, np.nan, np.nan
     error, std, size = (field.displacement_m - truth)[used], field.displacement_std_m[used], truth[used]
-    inside = float((np.abs(error) <= 1.96 * std).mean())
+    inside = float((np.abs(error) <= field.half_width_95_m[used]).mean())
     shares = (float(np.linalg.norm(each) / np.linalg.norm(size)) for each in (error, std))
     wrong = float((np.abs(error) > 5.0 * std).any(axis=(1, 2)).sum())
     return next(shares), float(used.mean()), next(shares), inside, wrong

@@ -7,6 +7,7 @@ scenes and coordinates of the wires that converged, as RMS shares of the displac
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -18,17 +19,19 @@ from skinnode.cli import _methods as methods
 from skinnode.cli._cases import Case, preset
 from skinnode.cli._score import bound_std_m
 from skinnode.cli._truth import Converter, Press, Skin, Stream, random_press, stream
-from skinnode.model.frames import FieldFrame
+from skinnode.model.frames import Z_95, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
+from skinnode.solve.estimate import PRIOR_DOUBT, SMOOTH_SHARE
 
 METHODS: Final = ("exact", "posterior")
 SIGMAS: Final = (1e-6, 4e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
+PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+FEWEST: Final = 1000
+"""Coordinates for a quantile of 99.9 %."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
-QUANTILE: Final = 1.959964
-"""Of the normal distribution at 97.5 %."""
 
 PROTOTYPE: Final = {
     ("staggered", 0.3): {
@@ -65,7 +68,7 @@ class Pool:
         self.scenes += 1
         self.wires += used.size
         self.converged += int(used.sum())
-        self.covered += int((np.abs(error) <= QUANTILE * std).sum())
+        self.covered += int((np.abs(error) <= frame.half_width_95_m[used]).sum())
         self.coordinates += error.size
         self._error += float((error**2).sum())
         self._variance += float((std**2).sum())
@@ -82,6 +85,47 @@ class Pool:
             "ratio": math.sqrt(self._error / (self._variance or math.nan)),
             "coverage": self.covered / (self.coordinates or math.nan),
         }
+
+
+@dataclass
+class Parts:
+    """Errors of the posterior against its variance n + b: n by the noise, b by what the prior leaves open."""
+
+    _error: list[Float] = field(default_factory=list)
+    _noise: list[Float] = field(default_factory=list)
+    _left: list[Float] = field(default_factory=list)
+
+    def add(self, frame: FieldFrame, truth_m: Float) -> None:
+        """``truth_m``: (U, N, 3). A held frame's deviations have more in them and do not count."""
+        if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
+            return
+        used = np.array([status is Status.CONVERGED for status in frame.status])
+        wide, core = frame.displacement_std_m[used] ** 2, frame.core_std_m[used] ** 2
+        left = (wide - core) / (PRIOR_DOUBT - SMOOTH_SHARE)
+        self._error.append(np.abs(frame.displacement_m - truth_m)[used].ravel())
+        self._noise.append((wide - PRIOR_DOUBT * left).ravel())
+        self._left.append(left.ravel())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """By the prior's share b / (n + b): error / √(n + b), its RMS, quantiles and kurtosis, beside the RMS
+        that n alone would give; and how much of b is in the errors."""
+        if not self._error:
+            return []
+        error, noise, left = (np.concatenate(each) for each in (self._error, self._noise, self._left))
+        share, z = left / (noise + left), error / np.sqrt(noise + left)
+        found = []
+        for low, high in itertools.pairwise(PRIOR_SHARES):
+            chosen = (share >= low) & (share < high)
+            if np.count_nonzero(chosen) >= FEWEST:
+                square, own = z[chosen] ** 2, share[chosen]
+                found.append(
+                    {"from": low, "to": high, "coordinates": int(chosen.sum())}
+                    | {"rms": float(np.sqrt(square.mean())), "by_noise": float(np.sqrt(1.0 - own.mean()))}
+                    | {"in_errors": float((square - 1.0 + own).mean() / own.mean())}
+                    | {f"q{at}": float(np.quantile(z[chosen], at / 1000)) for at in (950, 999)}
+                    | {"kurtosis": float((square**2).mean() / square.mean() ** 2)}
+                )
+        return found
 
 
 @dataclass
@@ -138,12 +182,12 @@ class Forces:
             error, std, size = np.array(values).T
             figures[f"{name}_error"] = float(np.sqrt(np.mean((error / size) ** 2)))
             figures[f"{name}_reported"] = float(np.sqrt(np.mean((std / size) ** 2)))
-            figures[f"{name}_coverage"] = float(np.mean(np.abs(error) <= QUANTILE * std))
+            figures[f"{name}_coverage"] = float(np.mean(np.abs(error) <= Z_95 * std))
         if self._place:
             off, std = np.array(self._place).T
             figures["centroid_error_m"] = float(np.sqrt(np.mean(off**2)))
             figures["centroid_reported_m"] = float(np.sqrt(np.mean(std**2)))
-            figures["centroid_coverage"] = float(np.mean(np.abs(off) <= QUANTILE * std))
+            figures["centroid_coverage"] = float(np.mean(np.abs(off) <= Z_95 * std))
         return figures
 
 
@@ -251,9 +295,10 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
     )
 
 
-def coverage(scenes: int) -> list[dict[str, Any]]:
-    """Random scenes: a row for each layout and noise, method by method, with forces where there are any."""
-    rows = []
+def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Random scenes: a row for each layout and noise, method by method, with forces where there are any; and
+    the posterior's errors of all of them by the prior's share in its variance."""
+    rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:
         follower = Follower(kind, height)
         skin = follower.case.skin
@@ -265,7 +310,8 @@ def coverage(scenes: int) -> list[dict[str, Any]]:
                 pools[name].add(frame, taken.truth_m[-1])
                 if name == "posterior":
                     forces.add(frame, taken)
+                    parts.add(frame, taken.truth_m[-1])
         for name, pool in pools.items():
             row = {"layout": kind, "height": height, "sigma": sigma, "method": name, **pool.row()}
             rows.append(row | (forces.row() if name == "posterior" else {}))
-    return rows
+    return rows, parts.rows()

@@ -9,7 +9,6 @@ from skinnode.cli import _accuracy_front as front
 from skinnode.cli import _accuracy_noise as noise
 from skinnode.cli import _accuracy_time as times
 from skinnode.cli._bench_solve import ACCURACY
-from skinnode.cli._bench_stability import share
 from skinnode.cli._bench_timing import machine
 from skinnode.cli._files import plain
 
@@ -25,6 +24,7 @@ is over 300 coordinates a scene already."""
 def run(scenes: int, rounds: int) -> dict[str, Any]:
     """The figures of the benchmark. ``scenes``: random ones for each row of the coverage."""
     few = max(3, scenes // SCENES_A_CELL)
+    coverage, parts = noise.coverage(scenes)
     figures: dict[str, Any] = {
         "benchmark": "accuracy",
         "machine": machine(),
@@ -32,7 +32,8 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
         "front": front.run(),
         "noise": noise.against_noise(few),
         "codes": noise.against_codes(few),
-        "coverage": noise.coverage(scenes),
+        "coverage": coverage,
+        "parts": parts,
         "time": times.run(rounds),
     }
     figures["must"] = musts(figures)
@@ -78,6 +79,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     _print_noise(figures["noise"], echo)
     _print_codes(figures["codes"], echo)
     _print_coverage(figures["coverage"], echo)
+    _print_parts(figures["parts"], echo)
     echo("\nwhat must be reached")
     for row in figures["must"]:
         value = "-" if row["value"] is None else f"{row['value']:.3g}"
@@ -87,7 +89,8 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    return "-" if value is None else share(value)
+    """A share in percent, whatever its size: figures of one column are of one unit."""
+    return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
 def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
@@ -148,7 +151,7 @@ def _pairs(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, A
 
 
 def _cell(row: dict[str, Any]) -> str:
-    return "-" if row["error"] is None else f"{share(row['error'])} ({share(row['reported'])})"
+    return "-" if row["error"] is None else f"{_text(row['error'])} ({_text(row['reported'])})"
 
 
 def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
@@ -176,9 +179,23 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
                 error, std = 1e3 * row["centroid_error_m"], 1e3 * row["centroid_reported_m"]
                 place = f"  centroid {error:.2f} ({std:.2f}) mm {row['centroid_coverage']:.0%}"
             parts = "".join(
-                f"  {name} {share(row[f'{name}_error'])} ({share(row[f'{name}_reported'])})"
+                f"  {name} {_text(row[f'{name}_error'])} ({_text(row[f'{name}_reported'])})"
                 f" {row[f'{name}_coverage']:.0%}"
                 for name in ("normal", "shear")
             )
             right = f"{row['contacts_right']:.0%} with the right number of contacts"
             echo(f"  {where:16}{row['sigma']:7.0e}{parts}{place}  {right}")
+
+
+def _print_parts(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
+    echo("  errors of the posterior there, in deviations √(n + b): n by the noise, b left open by the prior")
+    echo(
+        f"  {'b / (n + b)':16}{'coordinates':>12}{'RMS':>7}{'by noise':>10}{'b in it':>9}{'95 %':>7}"
+        f"{'99.9 %':>8}{'kurtosis':>10}"
+    )
+    for row in rows:
+        echo(
+            f"  {row['from']:.0%} to {row['to']:<9.0%}{row['coordinates']:12}{row['rms']:7.2f}"
+            f"{row['by_noise']:10.2f}{row['in_errors']:9.0%}{row['q950']:7.2f}{row['q999']:8.2f}"
+            f"{row['kurtosis']:10.1f}"
+        )

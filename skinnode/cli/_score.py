@@ -102,7 +102,7 @@ class Scorer:
         self._scans += 1
         self._squares += float(np.mean(error**2))
         self._variances += float(np.mean(std**2))
-        self._covered += int((deviations <= 1.96).sum())
+        self._covered += int((np.abs(error) <= frame.half_width_95_m).sum())
         self._largest = max(self._largest, float(np.abs(error).max()))
         self._worst = max(self._worst, float(deviations.max()))
         depth = float(np.abs(truth).max())

@@ -67,6 +67,7 @@ def stability(
     json: JsonFile = None,
     plot: PlotFile = None,
     seeds: Annotated[int, typer.Option(min=1, help="Streams of each hard case.")] = 50,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that the cases are shared out to.")] = 1,
 ) -> None:
     """Every hard case over many seeds: error, deviation, status, verdict. Exit 1 if any ends CONVERGED and
     wrong."""
@@ -75,7 +76,7 @@ def stability(
 
     _prepare(json, plot)
     typer.echo(bench.HEAD)
-    figures = bench.run(seeds, report=lambda row: typer.echo(bench.line(row)))
+    figures = bench.run(seeds, jobs=jobs, report=lambda row: typer.echo(bench.line(row)))
     wrong = [row for row in figures["rows"] if row["wrong"]]
     _print_machine(figures)
     typer.echo(bench.LEGEND)
@@ -99,7 +100,8 @@ def accuracy(
     scenes: Annotated[int, typer.Option(min=1, help="Random scenes for each line of the coverage.")] = 200,
     rounds: Rounds = 31,
 ) -> None:
-    """Error against time, noise and code width; coverage of the intervals; time a frame."""
+    """Error against time, noise and code width; coverage of the intervals; time a frame. Exit 1 if a line
+    that must be reached is not."""
     from skinnode.cli import _bench_accuracy as bench
 
     _prepare(json, plot)
@@ -111,6 +113,8 @@ def accuracy(
         from skinnode.cli._plot_accuracy import draw
 
         draw(plot, figures)
+    if not all(row["reached"] for row in figures["must"]):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
+
+Z_95: Final = 1.959964
+"""97.5 % of the normal distribution lie below."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +64,7 @@ class Contact:
     centroid_std_m: Float
     """(3,)"""
     area_m2: float
-    """Area of the contact, if a smooth body presses (Hertz); 0 where it is too small to tell."""
+    """Area of the contact, if a smooth body presses (Hertz); of one cell where it is too small to tell."""
     area_std_m2: float
     normal_force_n: float
     """Positive when pressing."""
@@ -78,7 +82,8 @@ class FieldFrame:
     displacement_m: Float
     """(U, N, 3) from the rest position."""
     displacement_std_m: Float
-    """(U, N, 3) standard deviation given the noise of the resistances; inf where nothing is known."""
+    """(U, N, 3) standard deviation given the noise of the resistances; inf where nothing is known. Five of
+    them are a fault: where a prior has a part in it, it has the tail of what that may get wrong."""
     status: tuple[Status, ...]
     """One for each upper wire."""
     residual: Float
@@ -101,6 +106,13 @@ class FieldFrame:
     """Estimated noise over the noise given, where it is estimated."""
     held: NDArray[np.bool_] | None = None
     """(U,) wires not solved, since the frame says within its noise that they have not moved."""
+    core_std_m: Float | None = None
+    """(U, N, 3) the deviation without that tail, of the bulk of the errors; None where there is no such."""
+
+    @property
+    def half_width_95_m(self) -> Float:
+        """(U, N, 3) half of the width of the 95 % interval around the displacement."""
+        return Z_95 * (self.displacement_std_m if self.core_std_m is None else self.core_std_m)
 
     @property
     def trusted(self) -> bool:

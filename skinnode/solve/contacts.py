@@ -11,18 +11,16 @@ those that press significantly, and not much less than the strongest, form conta
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from skinnode.jit import njit
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.estimate import PRIOR_DOUBT, Estimator
 from skinnode.solve.linear import Index
 from skinnode.solve.prior import ElasticPrior
-
-if TYPE_CHECKING:
-    from skinnode.solve.estimate import Estimator
 
 SIGNIFICANT: Final = 5.0
 """Deviations by which a sum of cells must press to be part of a contact: with 200 sums a frame, noise does so
@@ -90,7 +88,9 @@ class ContactFinder:
         )
         if not force > 0:
             return None
-        std = estimator.load_std(loads, weights)
+        # how a contact's load is shared out to its cells is for the most part the prior's word
+        std = math.sqrt(PRIOR_DOUBT) * estimator.load_std(loads, weights)
+        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load all over its cell about the centre
         return Contact(
             centroid_m=centroid,
             centroid_std_m=std[1:4],

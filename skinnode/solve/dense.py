@@ -146,6 +146,33 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
             _forward(l, b, r, min(ROWS, n - r), 0, col, min(TILE, cols - col))
 
 
+@njit_part
+def _backward(l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int) -> None:
+    """Rows r to r + rows of L⁻ᵀ B in place of a tile of ``b``, whose rows r + rows to n have theirs."""
+    _tile(b, r, rows, l, b, r + rows, n, col, count, True)
+    right = col + LANES
+    more = count - LANES
+    for i in range(r + rows - 1, r - 1, -1):
+        factors, row = l[i], b[i]
+        b0 = load(row, col, count)
+        b1 = load(row, right, more)
+        for k in range(i + 1, r + rows):
+            below = b[k]
+            b0 = fma(-factors[k], load(below, col, count), b0)
+            b1 = fma(-factors[k], load(below, right, more), b1)
+        inverse = 1.0 / factors[i]
+        store(row, col, count, b0 * inverse)
+        store(row, right, more, b1 * inverse)
+
+
+@njit
+def solve_lower_transposed(l: Float, b: Float, n: int, cols: int) -> None:
+    """L⁻ᵀ B in place of the leading (n, cols) of ``b``; of ``l`` the upper triangle is read, which has Lᵀ."""
+    for col in range(0, cols, TILE):
+        for r in range((n - 1) // ROWS * ROWS, -1, -ROWS):
+            _backward(l, b, r, min(ROWS, n - r), n, col, min(TILE, cols - col))
+
+
 @njit
 def solve_lower_vector(l: Float, v: Float, n: int) -> None:
     """L⁻¹ v in place of the leading n of ``v``."""

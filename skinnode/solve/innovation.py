@@ -33,7 +33,12 @@ import numpy as np
 from skinnode.jit import njit, njit_part
 from skinnode.model.kernels import potential, potential_jacobian
 from skinnode.model.layout import Float
-from skinnode.solve.dense import multiply, solve_lower_transposed_vector, solve_lower_vector
+from skinnode.solve.dense import (
+    multiply,
+    solve_lower_transposed,
+    solve_lower_transposed_vector,
+    solve_lower_vector,
+)
 from skinnode.solve.linear import Index, dot, qr_factor, qr_project
 
 
@@ -59,6 +64,8 @@ class Buffers(NamedTuple):
     """(U R, U R) S, then its factor L."""
     whitened: Float
     """(U R, U f) V."""
+    weights: Float
+    """(U R, U f) Kᵀ, what a unit of noise of each equation does to the estimate."""
     work: Float
     """(U R, U R) scratch."""
     gradient: Float
@@ -86,9 +93,9 @@ def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: 
         free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
         nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
         gain=np.zeros((m, n)), innovation=np.zeros((m, m)), whitened=np.zeros((m, n)),
-        work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m), block=np.zeros((free, rows)),
-        qr=np.zeros((equations, columns)), diagonal=np.zeros(columns), beta=np.zeros(columns),
-        scratch=np.zeros(columns), e=np.zeros(equations),
+        weights=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
+        block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
+        beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
     )  # fmt: skip
 
 
@@ -166,9 +173,11 @@ def load_squares(told: Float, loads: Index, weights: Float, out: Float) -> None:
 
 
 @njit
-def loads_found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> None:
+def loads_found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
     """Squares of the loads ``q`` (Q, 3), freed from their own prior variances ``own`` (Q,), into ``found``
-    (Q,): of a cell the largest that is significant, else 0; ``stiffness`` (3Q,)."""
+    (Q,): of a cell the largest that is significant, else 0; ``stiffness`` (3Q,). The largest square over its
+    noise."""
+    most = 0.0
     for cell in range(found.size):
         found[cell] = 0.0
         for i in range(3):
@@ -177,6 +186,8 @@ def loads_found(q: Float, own: Float, stiffness: Float, significant: float, foun
             noise = max(1.0 / k - own[cell], 0.0)
             if alone * alone > significant * noise:
                 found[cell] = max(found[cell], alone * alone - noise)
+                most = max(most, alone * alone / noise if noise > 0.0 else math.inf)
+    return most
 
 
 @njit_part
@@ -285,6 +296,33 @@ def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buff
         for k in range(m):
             total += b.nuisance[k, q] * b.v[k]
         g[q] = -d[q] * total
+
+
+@njit
+def noise_variance(m: int, d: Float, b: Buffers, out: Float) -> None:
+    """What the noise of ``m`` equations and the nuisances put into the estimate, diag(K (I + H d Hᵀ) Kᵀ)
+    with Kᵀ = L⁻ᵀ V, into ``out`` (U f,). V and L are at hand."""
+    n = out.size
+    for k in range(m):
+        for j in range(n):
+            b.weights[k, j] = b.whitened[k, j]
+    solve_lower_transposed(b.innovation, b.weights, m, n)
+    for j in range(n):
+        out[j] = 0.0
+    for k in range(m):
+        row = b.weights[k]
+        for j in range(n):
+            out[j] += row[j] * row[j]
+    for q in range(d.size):
+        for j in range(n):
+            b.gradient[j] = 0.0
+        for k in range(m):
+            value, row = b.nuisance[k, q], b.weights[k]
+            if value != 0.0:
+                for j in range(n):
+                    b.gradient[j] += value * row[j]
+        for j in range(n):
+            out[j] += d[q] * b.gradient[j] * b.gradient[j]
 
 
 @njit

@@ -21,7 +21,7 @@ from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status
-from skinnode.solve.branch import NEARLY_BLIND, REFEREE_NOISE, folded_wires, wire_deviations
+from skinnode.solve.branch import REFEREE_NOISE, folded_wires
 from skinnode.solve.contacts import ContactFinder
 from skinnode.solve.estimate import Data, Estimator, Index
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
@@ -69,14 +69,9 @@ BELIEVABLE: Final = 5.0
 FAR: Final = 0.1
 """Share of the clearance by which an electrode may go before the field is held against the one annealed from
 rest: folds were passed by presses of 0.3 and more, frame by frame, and never noticed afterwards."""
-DEEP: Final = 0.5
-DEEP_DOUBT: Final = 1.5
-"""On layouts with folds the deviations of a patch with an electrode this deep, in clearances, are larger by
-that factor: the posterior bends within them. On staggered, h = 1, 3 of 11 000 wires under presses of 70 %
-were 6 to 7 of the plain deviations off."""
-POOR_DOUBT: Final = 1.8
-"""Factor on the deviations of a wire that sees next to nothing, or has fewer lower wires than unknowns: on
-symmetric and with K = 20 for 30 unknowns 5 of 4000 wires were 8 to 10 of the plain ones off."""
+LIKELIER: Final = 4.0
+"""Twice the log by which a field annealed again must be the likelier. With less it is the same maximum, drawn
+nearer to what was found; the wrong one that was met lost by 23."""
 NOISE_WORTH: Final = 20.0
 """The noise given counts as much as 20 resistances when it is estimated."""
 NOISE_STEP: Final = math.log(1.1)
@@ -152,9 +147,6 @@ class Posterior:
         self._quiet, self._impossible = (
             chi_square_limits(layout.shape[1], chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
         )
-        # a mirrored root is as good to a wire that sees next to nothing, and so are many to one of too few
-        poor = wire_deviations(layout, 1.0, normal_only) > NEARLY_BLIND
-        self._doubt = np.where(poor | (layout.shape[1] < self._free.size), POOR_DOUBT, 1.0)[:, None]
         self._folded = float(folded_wires(layout, normal_only).mean()) > 0.5
         self._noise_least = REFEREE_NOISE if self._folded else NOISE_LEAST
         self._far = FAR * float(self._problem.clearance.min())
@@ -188,6 +180,7 @@ class Posterior:
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
         self._compared = np.zeros_like(self._trusted)  # field when it was last held against the annealed
+        self._annealed = False  # whether the field at hand came from rest
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
         self._overlooked = np.zeros_like(self._estimator.std)
@@ -340,6 +333,8 @@ class Posterior:
                 data = self._data(a, noise, usable)
                 continue
             data = self._adapt(data, a, noise, usable, members, local=touched.size > 0)
+            if self._folded and self._annealed and touched.size and self._seconds == math.inf:
+                data = self._anneal_again(data, a, noise, usable, members)
             if not np.isfinite(estimator.moved).all():
                 return self._give_up(Status.NON_FINITE)
             stirred, _, total = self._stirred(data, estimator.moved)
@@ -375,6 +370,7 @@ class Posterior:
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
+        self._annealed = False
         hurry = self._seconds < math.inf  # annealing takes several frames' worth of time
         if (self._known or hurry) and estimator.track(data, members):
             gone = float(np.abs(estimator.moved - self._compared).max())
@@ -384,6 +380,7 @@ class Posterior:
         estimator.spread(self._fixed_scale or self._scale_rest)
         if self._fixed_scale is None:
             estimator.scale2 = self._bounded(estimator.guess_scale(data, members))
+        self._annealed = True
         return estimator.anneal(data, members)
 
     def _strained(self, data: Data, deviations: float) -> bool:
@@ -399,10 +396,24 @@ class Posterior:
         tracked = estimator.moved.copy(), estimator.g.copy()
         estimator.spread(self._fixed_scale or self._bounded(estimator.guess_scale(data, members)))
         annealed = estimator.anneal(data, members)
-        if annealed and estimator.objective(data) <= estimator.objective(data, *tracked):
+        self._annealed = annealed and estimator.objective(data) <= estimator.objective(data, *tracked)
+        if self._annealed:
             return True
         estimator.moved[:], estimator.g[:] = tracked
         return estimator.track(data, members)
+
+    def _anneal_again(
+        self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_], members: Index
+    ) -> Data:
+        """With folds, loads expected all over the patch may have led to a wrong maximum: the better of that
+        and the one annealed with the loads expected where they were found."""
+        estimator = self._estimator
+        first, before = (estimator.moved.copy(), estimator.g.copy()), estimator.objective(data)
+        if estimator.anneal(data, members) and estimator.objective(data) < before - LIKELIER:
+            return self._adapt(data, a, noise, usable, members, local=True)
+        estimator.moved[:], estimator.g[:] = first
+        estimator.track(data, members)
+        return data
 
     def _bounded(self, scale2: float) -> float:
         return min(max(scale2, self._scale_least), self._scale_most)
@@ -466,15 +477,11 @@ class Posterior:
     ) -> FieldFrame:
         estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
         displacement = problem.displacement_m(problem.rest + self._trusted)
-        std = np.zeros_like(self._trusted)
-        std[:, self._free] = estimator.std
+        std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
+        std[:, self._free], core[:, self._free] = estimator.std, estimator.core
         if held.all():  # half of what it may overlook
-            std[:, self._free] = np.maximum(estimator.std, 0.5 * self._overlooked)
-        std *= self._doubt
-        if self._folded:
-            moved = self._trusted.reshape(problem.layout.upper_m.shape)
-            if (np.sqrt((moved**2).sum(axis=-1)) > DEEP * problem.clearance).any():
-                std *= DEEP_DOUBT
+            for each in (std, core):
+                each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():
             self._force, self._contacts_found = self._contacts.find(estimator)
         used = data.weight > 0
@@ -484,6 +491,7 @@ class Posterior:
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=(std * pitch).reshape(displacement.shape),
+            core_std_m=(core * pitch).reshape(displacement.shape),
             status=tuple(map(Status, status.tolist())),
             residual=np.where(used.any(axis=1), rms, np.inf),
             stats=SolveStats(

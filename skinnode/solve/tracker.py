@@ -211,15 +211,19 @@ class Tracker:
                 status[u] = Status.CONVERGED
             elif converged[u]:
                 status[u] = Status.ILL_CONDITIONED
-        moved, std = field.displacement_m.copy(), field.displacement_std_m.copy()
-        residual = field.residual.copy()
-        moved[replaced], std[replaced] = guide.displacement_m[replaced], guide.displacement_std_m[replaced]
-        residual[replaced] = guide.residual[replaced]
-        std[doubtful & ~agreed & ~replaced] = np.inf
-        if self._folded.any():  # two roots may lie closer than the posterior can tell
-            std[replaced & self._folded] *= 2.0
-            apart = 3.0 * gap.max(axis=(1, 2), keepdims=True)
-            std = np.where((agreed & self._folded)[:, None, None], np.hypot(std, apart), std)
+        moved, residual = field.displacement_m.copy(), field.residual.copy()
+        moved[replaced], residual[replaced] = guide.displacement_m[replaced], guide.residual[replaced]
+        apart = 3.0 * gap.max(axis=(1, 2), keepdims=True)
+
+        def judged(own: Float, guides: Float) -> Float:
+            std = np.where(replaced[:, None, None], guides, own)
+            std[doubtful & ~agreed & ~replaced] = np.inf
+            if self._folded.any():  # two roots may lie closer than the posterior can tell
+                std[replaced & self._folded] *= 2.0
+                std = np.where((agreed & self._folded)[:, None, None], np.hypot(std, apart), std)
+            return std
+
+        assert guide.core_std_m is not None
         self._exact.adopt(replaced, moved)
         self._exact.distrust(doubtful & ~agreed & ~replaced)
         stats = dataclasses.replace(
@@ -235,7 +239,8 @@ class Tracker:
         return dataclasses.replace(
             field,
             displacement_m=moved,
-            displacement_std_m=std,
+            displacement_std_m=judged(field.displacement_std_m, guide.displacement_std_m),
+            core_std_m=judged(field.displacement_std_m, guide.core_std_m),
             status=tuple(status),
             residual=residual,
             stats=stats,

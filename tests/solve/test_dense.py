@@ -77,6 +77,11 @@ def test_triangular_solves(n, cols, seed, size):
         assert (np.abs(matrix @ solution - value) <= 2 * slack).all()
 
     assert_solves(lower, x, b)
+    whole = right.copy()
+    dense.solve_lower_transposed(l, whole, n, cols)
+    np.testing.assert_array_equal(whole[n:], right[n:])
+    np.testing.assert_array_equal(whole[:, cols:], right[:, cols:])
+    assert_solves(lower.T, whole[:n, :cols], b)
     forward, backward = right[:, 0].copy(), right[:, 0].copy()
     dense.solve_lower_vector(l, forward, n)
     dense.solve_lower_transposed_vector(l, backward, n)

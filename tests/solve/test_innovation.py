@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 import skinnode as sk
 from skinnode.solve import innovation
 from skinnode.solve.dense import cholesky
-from skinnode.solve.estimate import PRIOR_DOUBT, Data, Estimator
+from skinnode.solve.estimate import PRIOR_DOUBT, SMOOTH_SHARE, Data, Estimator
 from skinnode.solve.prior import ElasticPrior
 from skinnode.solve.problem import PatchProblem
 
@@ -246,7 +246,8 @@ def test_annealing_finds_the_maximum_scipy_finds(name):
 
 @pytest.mark.parametrize("name", ["square", "tall, reduced", "short", "normal only, reduced"])
 def test_covariance_and_directions_known_are_the_textbooks(name):
-    """σ² of each coordinate, widened where the prior alone speaks, and γ = Uf − tr((s²C)⁻¹ Σ) (MacKay)."""
+    """σ² of each coordinate, parted into what noise does and Σ (s²C)⁻¹ Σ, which the prior leaves open and a
+    fixed field would have as bias; and γ = Uf − tr((s²C)⁻¹ Σ) (MacKay)."""
     it = case(**CASES[name], depth=0.02, noise=1e-4)
     solver = estimator(it)
     assert solver.anneal(it.data, np.arange(3))
@@ -254,9 +255,11 @@ def test_covariance_and_directions_known_are_the_textbooks(name):
     n = 3 * it.free.size
     covariance = covariance[:n, :n]
     np.testing.assert_allclose(solver.covariance(), covariance, rtol=0, atol=0.01 * covariance.max())
-    variance, prior = np.diag(covariance), it.scale2 * np.diag(it.c)
-    widened = np.sqrt(variance * (1 + PRIOR_DOUBT * variance / prior))
-    np.testing.assert_allclose(solver.std.ravel(), widened, rtol=0.02)
+    left = np.diag(covariance @ np.linalg.solve(it.scale2 * it.c, covariance))
+    noise = np.diag(covariance) - left
+    np.testing.assert_allclose(solver.noise_variance, noise, rtol=0.04, atol=0.01 * left.min())
+    for found, share in ((solver.std, PRIOR_DOUBT), (solver.core, SMOOTH_SHARE)):
+        np.testing.assert_allclose(found.ravel(), np.sqrt(noise + share * left), rtol=0.02)
     if not it.data.d.size:
         known = n - np.trace(np.linalg.solve(it.scale2 * it.c, covariance))
         assert solver.gamma == pytest.approx(known, rel=0.01)

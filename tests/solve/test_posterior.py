@@ -74,20 +74,20 @@ def deviations(field: sk.FieldFrame, moved: np.ndarray) -> np.ndarray:
     return np.asarray((field.displacement_m - moved) / field.displacement_std_m)
 
 
-SETTINGS = [  # layout, noise, most that may lie within 1.96 deviations
-    ("staggered", 1e-6, 0.985),
-    ("staggered", 1e-5, 0.985),
-    ("staggered", 1e-4, 1.0),  # where the prior speaks, deviations are widened on purpose
-    ("staggered", 1e-3, 1.0),
-    ("aligned", 1e-5, 1.0),
-    ("aligned", 1e-3, 1.0),
+SETTINGS = [  # layout, noise, least share in 95 % intervals; a ridge under much noise is farthest
+    ("staggered", 1e-6, 0.90),
+    ("staggered", 1e-5, 0.90),
+    ("staggered", 1e-4, 0.90),
+    ("staggered", 1e-3, 0.90),
+    ("aligned", 1e-5, 0.90),
+    ("aligned", 1e-3, 0.87),
 ]
 
 
 @pytest.mark.parametrize("kind", ["sphere", "gauss", "ridge", "plateau"])
-@pytest.mark.parametrize(("name", "sigma", "most"), SETTINGS)
-def test_reported_deviations_hold(name, sigma, most, kind):
-    """A jump from rest to each of 10 scenes is solved: 95 % within 1.96, RMS error no more than reported."""
+@pytest.mark.parametrize(("name", "sigma", "least"), SETTINGS)
+def test_reported_deviations_and_intervals_hold(name, sigma, least, kind):
+    """A jump from rest to each of 10 scenes is solved: 95 % in the interval, no error beyond 5 deviations."""
     layout = sk.PatchLayout.preset(name)
     rng = np.random.default_rng(8)
     tracker = sk.Posterior(layout, relative_noise=sigma)
@@ -97,12 +97,33 @@ def test_reported_deviations_hold(name, sigma, most, kind):
         tracker.reset()
         field = tracker.update(noisy(sk.resistance_ohm(layout, layout.upper_m + moved), rng, sigma))
         assert field.trusted
-        z = deviations(field, moved)
-        inside.append(np.mean(np.abs(z) < 1.96))
-        error2.append(np.mean((field.displacement_m - moved) ** 2))
+        error = np.abs(field.displacement_m - moved)
+        assert (error < 5 * field.displacement_std_m).all()
+        assert (field.half_width_95_m <= 1.96 * field.displacement_std_m).all()
+        inside.append(np.mean(error < field.half_width_95_m))
+        error2.append(np.mean(error**2))
         reported2.append(np.mean(field.displacement_std_m**2))
-    assert 0.90 <= np.mean(inside) <= most
+    assert least <= np.mean(inside) <= 0.985
     assert np.sqrt(np.sum(error2) / np.sum(reported2)) <= 1.15
+
+
+def test_a_jump_beside_missing_wires_ends_on_the_right_root():
+    """Five of ten wires, a layer of one pitch, 70 % between two frames: annealed once only, the wire below
+    the press ends on another root, 0.36 mm off."""
+    full = sk.PatchLayout.preset("staggered", height_m=4e-3)
+    layout = sk.PatchLayout(full.upper_m[[0, 2, 5, 8, 9]], full.lower_m, full.resistivity_ohm_per_m)
+    contact = HertzContact(
+        Rubber(),
+        radius_m=0.014771423810290708,
+        indentation_m=2.8e-3,
+        center_m=(0.0148668657670782, 0.027077897109609252),
+        traction_ratio=(0.1581682575823667, 0.20992435014179808),
+    )
+    moved = contact.displacement_m(layout.upper_m[..., :2].reshape(-1, 2)).reshape(layout.upper_m.shape)
+    field = sk.Posterior(layout).update(sk.resistance_ohm(layout, layout.upper_m + moved))
+    assert field.trusted
+    assert np.abs(deviations(field, moved)).max() < 5
+    assert np.abs(field.displacement_m - moved).max() < 1e-5
 
 
 def test_deviations_shrink_with_the_noise(staggered):
@@ -518,19 +539,20 @@ def test_deadline_gives_up_in_time_and_recovers(staggered, monkeypatch):
 
 
 def test_covariance_belongs_to_the_field(small):
-    """Positive definite; its diagonal is the deviation, which is larger where the prior speaks. The wire in
-    the middle is on a symmetry line of the layout and has an allowance of its own."""
+    """Positive definite; its diagonal is the deviation, which is larger where the prior speaks: on the wire
+    in the middle, on a symmetry line of the layout, whatever the noise."""
     rng = np.random.default_rng(17)
-    for sigma, loose in ((1e-6, 1.2), (1e-4, np.sqrt(1 + estimate.PRIOR_DOUBT))):
+    for sigma, loose in ((1e-6, 1.2), (1e-4, np.inf)):
         tracker = sk.Posterior(small, relative_noise=sigma, hold=False)
         field = tracker.update(
             noisy(frame_ohm(small, hertz_press(small, 0.1, centre_m=(8e-3, 8e-3))), rng, sigma)
         )
         covariance = tracker.covariance_m2()
         std = np.sqrt(np.diag(covariance))
-        ratio = (field.displacement_std_m.ravel() / std).reshape(5, -1)[[0, 1, 3, 4]]
+        ratio = (field.displacement_std_m.ravel() / std).reshape(5, -1)
         assert (ratio >= 1 - 1e-9).all()
-        assert (ratio <= loose).all()
+        assert (ratio <= np.sqrt(estimate.PRIOR_DOUBT)).all()
+        assert (ratio[[0, 1, 3, 4]] <= loose).all()
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12 * covariance.max())
         assert np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > 0
 

@@ -16,6 +16,8 @@ START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 
 
 STATES: Final = {0: "initialising", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
+_HEARTBEATS: Final = tuple(bytes((state,)) for state in STATES if state)
+
 BOOT_S: Final = 5.0
 """How long a device may take to start up."""
 
@@ -55,7 +57,12 @@ class Dut:
         """Reset and await the boot-up message. Raises Failed where none comes, or another than it should."""
         self.bus.clear()
         self.nmt(command)
-        frame = self.bus.expect(self.error_control_id, "the boot-up message", BOOT_S)
+        frame = self.bus.expect(
+            self.error_control_id,
+            "the boot-up message",
+            BOOT_S,
+            lambda frame: frame.data not in _HEARTBEATS,  # of before the reset
+        )
         self.bus.forget()
         if frame.data != b"\0":
             raise Failed(f"the boot-up message 0x{self.error_control_id:03X} [1] 00", describe(frame))

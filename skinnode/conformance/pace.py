@@ -24,7 +24,7 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
     between."""
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms
-    too_seldom = mean > 1.5 or median > 1.15
-    too_often = (mean < 0.95 or median < 0.85) and not or_sooner
+    too_seldom = mean > 1.3 or median > 1.25
+    too_often = (mean < 0.9 or median < 0.8) and not or_sooner
     if too_seldom or too_often:
         raise Failed(f"{what} each {period_ms:g} ms", f"gaps of {', '.join(f'{gap:.1f}' for gap in gaps)} ms")

@@ -29,10 +29,12 @@ class Source:
 
 
 @contextmanager
-def patch_on(channel: str, wrap: Callable[[CanPort], CanPort] = lambda port: port) -> Iterator[PatchNode]:
+def patch_on(
+    channel: str, wrap: Callable[[CanPort], CanPort] = lambda port: port, interface: str = "virtual"
+) -> Iterator[PatchNode]:
     """A running patch of 2 × 6 wires; ``wrap`` may stand between it and its bus."""
     layout = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=6)
-    with CanPort(BusConfig(channel=channel)) as bare:
+    with CanPort(BusConfig(interface=interface, channel=channel)) as bare:
         port = wrap(bare)
         node = PatchNode(NODE_ID, layout, Source(layout), send=port.send, memory=VolatileMemory())
         with NodeRunner(port, [node]):

@@ -27,7 +27,7 @@ from skinnode.conformance.pdo import (
     tpdos,
 )
 
-_EVENT_MS = 20
+_EVENT_MS = 50
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
@@ -107,8 +107,8 @@ def event_driven(dut: Dut) -> None:
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} at its event timer") for _ in range(8)]
         gaps = gaps_ms(frames)
-        # The mean is held exactly; single distances may be short where a frame before was late on the bus.
-        if statistics.mean(gaps) < 40 * 0.98 or min(gaps) < 20:
+        # Single distances are short where the frame before was late on its way; their mean hardly is.
+        if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             told = ", ".join(f"{gap:.1f}" for gap in gaps)
             raise Failed(f"{pdo} no closer than its inhibit time of 40 ms", f"gaps of {told} ms")
 
@@ -123,16 +123,16 @@ def event_timer(dut: Dut) -> None:
         length = payload_bytes(mapped(dut, pdo))
         can_id = set_up(dut, pdo, 254)
         dut.operational()
-        busy = bool(dut.bus.listen(can_id, 5 * _EVENT_MS * 1e-3))  # events of the application itself
+        busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))  # events of the application itself
         dut.nmt(PRE_OPERATIONAL)
         set_up(dut, pdo, 254, event_ms=_EVENT_MS)
         dut.operational()
-        frames = [expect_pdo(dut, can_id, length, f"{pdo} each {_EVENT_MS} ms") for _ in range(16)]
+        frames = [expect_pdo(dut, can_id, length, f"{pdo} each {_EVENT_MS} ms") for _ in range(9)]
         check_period(frames, _EVENT_MS, str(pdo), or_sooner=busy)
         if not busy:
             dut.sdo.write_integer(pdo.parameter, EVENT_TIMER, 0, 2)
             dut.bus.pending(can_id)
-            dut.bus.expect_silence(can_id, f"{pdo} with an event timer of 0", 4 * _EVENT_MS * 1e-3)
+            dut.bus.expect_silence(can_id, f"{pdo} with an event timer of 0", 2.5 * _EVENT_MS * 1e-3)
 
     each_tpdo(dut, trial)
 
@@ -218,7 +218,7 @@ def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bo
         drain(dut, can_id)
         what = f"{pdo} of type {kind} in {state}"
         if kind in (254, 255):
-            dut.bus.expect_silence(can_id, what, 4 * _EVENT_MS * 1e-3)
+            dut.bus.expect_silence(can_id, what, 2.5 * _EVENT_MS * 1e-3)
             return
         for number in range(1, 5):
             if kind == 253:

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from skinnode.cli import bench, conformance, demo, eds, host, node
+from skinnode.cli import bench, conformance, demo, eds, host, node, scan
 from skinnode.errors import SkinError
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app.command(name="demo")(demo.demo)
 app.command(name="host")(host.host)
 app.command(name="node")(node.node)
 app.command(name="eds")(eds.eds)
+app.command(name="scan")(scan.scan)
 app.command(name="conformance")(conformance.conformance)
 app.add_typer(bench.app, name="bench")
 

@@ -1,0 +1,132 @@
+"""``skinnode scan``: who is on a bus."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
+
+if TYPE_CHECKING:
+    from skinnode.cli._bus import Place
+    from skinnode.technician.survey import FoundNode, Survey
+
+
+def scan(
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    fd: Fd = False,
+    hand: Hand = None,
+    bus: Bus = None,
+    as_json: Json = False,
+) -> None:
+    """Find every node on a bus: by SDO, by its heartbeat, and by LSS those without a node-ID.
+
+    Nothing is changed in any node. Takes two seconds. Exit status 0 if nodes were
+    found and all is well, 1 if none was, two share a node-ID, or one of --hand
+    is missing or another device; 2 if it could not run.
+    """
+    from skinnode.cli._bus import find_bus
+    from skinnode.cli._console import print_json, progress
+    from skinnode.technician.line import Line
+    from skinnode.technician.survey import survey
+
+    place = find_bus(interface, channel, bitrate, fd, hand, bus)
+    with progress(as_json) as tell, Line(place.bus) as line:
+        found = survey(line, tell)
+    faults = _faults(found, place)
+    if as_json:
+        print_json(_as_json(found, place, faults))
+    else:
+        _print(found, place, faults)
+    if faults:
+        raise typer.Exit(1)
+
+
+def _faults(found: Survey, place: Place) -> list[str]:
+    """What is not as it should be, one line each."""
+    faults = [
+        f"node {node.node_id}: two nodes have this node-ID: {node.duplicate}"
+        for node in found.nodes
+        if node.duplicate
+    ]
+    there = {node.node_id: node for node in found.nodes}
+    for patch in () if place.hand is None else place.hand.patches_on(place.bus.name):
+        node = there.get(patch.node_id)
+        if node is None:
+            faults.append(f"patch {patch.name!r}: no node {patch.node_id}")
+        elif not node.answers:
+            faults.append(f"patch {patch.name!r}: node {patch.node_id} is {node.state} and does not answer")
+        elif not node.is_patch:
+            faults.append(f"patch {patch.name!r}: node {patch.node_id} is another device ({node.name})")
+        elif patch.serial not in (None, node.serial):
+            faults.append(
+                f"patch {patch.name!r}: node {patch.node_id} has serial {node.serial}, not {patch.serial}"
+            )
+    if not found.nodes and not found.unconfigured:
+        faults.insert(0, "nobody answered: cable, termination, supply, bit rate?")
+    return faults
+
+
+def _as_json(found: Survey, place: Place, faults: list[str]) -> dict[str, object]:
+    from dataclasses import asdict
+
+    return {
+        "interface": place.bus.interface,
+        "channel": place.bus.channel,
+        "nodes": [{**asdict(node), "patch": place.patch_name(node.node_id) or None} for node in found.nodes],
+        "unconfigured": [address._asdict() for address in found.unconfigured],
+        "more_unconfigured": found.more_unconfigured,
+        "faults": faults,
+        "seconds": round(found.seconds, 3),
+    }
+
+
+def _print(found: Survey, place: Place, faults: list[str]) -> None:
+    from skinnode.cli._console import console, table
+
+    out = console()
+    if found.nodes:
+        listed = table(
+            "node", "state", "device", "vendor:product", "revision", "serial", right=("node", "serial")
+        )
+        for node in found.nodes:
+            listed.add_row(
+                str(node.node_id),
+                node.state,
+                _device(node, place),
+                _vendor_product(node.vendor_id, node.product_code),
+                _revision(node.revision),
+                "" if node.serial is None else str(node.serial),
+            )
+        out.print(listed)
+    for address in found.unconfigured:
+        out.print(
+            f"without a node-ID: serial {address.serial_number}, "
+            f"vendor:product {_vendor_product(address.vendor_id, address.product_code)}"
+        )
+    if found.more_unconfigured:
+        out.print("more nodes without a node-ID: skinnode lss list")
+    out.print(f"{len(found.nodes)} nodes on {place.bus.interface} {place.bus.channel}, {found.seconds:.1f} s")
+    for fault in faults:
+        out.print(f"fault: {fault}", markup=False)
+
+
+def _device(node: FoundNode, place: Place) -> str:
+    name = node.name or ("unknown, answers" if node.answers else "does not answer")
+    patch = place.patch_name(node.node_id)
+    return f"{name} ({patch})" if patch else name
+
+
+def _vendor_product(vendor_id: int | None, product_code: int | None) -> str:
+    return f"{_hex(vendor_id)}:{_hex(product_code)}"
+
+
+def _hex(value: int | None) -> str:
+    return "?" if value is None else f"{value:08X}"
+
+
+def _revision(value: int | None) -> str:
+    return "" if value is None else f"{value >> 16}.{value & 0xFFFF}"

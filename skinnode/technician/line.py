@@ -1,0 +1,137 @@
+"""An open bus in a technician's hands: SDO to any node, LSS, NMT, and everything that is heard meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Final, NamedTuple, Self
+
+from skinnode.errors import BusError, NodeError, SkinError
+from skinnode.host.link import BusLink
+from skinnode.host.network import RemoteOd
+from skinnode.model.config import BusConfig
+from skinnode.technician.heard import Beat, Heard
+from skinnode.technician.lss import LssMaster
+from skinnode.wire import indices as od
+
+STATES: Final = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
+"""NMT states as a heartbeat carries them (CiA 301, 7.2.8.3.2.2)."""
+
+LONGEST_HEARTBEAT_S: Final = 2.5
+"""How long a heartbeat is waited for; nodes that beat more seldom are not known to be there by it."""
+
+GUARD_ANSWER_S: Final = 0.15
+"""How long the answer to a remote frame may take."""
+
+_POLL_S: Final = 0.002
+
+
+class State(NamedTuple):
+    """NMT state of a node and how it is known."""
+
+    state: int | None
+    """None where nobody knows."""
+    how: str
+    """``heartbeat``, ``guarding``, or why it is not known."""
+
+    def __str__(self) -> str:
+        return "unknown" if self.state is None else state_name(self.state)
+
+
+def state_name(state: int) -> str:
+    """The state in words."""
+    return STATES.get(state, f"state {state}")
+
+
+class Line:
+    """An open bus. Raises BusError where it does not open. Closed by :meth:`close` or a ``with`` block."""
+
+    def __init__(self, bus: BusConfig) -> None:
+        self.bus = bus
+        self.heard = Heard()
+        self.defect: SkinError | None = None
+        """A failure of this program on the mainline."""
+        self._remotes: dict[int, RemoteOd] = {}
+        self.link = BusLink(bus, {}, self._on_defect)
+        self.link.listen(self.heard.on_frames)
+        self.lss = LssMaster(self.link.send)
+        self.link.handle(od.LSS_RESPONSE_COB_ID, self.lss.on_response)
+
+    def od(self, node_id: int) -> RemoteOd:
+        """The object dictionary of a node."""
+        if node_id not in self._remotes:
+            self._remotes[node_id] = self.link.remote_od(node_id)
+        return self._remotes[node_id]
+
+    def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
+        """Whether ``condition`` comes true in that time. Raises BusError if the bus fails meanwhile."""
+        end_s = time.monotonic() + within_s
+        while not condition():
+            if self.defect is not None:
+                raise self.defect
+            if self.link.failure is not None:
+                raise BusError(str(self.link.failure)) from self.link.failure
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(_POLL_S)
+        return True
+
+    def ask_all(self, node_id: int, request: bytes, within_s: float) -> list[bytes]:
+        """Every SDO answer to one request: two where two nodes bear the node-ID."""
+        since_ns = time.monotonic_ns()
+        self.link.send(od.sdo_request_cob_id(node_id), request.ljust(8, b"\0"))
+        self.wait_until(lambda: False, within_s)
+        answers = list(self.heard.node(node_id).sdo_answers)
+        return [data for t_ns, data in answers if t_ns >= since_ns]
+
+    def heartbeat_s(self, node_id: int) -> float | None:
+        """How often the node beats by its 0x1017; 0 for never, None where it does not say."""
+        try:
+            return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
+        except NodeError:
+            return None
+
+    def guarded(self, node_id: int) -> bool:
+        """Whether the node expects a master to guard it: a remote frame of ours would then start its clock,
+        and our going away be taken for the master's."""
+        remote = self.od(node_id)
+        try:
+            return bool(remote.read(od.GUARD_TIME, 0, "u16") and remote.read(od.LIFE_TIME_FACTOR, 0, "u8"))
+        except NodeError:
+            return False
+
+    def state(self, node_id: int, heartbeat_s: float | None, *, guarding: bool, since_ns: int = 0) -> State:
+        """NMT state by the next heartbeat after ``since_ns``, or by guarding where there is none and
+        ``guarding`` allows it. ``heartbeat_s`` as of :meth:`heartbeat_s`."""
+        if heartbeat_s != 0:
+            wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1
+            beat = self._beat(node_id, since_ns, min(wait_s, LONGEST_HEARTBEAT_S))
+            if beat is not None:
+                return State(beat.state, "heartbeat")
+            if heartbeat_s:
+                return State(None, f"no heartbeat, though one every {heartbeat_s:g} s is set")
+        if not guarding:
+            return State(None, "no heartbeat, and a master guards the node")
+        asked_ns = time.monotonic_ns()
+        self.link.ask_remote(od.heartbeat_cob_id(node_id))
+        beat = self._beat(node_id, asked_ns, GUARD_ANSWER_S)
+        return State(beat.state, "guarding") if beat is not None else State(None, "no heartbeat, no guarding")
+
+    def close(self) -> None:
+        self.link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _beat(self, node_id: int, since_ns: int, within_s: float) -> Beat | None:
+        self.wait_until(lambda: self.heard.newest_beat(node_id, since_ns), within_s)
+        return self.heard.newest_beat(node_id, since_ns)
+
+    def _on_defect(self, error: SkinError) -> None:
+        self.defect = error

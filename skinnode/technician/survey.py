@@ -1,0 +1,192 @@
+"""Who is on a bus: every node-ID is asked at once, what beats is heard meanwhile, LSS finds the rest.
+
+Nothing is written but LSS switches, which concern nodes without a node-ID alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.errors import NodeError
+from skinnode.node.lss import LssAddress
+from skinnode.technician.line import Line
+from skinnode.wire import indices as od
+
+PACE_S: Final = 0.001
+"""Between two questions: a sixth of a bus at 1 Mbit/s, so that PDOs under way are not held up."""
+
+ANSWER_S: Final = 0.12
+"""How long after the last question of a sweep answers may come."""
+
+SWEEPS: Final = 2
+"""A node that was busy with the first question hears a second one."""
+
+LISTEN_S: Final = 1.2
+"""How long heartbeats are heard at least: of nodes that are stopped there is nothing else."""
+
+LSS_S: Final = 1.5
+"""Nodes without a node-ID are counted for this long; what is left is told as more."""
+
+_THREADS: Final = 16
+_ASK_DEVICE_TYPE: Final = bytes((0x40, 0x00, 0x10, 0x00))
+_ASK_SERIAL: Final = bytes((0x40, 0x18, 0x10, od.IDENTITY_SERIAL))
+
+
+@dataclass(frozen=True, slots=True)
+class FoundNode:
+    """A node-ID that was heard. What the node does not have, or did not answer, is None."""
+
+    node_id: int
+    answers: bool
+    """By SDO; a stopped node does not."""
+    state: str
+    state_known_by: str
+    """Or why it is not known."""
+    name: str | None
+    """0x1008."""
+    vendor_id: int | None
+    product_code: int | None
+    revision: int | None
+    serial: int | None
+    heartbeat_ms: int | None
+    boot_ups: int
+    """Heard during the survey."""
+    duplicate: str
+    """What speaks for two nodes with this node-ID; empty for nothing."""
+
+    @property
+    def is_patch(self) -> bool:
+        """Whether it is one of ours by vendor and product."""
+        return (self.vendor_id, self.product_code) == (od.VENDOR_ID, od.PRODUCT_CODE)
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What was found."""
+
+    nodes: tuple[FoundNode, ...]
+    """By ascending node-ID."""
+    unconfigured: tuple[LssAddress, ...]
+    """Nodes without a node-ID."""
+    more_unconfigured: bool
+    """There are others that time did not allow to tell apart."""
+    seconds: float
+
+
+def survey(line: Line, progress: Callable[[str], None] = lambda _: None) -> Survey:
+    """Find everybody. ``progress`` is told what is being done. Raises BusError."""
+    begun_s = time.monotonic()
+    with ThreadPoolExecutor(_THREADS, thread_name_prefix="survey") as pool:
+        lss = pool.submit(find_unconfigured, line)
+        progress("asking node-IDs 1 to 127")
+        answered = _sweep(line)
+        progress(f"{len(answered)} answer; who are they?")
+        jobs = [pool.submit(_examine, line, node_id, count) for node_id, count in answered.items()]
+        nodes = [job.result() for job in jobs]
+        line.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
+        unconfigured, more = lss.result()
+    silent = [_only_heard(line, node_id) for node_id in line.heard.nodes if node_id not in answered]
+    found = sorted((*nodes, *filter(None, silent)), key=lambda node: node.node_id)
+    return Survey(tuple(found), unconfigured, more, time.monotonic() - begun_s)
+
+
+def find_unconfigured(line: Line) -> tuple[tuple[LssAddress, ...], bool]:
+    """Nodes without a node-ID, and whether there are more than time allowed to find. They wait again at the
+    end."""
+    found: list[LssAddress] = []
+    end_s = time.monotonic() + LSS_S
+    if not line.lss.any_unconfigured():
+        return (), False
+    try:
+        while time.monotonic() < end_s:
+            address = line.lss.find_unconfigured()
+            if address is None or address in found:
+                return tuple(found), not found
+            found.append(address)
+        return tuple(found), line.lss.find_unconfigured() is not None
+    finally:
+        line.lss.release()
+
+
+def _sweep(line: Line) -> dict[int, int]:
+    """Node-IDs that answer, and the most answers that one question got."""
+    answers: dict[int, int] = {}
+    for _ in range(SWEEPS):
+        asked_ns = time.monotonic_ns()
+        for node_id in range(1, 128):
+            if node_id not in answers:
+                line.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE.ljust(8, b"\0"))
+                time.sleep(PACE_S)
+        line.wait_until(lambda: False, ANSWER_S)
+        for node_id, heard in line.heard.nodes.items():
+            count = sum(
+                t_ns >= asked_ns and data[1:4] == _ASK_DEVICE_TYPE[1:]
+                for t_ns, data in list(heard.sdo_answers)
+            )
+            if count and node_id not in answers:
+                answers[node_id] = count
+    return dict(sorted(answers.items()))
+
+
+def _examine(line: Line, node_id: int, answers: int) -> FoundNode:
+    duplicate = _two_serials(line, node_id) if answers > 1 else ""
+    identity = [_number(line, node_id, od.IDENTITY, sub) for sub in (1, 2, 3, 4)]
+    if not duplicate and identity[:2] == [od.VENDOR_ID, od.PRODUCT_CODE]:
+        strangers = _number(line, node_id, od.REJECTED_FRAMES, 7)
+        if strangers:
+            duplicate = f"the node heard its own node-ID from somebody else {strangers} times (0x2040:7)"
+    heartbeat_s = line.heartbeat_s(node_id)
+    state = line.state(node_id, heartbeat_s, guarding=not line.guarded(node_id))
+    return FoundNode(
+        node_id=node_id,
+        answers=True,
+        state=str(state),
+        state_known_by=state.how,
+        name=_text(line, node_id, od.DEVICE_NAME_INDEX),
+        vendor_id=identity[0],
+        product_code=identity[1],
+        revision=identity[2],
+        serial=identity[3],
+        heartbeat_ms=None if heartbeat_s is None else round(heartbeat_s * 1e3),
+        boot_ups=line.heard.node(node_id).boot_ups,
+        duplicate=duplicate,
+    )
+
+
+def _only_heard(line: Line, node_id: int) -> FoundNode | None:
+    """A node-ID that beats and does not answer."""
+    beat = line.heard.newest_beat(node_id)
+    if beat is None:
+        return None
+    state = line.state(node_id, None, guarding=False)
+    boot_ups = line.heard.node(node_id).boot_ups
+    nothing = dict.fromkeys(("vendor_id", "product_code", "revision", "serial", "heartbeat_ms"))
+    return FoundNode(
+        node_id, False, str(state), state.how, name=None, boot_ups=boot_ups, duplicate="", **nothing
+    )
+
+
+def _two_serials(line: Line, node_id: int) -> str:
+    answers = line.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
+    serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
+    shown = " and ".join(map(str, serials))
+    return f"one question got {max(2, len(answers))} answers" + (f": serials {shown}" if shown else "")
+
+
+def _number(line: Line, node_id: int, index: int, subindex: int) -> int | None:
+    try:
+        return int.from_bytes(line.od(node_id).read_bytes(index, subindex), "little")
+    except NodeError:
+        return None
+
+
+def _text(line: Line, node_id: int, index: int) -> str | None:
+    try:
+        text = line.od(node_id).read_bytes(index, 0).rstrip(b"\0").decode("latin-1")
+    except NodeError:
+        return None
+    return "".join(letter if letter.isprintable() else "�" for letter in text)

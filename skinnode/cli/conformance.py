@@ -37,7 +37,8 @@ def conformance(
     It RESETS the node many times, starts and stops it, remaps its PDOs, stores
     and restores its parameters, and puts back at the end what it changed: the
     configuration is read first, and stored again where it differs from the
-    defaults. For a bus without another master, and a machine that may stand.
+    defaults. It commands all nodes and speaks for others: use a bus without
+    another master, best without another node, and a machine that may stand.
 
     Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
     """

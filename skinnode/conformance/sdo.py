@@ -207,11 +207,7 @@ class SdoClient:
         """Bytes, number of segments, and whether the last of them was marked as the last of all."""
         data = b""
         for number in range(1, size + 1):
-            segment = (
-                _not_aborted(self.answer(f"segment {number}, {what}"), what)
-                if number == 1
-                else (self.answer(f"segment {number}, {what}"))
-            )
+            segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
             if segment[0] & 0x7F != number:
                 raise Failed(f"sequence number {number}, {what}", segment.hex(" ").upper())
             data += segment[1:]

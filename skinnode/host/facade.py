@@ -16,8 +16,9 @@ from typing import Final
 from skinnode.errors import BusError, CodecError, NodeTimeout, SkinError
 from skinnode.host import bringup
 from skinnode.host.bringup import Abandoned, Bringer, NodeFacts, check_eds
+from skinnode.host.dealer import BusStats, Handler
 from skinnode.host.health import OPERATIONAL, NodeMonitor, PatchHealth
-from skinnode.host.link import BusLink, BusStats, Handler
+from skinnode.host.link import BusLink
 from skinnode.host.pipeline import Lane, LaneStats, Solver, check_solvable
 from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
 from skinnode.host.sync import SyncProducer, SyncStats, Ticks

@@ -1,4 +1,4 @@
-"""One bus of the hand: its port, its receive thread, and the mainline that deals frames out by COB-ID."""
+"""One bus of the hand: its port, its receive thread, and its mainline."""
 
 from __future__ import annotations
 
@@ -6,26 +6,18 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Final, Self
 
 from skinnode.errors import BusError, CodecError, SkinError
+from skinnode.host.dealer import BusStats, Dealer, Handler
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Receiver
 from skinnode.wire.indices import sdo_response_cob_id
-from skinnode.wire.timing import BusLoad
 
 _log = logging.getLogger(__name__)
-
-Handler = Callable[[bytes, int], None]
-"""What happens to a frame: its data and when it was received, monotonic ns."""
-
-_MARK_NS: Final = 100_000_000
-_MARKS: Final = 10
-"""The load is the mean over the last ten tenths of a second."""
 
 _WAIT_S: Final = 0.02
 """How long the mainline waits for a frame before it looks at the clock for scans that lack something."""
@@ -35,30 +27,7 @@ _REOPEN_S: Final = 0.1
 """Pause before an interface that failed is opened again."""
 
 
-@dataclass(frozen=True, slots=True)
-class BusStats:
-    """What passed on a bus since the host opened it."""
-
-    received: int
-    """Data frames read, the host's own not among them."""
-    sent: int
-    foreign: int
-    """Data frames of a COB-ID that the hand file does not explain."""
-    ignored: int
-    """Remote, error and extended frames; on a bus without ``fd`` also CAN FD frames."""
-    dropped: int
-    """Frames that found the receive queue full."""
-    malformed: int
-    """Frames of a known COB-ID with a length that it does not have."""
-    outages: int
-    """Times the interface failed and was opened again."""
-    bits: int
-    """Exact length of all data frames, received and sent, up to a tenth of a second ago."""
-    load: float
-    """Share of the bus that these took over the last second; 1 is full."""
-
-
-class BusLink:
+class BusLink(Dealer):
     """An open bus. Its threads run from construction to :meth:`close`.
 
     ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once, from
@@ -69,23 +38,14 @@ class BusLink:
     def __init__(
         self, config: BusConfig, handlers: Mapping[int, Handler], on_failure: Callable[[SkinError], None]
     ) -> None:
-        self.config = config
-        self.first_malformed: CodecError | None = None
+        super().__init__(config, handlers, time.monotonic_ns())
         self._on_failure = on_failure
-        self._handlers = dict(handlers)
-        self._pollers: tuple[Callable[[int], None], ...] = ()
-        self._listeners: tuple[Callable[[Sequence[Frame]], None], ...] = ()
-        self._complained: set[int] = set()
-        self._foreign = self._ignored = self._malformed = self._received = 0
-        self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
-        self._outgoing: deque[tuple[int, bytes]] = deque()
+        self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[Callable[[], None]] = deque()
         self.failure: BusError | None = None
         """Why the bus is away; None while it is there."""
         self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
         self._outages = self._dropped_before = 0
-        self._marks: deque[tuple[int, int]] = deque([(time.monotonic_ns(), 0)], maxlen=_MARKS)
-        self._load = 0.0
         self._stop = threading.Event()
         self._port = CanPort(config)
         self.network = SkinNetwork(self.send)
@@ -95,12 +55,11 @@ class BusLink:
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send a data frame, from any thread. Raises BusError."""
+        t_ns = time.monotonic_ns()
         self._port.send(can_id, data)
-        self._outgoing.append((can_id, data))
-
-    def handle(self, cob_id: int, handler: Handler) -> None:
-        """From now on ``handler`` gets the data frames of ``cob_id``, on the mainline."""
-        self._handlers[cob_id] = handler
+        self.count_sent(can_id, data)
+        for listener in self._sent_listeners:
+            listener(Frame(can_id, data, t_ns, fd=len(data) > 8))
 
     def remote_od(self, node_id: int) -> RemoteOd:
         """The object dictionary of a node on this bus."""
@@ -116,41 +75,25 @@ class BusLink:
 
     def ask_remote(self, can_id: int) -> None:
         """Send a remote frame, as guarding does, from any thread. Raises BusError."""
+        t_ns = time.monotonic_ns()
         self._port.send(can_id, b"", remote=True)
+        for listener in self._sent_listeners:
+            listener(Frame(can_id, b"", t_ns, remote=True))
 
-    def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """From now on ``listener`` gets every batch of frames whole, of all kinds, before any handler does,
-        on the mainline."""
-        self._listeners = (*self._listeners, listener)
-
-    def poll_with(self, poller: Callable[[int], None]) -> None:
-        """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
-        self._pollers = (*self._pollers, poller)
+    def listen_to_sent(self, listener: Callable[[Frame], None]) -> None:
+        """From now on ``listener`` gets every frame that was sent, with the time at which it was handed to
+        the interface, on the thread that sent it."""
+        self._sent_listeners = (*self._sent_listeners, listener)
 
     def call(self, job: Callable[[], None]) -> None:
         """Have ``job`` done by the mainline, before any frame that is received from now on."""
         self._jobs.append(job)
 
-    def reject(self, error: CodecError) -> None:
-        """Count a frame that is not what its COB-ID promises; log the first of a COB-ID. Mainline only."""
-        self._malformed += 1
-        if self.first_malformed is None:
-            self.first_malformed = error
-        if error.cob_id not in self._complained:
-            self._complained.add(error.cob_id)
-            _log.warning("%s: %s; rejected, as are others like it", self.config.name, error)
-
     def stats(self) -> BusStats:
-        return BusStats(
-            received=self._received,
+        return self.count(
             sent=self._port.sent,
-            foreign=self._foreign,
-            ignored=self._ignored,
             dropped=self._dropped_before + self._receiver.dropped,
             outages=self._outages,
-            malformed=self._malformed,
-            bits=self._marks[-1][1],
-            load=self._load,
         )
 
     def stop(self) -> None:
@@ -210,33 +153,7 @@ class BusLink:
         batch = self._receiver.get_batch(_WAIT_S)
         while self._jobs:
             self._jobs.popleft()()
-        if batch:
-            for listener in self._listeners:
-                listener(batch)
-        for frame in batch:
-            if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
-                self._ignored += 1
-                continue
-            self._received += 1
-            self._meter.add(frame.can_id, frame.data, fd=frame.fd)
-            handler = self._handlers.get(frame.can_id)
-            if handler is None:
-                self._foreign += 1
-                continue
-            handler(frame.data, frame.t_ns)
+        self.deal(batch)
         # While frames wait, the time is that of the newest one dealt out: a scan is not late because we are.
-        now_ns = batch[-1].t_ns if batch else time.monotonic_ns()
-        for poll in self._pollers:
-            poll(now_ns)
-        if now_ns >= self._marks[-1][0] + _MARK_NS:
-            self._mark(now_ns)
+        self.poll(batch[-1].t_ns if batch else time.monotonic_ns())
         return bool(batch)
-
-    def _mark(self, now_ns: int) -> None:
-        """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
-        while self._outgoing:
-            self._meter.add(*self._outgoing.popleft())
-        bits = self._meter.bits
-        then_ns, then_bits = self._marks[0]
-        self._load = (bits - then_bits) * 1e9 / ((now_ns - then_ns) * self.config.bitrate_bps)
-        self._marks.append((now_ns, bits))

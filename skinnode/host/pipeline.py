@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -31,10 +32,13 @@ _log = logging.getLogger(__name__)
 
 
 class Solver:
-    """Scans of one patch to fields. Owned by one thread at a time."""
+    """Scans of one patch to fields. Owned by one thread at a time. ``clock`` says when a field is ready."""
 
-    def __init__(self, facts: NodeFacts, config: SolverConfig) -> None:
-        self._facts = facts
+    def __init__(
+        self, facts: NodeFacts, config: SolverConfig, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self.facts = facts
+        self._clock = clock
         self._tracker = Tracker(
             facts.layout,
             method=config.method,
@@ -47,19 +51,19 @@ class Solver:
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
         """Resistances of a scan, NaN where there is none."""
-        resistance_ohm, valid = decode(scan.codes, self._facts.baseline_ohm, self._facts.scale)
+        resistance_ohm, valid = decode(scan.codes, self.facts.baseline_ohm, self.facts.scale)
         valid &= scan.valid
         resistance_ohm[~valid] = np.nan
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, frame: ResistanceFrame) -> FieldFrame:
         """Field of a frame, stamped. The noise is that of the front end and of the codes together."""
-        analogue = self._facts.config.relative_noise
+        analogue = self.facts.config.relative_noise
         noise = np.hypot(analogue, self._quantisation_ohm / frame.resistance_ohm)
         field: FieldFrame = self._tracker.update(
             frame.resistance_ohm, frame.valid, np.where(frame.valid, noise, 1.0)
         )
-        return replace(field, stamp=replace(frame.stamp, t_solved_ns=time.monotonic_ns()))
+        return replace(field, stamp=replace(frame.stamp, t_solved_ns=self._clock()))
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
@@ -92,6 +96,19 @@ class LaneStats:
     assembler: AssemblerStats
 
 
+class LaneTap(Protocol):
+    """Who writes down what, beside the frames, decides which scans a lane makes of them. Mainline."""
+
+    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
+        """:meth:`Lane.resume` let scans through."""
+
+    def withheld(self, patch: str) -> None:
+        """:meth:`Lane.withhold` was called."""
+
+    def polled(self, patch: str, t_ns: int) -> None:
+        """:meth:`Lane.poll` ended a scan."""
+
+
 class Lane:
     """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
     them."""
@@ -111,6 +128,7 @@ class Lane:
         self._tick, self._on_scan = tick, on_scan
         self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque(maxlen=1)
         self._token: deque[None] = deque([None])
+        self.tap: LaneTap | None = None
         self.withholdings = 0
         """How often scans began to be withheld."""
         self._withheld = 0
@@ -135,12 +153,16 @@ class Lane:
         """Let a scan go that has waited long enough for what it lacks."""
         scan = self._assembler.poll(t_ns)
         if scan is not None:
+            if self.tap is not None:
+                self.tap.polled(self._patch, t_ns)
             self._offer(scan)
 
     def withhold(self) -> None:
         """Let no scan through from now on, the one under way included."""
         self._solver = None
         self.withholdings += 1
+        if self.tap is not None:
+            self.tap.withheld(self._patch)
 
     def resume(self, solver: Solver, withholdings: int, *, anew: bool) -> None:
         """Let scans through from now on, decoded and solved by ``solver``; unless there was another reason to
@@ -151,6 +173,8 @@ class Lane:
         self._solver = solver
         if anew:
             self._assembler.reset()
+        if self.tap is not None:
+            self.tap.resumed(self._patch, solver, anew=anew)
 
     def close(self) -> None:
         """Take no scan that is still in the box. Called when the mainline has ended."""

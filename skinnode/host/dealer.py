@@ -1,0 +1,140 @@
+"""What the mainline of a bus does with frames: counts them and deals them out by COB-ID. No thread, no clock.
+
+A :class:`~skinnode.host.link.BusLink` is fed by a bus; a replay feeds a dealer from a recording.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.errors import CodecError
+from skinnode.model.config import BusConfig
+from skinnode.transport import Frame
+from skinnode.wire.timing import BusLoad
+
+_log = logging.getLogger(__name__)
+
+Handler = Callable[[bytes, int], None]
+"""What happens to a frame: its data and when it was received, monotonic ns."""
+
+_MARK_NS: Final = 100_000_000
+_MARKS: Final = 10
+"""The load is the mean over the last ten tenths of a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusStats:
+    """What passed on a bus since the host opened it."""
+
+    received: int
+    """Data frames read, the host's own not among them."""
+    sent: int
+    foreign: int
+    """Data frames of a COB-ID that the hand file does not explain."""
+    ignored: int
+    """Remote, error and extended frames; on a bus without ``fd`` also CAN FD frames."""
+    dropped: int
+    """Frames that found the receive queue full."""
+    malformed: int
+    """Frames of a known COB-ID with a length that it does not have."""
+    outages: int
+    """Times the interface failed and was opened again."""
+    bits: int
+    """Exact length of all data frames, received and sent, up to a tenth of a second ago."""
+    load: float
+    """Share of the bus that these took over the last second; 1 is full."""
+
+
+class Dealer:
+    """One bus of the hand, as far as its frames go. Owned by one thread, the mainline; only what says so may
+    be called from others."""
+
+    def __init__(self, config: BusConfig, handlers: Mapping[int, Handler], now_ns: int) -> None:
+        self.config = config
+        self.first_malformed: CodecError | None = None
+        self._handlers = dict(handlers)
+        self._pollers: tuple[Callable[[int], None], ...] = ()
+        self._listeners: tuple[Callable[[Sequence[Frame]], None], ...] = ()
+        self._complained: set[int] = set()
+        self._foreign = self._ignored = self._malformed = self._received = 0
+        self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
+        self._outgoing: deque[tuple[int, bytes]] = deque()
+        self._marks: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=_MARKS)
+        self._load = 0.0
+
+    def handle(self, cob_id: int, handler: Handler) -> None:
+        """From now on ``handler`` gets the data frames of ``cob_id``, on the mainline."""
+        self._handlers[cob_id] = handler
+
+    def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
+        """From now on ``listener`` gets every batch of frames whole, of all kinds, before any handler does,
+        on the mainline."""
+        self._listeners = (*self._listeners, listener)
+
+    def poll_with(self, poller: Callable[[int], None]) -> None:
+        """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
+        self._pollers = (*self._pollers, poller)
+
+    def count_sent(self, can_id: int, data: bytes) -> None:
+        """Let a frame that was sent count towards the load. From any thread."""
+        self._outgoing.append((can_id, data))
+
+    def deal(self, batch: Sequence[Frame]) -> None:
+        """Frames to their handlers, in order."""
+        if batch:
+            for listener in self._listeners:
+                listener(batch)
+        for frame in batch:
+            if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
+                self._ignored += 1
+                continue
+            self._received += 1
+            self._meter.add(frame.can_id, frame.data, fd=frame.fd)
+            handler = self._handlers.get(frame.can_id)
+            if handler is None:
+                self._foreign += 1
+                continue
+            handler(frame.data, frame.t_ns)
+
+    def poll(self, now_ns: int) -> None:
+        """Tell the pollers the time, after a batch."""
+        for poll in self._pollers:
+            poll(now_ns)
+        if now_ns >= self._marks[-1][0] + _MARK_NS:
+            self._mark(now_ns)
+
+    def reject(self, error: CodecError) -> None:
+        """Count a frame that is not what its COB-ID promises; log the first of a COB-ID. Mainline only."""
+        self._malformed += 1
+        if self.first_malformed is None:
+            self.first_malformed = error
+        if error.cob_id not in self._complained:
+            self._complained.add(error.cob_id)
+            _log.warning("%s: %s; rejected, as are others like it", self.config.name, error)
+
+    def count(self, *, sent: int = 0, dropped: int = 0, outages: int = 0) -> BusStats:
+        """All counters; the arguments are those of whoever feeds the dealer. From any thread."""
+        return BusStats(
+            received=self._received,
+            sent=sent,
+            foreign=self._foreign,
+            ignored=self._ignored,
+            dropped=dropped,
+            outages=outages,
+            malformed=self._malformed,
+            bits=self._marks[-1][1],
+            load=self._load,
+        )
+
+    def _mark(self, now_ns: int) -> None:
+        """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
+        while self._outgoing:
+            self._meter.add(*self._outgoing.popleft())
+        bits = self._meter.bits
+        then_ns, then_bits = self._marks[0]
+        self._load = (bits - then_bits) * 1e9 / ((now_ns - then_ns) * self.config.bitrate_bps)
+        self._marks.append((now_ns, bits))

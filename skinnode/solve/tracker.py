@@ -129,6 +129,7 @@ class Tracker:
         self._large_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # what its confirmation left open of a wire
         self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
         rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
         self._folded = folded_wires(layout, normal_only) | rough_noise
@@ -139,6 +140,7 @@ class Tracker:
         if self._exact is not None:
             self._exact.reset()
             self._confirmed = None
+            self._apart[:] = 0.0
             self._last_m[:] = 0.0
 
     def update(
@@ -167,6 +169,7 @@ class Tracker:
             self._posterior.stop_at(start + self._seconds)
             guide = self._posterior.update(frame_ohm, valid, noise)
             field = self._refer(field, lost | unsure, guide)
+        field = self._keep_apart(field, ~(lost | unsure))
         self._last_m = field.displacement_m
         return field
 
@@ -191,6 +194,22 @@ class Tracker:
                 rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
             unsure |= rough
         return lost, unsure
+
+    def _keep_apart(self, field: FieldFrame, unasked: NDArray[np.bool_]) -> FieldFrame:
+        """A wire that is held is no better known than when the posterior confirmed it."""
+        if field.held is None:
+            return field
+        self._apart[unasked & ~field.held] = 0.0
+        still = unasked & field.held & (self._apart[:, 0, 0] > 0.0)
+        if not still.any():
+            return field
+        apart = np.where(still[:, None, None], self._apart, 0.0)
+        core = field.core_std_m
+        return dataclasses.replace(
+            field,
+            displacement_std_m=np.hypot(field.displacement_std_m, apart),
+            core_std_m=None if core is None else np.hypot(core, apart),
+        )
 
     def _refer(self, field: FieldFrame, doubtful: NDArray[np.bool_], guide: FieldFrame) -> FieldFrame:
         """The field with the posterior's word on the doubtful wires: confirmed, replaced, or given up."""
@@ -222,6 +241,9 @@ class Tracker:
                 std[replaced & self._folded] *= 2.0
                 std = np.where((agreed & self._folded)[:, None, None], np.hypot(std, apart), std)
             return std
+
+        self._apart[doubtful] = 0.0
+        self._apart[agreed & self._folded] = apart[agreed & self._folded]
 
         assert guide.core_std_m is not None
         self._exact.adopt(replaced, moved)

@@ -243,3 +243,18 @@ def test_reset_forgets_the_stream_of_both_methods():
         np.testing.assert_array_equal(one.displacement_m, two.displacement_m)
         np.testing.assert_array_equal(one.displacement_std_m, two.displacement_std_m)
         assert one.status == two.status
+
+
+def test_what_a_confirmation_left_open_stays_while_a_wire_is_held():
+    """Much noise, so that roots lie within it: the same frame again says nothing new of a wire."""
+    layout = sk.PatchLayout.preset("staggered")
+    rng = np.random.default_rng(5)
+    tracker = sk.Tracker(layout, method="exact", relative_noise=1e-3)
+    tracker.update(noisy(layout, np.zeros_like(layout.upper_m), rng, 1e-3))
+    frame = noisy(layout, hertz_press(layout, 0.2), rng, 1e-3)
+    first, again = tracker.update(frame), tracker.update(frame)
+    assert first.by_prior is not None
+    own = again.held & ~first.by_prior & ~np.isinf(first.displacement_std_m).any(axis=(1, 2))
+    assert own.any()
+    wide, still = (field.displacement_std_m[own].max(axis=(1, 2)) for field in (first, again))
+    assert (still > 0.5 * wide).all()

@@ -1,0 +1,43 @@
+"""What a node's object dictionary looks like: of a patch of ours by its identity, of others by a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from skinnode.conformance.eds import Eds, parse_eds
+from skinnode.errors import ConfigError, NodeError, ProfileError
+from skinnode.host.network import RemoteOd
+from skinnode.wire import indices as od
+from skinnode.wire.profile import PatchProfile, eds_name, eds_text
+
+
+def read_profile(remote: RemoteOd) -> PatchProfile | None:
+    """The sizes of a patch of ours, None for another device. Raises NodeError where it does not answer."""
+    try:
+        identity = [remote.read(od.IDENTITY, sub, "u32") for sub in (od.IDENTITY_VENDOR, od.IDENTITY_PRODUCT)]
+        if identity != [od.VENDOR_ID, od.PRODUCT_CODE]:
+            return None
+        subs = od.ROWS, od.COLUMNS, od.UPPER_ELECTRODES, od.LOWER_ELECTRODES, od.CODE_BITS, od.PDO_BYTES
+        rows, columns, upper, lower, bits, pdo_bytes = (remote.read(od.DESCRIPTOR, sub, "u8") for sub in subs)
+        return PatchProfile(rows, columns, upper, lower, bits, bus="classic" if pdo_bytes == 8 else "fd")
+    except ConfigError as error:
+        raise NodeError(remote.node_id, f"its descriptor (0x2000) is of no patch: {error}") from None
+
+
+def load_sheet(path: Path) -> Eds:
+    """An EDS or DCF. Raises ConfigError for a file that cannot be read, ProfileError for one that is none."""
+    try:
+        text = path.read_text(encoding="latin-1")
+    except OSError as error:
+        raise ConfigError("EDS", str(path), f"a file that can be read ({error.strerror})") from None
+    return parse_eds(text, str(path))
+
+
+def sheet_of(remote: RemoteOd, path: Path | None) -> Eds:
+    """That of the file, or of a patch of ours. Raises ProfileError for another device without a file."""
+    if path is not None:
+        return load_sheet(path)
+    profile = read_profile(remote)
+    if profile is None:
+        raise ProfileError("--eds", None, f"the EDS of node {remote.node_id}, which is no patch of ours")
+    return parse_eds(eds_text(profile), eds_name(profile))

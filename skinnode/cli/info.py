@@ -39,7 +39,7 @@ def info(
 
     place = find_bus(interface, channel, bitrate, fd, hand, bus)
     node_id = find_node(node, place)
-    sheet = None if eds is None else load_sheet(eds)
+    sheet = None if eds is None else load_sheet(eds).eds
     with progress(as_json) as tell, Line(place.bus) as line:
         tell(f"reading node {node_id}")
         found = read_info(line, node_id, sheet)

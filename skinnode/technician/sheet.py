@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 from skinnode.conformance.eds import Eds, parse_eds
 from skinnode.errors import ConfigError, NodeError, ProfileError
 from skinnode.host.network import RemoteOd
 from skinnode.wire import indices as od
 from skinnode.wire.profile import PatchProfile, eds_name, eds_text
+
+
+class Sheet(NamedTuple):
+    """An electronic data sheet, read and as text."""
+
+    eds: Eds
+    text: str
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
@@ -24,20 +32,21 @@ def read_profile(remote: RemoteOd) -> PatchProfile | None:
         raise NodeError(remote.node_id, f"its descriptor (0x2000) is of no patch: {error}") from None
 
 
-def load_sheet(path: Path) -> Eds:
+def load_sheet(path: Path) -> Sheet:
     """An EDS or DCF. Raises ConfigError for a file that cannot be read, ProfileError for one that is none."""
     try:
         text = path.read_text(encoding="latin-1")
     except OSError as error:
         raise ConfigError("EDS", str(path), f"a file that can be read ({error.strerror})") from None
-    return parse_eds(text, str(path))
+    return Sheet(parse_eds(text, str(path)), text)
 
 
-def sheet_of(remote: RemoteOd, path: Path | None) -> Eds:
+def sheet_of(remote: RemoteOd, path: Path | None) -> Sheet:
     """That of the file, or of a patch of ours. Raises ProfileError for another device without a file."""
     if path is not None:
         return load_sheet(path)
     profile = read_profile(remote)
     if profile is None:
         raise ProfileError("--eds", None, f"the EDS of node {remote.node_id}, which is no patch of ours")
-    return parse_eds(eds_text(profile), eds_name(profile))
+    text = eds_text(profile)
+    return Sheet(parse_eds(text, eds_name(profile)), text)

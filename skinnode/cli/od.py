@@ -1,0 +1,212 @@
+"""``skinnode od NODE [INDEX[:SUB]]``: the object dictionary of a node, read, written, dumped and compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from skinnode.conformance.eds import Eds, EdsEntry
+    from skinnode.host.network import RemoteOd
+    from skinnode.technician.dictionary import Difference, Reading
+    from skinnode.technician.sheet import Sheet
+
+
+def od(
+    node: Node,
+    address: Annotated[
+        str | None, typer.Argument(help="0x1018 or 0x1018:4; all without.", metavar="INDEX[:SUB]")
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    fd: Fd = False,
+    hand: Hand = None,
+    bus: Bus = None,
+    write: Annotated[
+        str | None, typer.Option(help="Write this, typed as the EDS says, and read it back.", metavar="VALUE")
+    ] = None,
+    as_hex: Annotated[bool, typer.Option("--hex", help="Bytes as they travel, both ways.")] = False,
+    eds: Annotated[
+        Path | None, typer.Option(help="Names and types; not needed for a patch of ours.", metavar="FILE")
+    ] = None,
+    dcf: Annotated[
+        Path | None, typer.Option(help="Write all that can be configured as a DCF.", metavar="FILE")
+    ] = None,
+    diff: Annotated[
+        Path | None, typer.Option(help="Show what differs from this EDS or DCF.", metavar="FILE")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Read or write objects of a node. Indices are hexadecimal, with or without 0x.
+
+    Without INDEX it dumps the whole dictionary. Exit status 0 if done, 1 if
+    --diff found differences, 2 if the node did not answer or refused.
+    """
+    from skinnode.cli._bus import find_bus, find_node
+    from skinnode.cli._console import print_json, progress
+    from skinnode.cli._files import require_writable
+    from skinnode.errors import ConfigError
+    from skinnode.technician.dictionary import compare, entries_at, expected, parse_address, require_answer
+    from skinnode.technician.line import Line
+    from skinnode.technician.sheet import load_sheet, sheet_of
+
+    place = find_bus(interface, channel, bitrate, fd, hand, bus)
+    node_id = find_node(node, place)
+    where = None if address is None else parse_address(address)
+    if write is not None and where is None:
+        raise ConfigError("--write", write, "a value beside INDEX[:SUB]")
+    if diff is not None and (where is not None or write is not None or dcf is not None):
+        raise ConfigError("--diff", str(diff), "alone: it compares the whole dictionary")
+    if dcf is not None and where is not None:
+        raise ConfigError("--dcf", str(dcf), "no INDEX beside it: it takes the whole dictionary")
+    if dcf is not None:
+        require_writable("--dcf", dcf)
+    wanted = None if diff is None else expected(load_sheet(diff))
+    with progress(as_json) as tell, Line(place.bus) as line:
+        remote = line.od(node_id)
+        require_answer(remote)
+        if wanted is not None:
+            found = compare(remote, wanted, node_id, tell)
+        else:
+            typed = where is None or (write is not None and not as_hex)
+            sheet = sheet_of(remote, eds) if typed else _sheet_if_any(remote, eds)
+            if where is None:
+                readings = _dump(remote, sheet.eds, tell)
+            else:
+                entries = entries_at(sheet.eds, *where)
+                if write is not None:
+                    _write(remote, entries, write, as_hex, node_id)
+                readings = _read(remote, entries)
+    if wanted is not None:
+        _tell_differences(found, as_json)
+        if found:
+            raise typer.Exit(1)
+        return
+    if dcf is not None:
+        _write_dcf(dcf, readings, sheet, node_id, place.bus.bitrate_bps, place.patch_name(node_id))
+    elif as_json:
+        print_json([_as_json(reading) for reading in readings])
+    else:
+        _print(readings, as_hex, single=where is not None)
+
+
+def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> Sheet:
+    """Bytes need no types."""
+    from skinnode.conformance.eds import Eds
+    from skinnode.errors import ProfileError
+    from skinnode.technician.sheet import Sheet, sheet_of
+
+    try:
+        return sheet_of(remote, eds)
+    except ProfileError:
+        if eds is not None:
+            raise
+        return Sheet(Eds("", {}, frozenset(), {}, ()), "")
+
+
+def _dump(remote: RemoteOd, sheet: Eds, tell: Callable[[str], None]) -> list[Reading]:
+    from skinnode.technician.dictionary import dump
+
+    return list(dump(remote, sheet, tell))
+
+
+def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
+    """One object alone must be there; of several the refusal of one is told beside the others."""
+    from skinnode.technician.dictionary import read_entry
+
+    if len(entries) == 1 and entries[0].access != "wo":
+        remote.read_bytes(entries[0].index, entries[0].subindex)
+    return [read_entry(remote, entry) for entry in entries if entry.access != "wo"]
+
+
+def _write(remote: RemoteOd, entries: list[EdsEntry], text: str, as_hex: bool, node_id: int) -> None:
+    from skinnode.errors import ConfigError
+    from skinnode.technician.dictionary import encode
+
+    if len(entries) != 1:
+        raise ConfigError("INDEX", f"0x{entries[0].index:04X}", "one with :SUB, for an array or a record")
+    (entry,) = entries
+    if as_hex:
+        try:
+            data = bytes.fromhex(text)
+        except ValueError:
+            raise ConfigError("--write", text, "bytes in hexadecimal, such as 'e8 03'") from None
+    else:
+        data = encode(entry, text, node_id)
+    remote.write_bytes(entry.index, entry.subindex, data)
+
+
+def _write_dcf(
+    file: Path, readings: list[Reading], sheet: Sheet, node_id: int, bitrate: int, name: str
+) -> None:
+    from skinnode.cli._files import write_text
+    from skinnode.technician.dictionary import as_dcf
+
+    text = as_dcf(sheet, readings, node_id, bitrate, name or f"node {node_id}")
+    write_text("--dcf", file, text)
+    refused = [reading for reading in readings if reading.refused and reading.refused != "no data"]
+    typer.echo(f"{len(readings) - len(refused)} values of node {node_id} in {file}")
+    for reading in refused:
+        typer.echo(f"note: 0x{reading.index:04X}:{reading.subindex} {reading.refused}")
+
+
+def _print(readings: list[Reading], as_hex: bool, *, single: bool) -> None:
+    from rich.markup import escape
+
+    from skinnode.cli._console import console, table
+    from skinnode.technician.dictionary import hex_text
+
+    out = console()
+    listed = table("object", "name", "type", "access", "value")
+    for reading in readings:
+        raw = as_hex and reading.data is not None
+        whole = single and len(readings) == 1
+        value = (reading.data or b"").hex(" ") if raw and whole else hex_text(reading.data or b"")
+        listed.add_row(
+            f"{reading.index:04X}:{reading.subindex}",
+            escape(reading.name),
+            reading.data_type,
+            reading.access,
+            escape(value if raw else reading.text),
+        )
+    out.print(listed)
+
+
+def _tell_differences(found: list[Difference], as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from rich.markup import escape
+
+    from skinnode.cli._console import console, print_json, table
+
+    if as_json:
+        print_json([asdict(difference) for difference in found])
+        return
+    if not found:
+        typer.echo("no differences")
+        return
+    listed = table("object", "name", "node", "file")
+    for item in found:
+        listed.add_row(f"{item.index:04X}:{item.subindex}", *map(escape, (item.name, item.node, item.file)))
+    console().print(listed)
+    typer.echo(f"{len(found)} differences")
+
+
+def _as_json(reading: Reading) -> dict[str, object]:
+    return {
+        "index": reading.index,
+        "subindex": reading.subindex,
+        "name": reading.name,
+        "type": reading.data_type,
+        "access": reading.access,
+        "value": reading.value,
+        "hex": None if reading.data is None else reading.data.hex(),
+        "refused": reading.refused or None,
+    }

@@ -44,11 +44,12 @@ def simulate(
     Bring them up with `skinnode host` and the same file in another terminal.
     """
     from skinnode.model.config import load_hand
+    from skinnode.pauses import short_pauses
     from skinnode.signals import until_told
     from vcan_sim.fleet import Fleet
 
     plan = load_hand(hand).on(interface, channel)
-    with until_told() as ended, Fleet(plan) as fleet:
+    with until_told() as ended, Fleet(plan) as fleet, short_pauses():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         _say(f"{len(plan.patches)} patches of {plan.name!r} on {where}; Ctrl-C ends")
         _watch(fleet, ended.wait, seconds)

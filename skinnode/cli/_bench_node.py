@@ -22,6 +22,7 @@ from skinnode.model.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import EXACT, THRIFTY, NodeRunner, Pacing, PatchNode
+from skinnode.pauses import short_pauses
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 
@@ -87,9 +88,10 @@ class _Rig:
 def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dict[str, Any]:
     """All rows. ``seconds``: length of each measurement on the bus."""
     config = BusConfig(interface=interface, channel=channel or uuid.uuid4().hex)
-    rows = _scans(config, seconds, EXACT, "exact") + _scans(config, seconds, THRIFTY, "thrifty")
-    rows.append(_heartbeat(config, seconds, 0))
-    rows.append(_heartbeat(config, seconds, FULL_BUS_HZ))
+    with short_pauses():
+        rows = _scans(config, seconds, EXACT, "exact") + _scans(config, seconds, THRIFTY, "thrifty")
+        rows.append(_heartbeat(config, seconds, 0))
+        rows.append(_heartbeat(config, seconds, FULL_BUS_HZ))
     handling = [
         {"what": what, "us": timing.call_us} for what, timing in take_turns(handlers(), rounds=rounds).items()
     ]

@@ -29,6 +29,7 @@ from skinnode.host.pipeline import LaneStats
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
+from skinnode.pauses import short_pauses
 from skinnode.wire.codec import CodeScale
 from vcan_sim.fleet import Fleet
 
@@ -204,7 +205,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with _responsive_threads(), _ended_by_sigterm(), Fleet(hand) as fleet:
-        with Host.from_config(hand) as host:
+        with Host.from_config(hand) as host, short_pauses():
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
             progress = _Progress(console, hand, list(watches.values()), seconds)

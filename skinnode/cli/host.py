@@ -64,9 +64,10 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
     """Run the hand until told to end or time is up; the exit status. Of a frame that was not what its
     identifier promises the host has said so in the log, which Python writes to stderr."""
     from skinnode.host import BringUpCancelled, Host
+    from skinnode.pauses import short_pauses
 
     try:
-        with Host.from_config(plan, cancelled=told.is_set) as running:
+        with Host.from_config(plan, cancelled=told.is_set) as running, short_pauses():
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)

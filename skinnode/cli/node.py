@@ -69,6 +69,7 @@ def node(
     from skinnode.node.find_source import make_source
     from skinnode.node.lss import NOT_CONFIGURED
     from skinnode.node.memory import FileMemory
+    from skinnode.pauses import short_pauses
     from skinnode.signals import until_told
     from skinnode.transport import CanPort
     from skinnode.wire.profile import PatchProfile
@@ -100,7 +101,7 @@ def node(
             memory=None if store is None else FileMemory(store),
             pacing=EXACT if strict_timing else THRIFTY,
         )
-        with NodeRunner(port, [board]) as runner:
+        with short_pauses(), NodeRunner(port, [board]) as runner:
             where = f"{interface} {channel}{', CAN FD' if fd else ''}"
             sizes = f"{profile.rows} × {profile.columns} wires, {code_bits}-bit codes"
             who = f"node {node_id}" if node_id is not None else "node without a node-ID of its own"

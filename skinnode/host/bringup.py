@@ -1,32 +1,34 @@
 """From a node that may be there to one that is known, configured and ready to start.
 
 Nothing is written to a node before its identity and its layout are what the hand file says: it could be a
-drive. What is written is read back.
+drive. What is written is read back. A guest writes what belongs to the patch alone, and only what differs: no
+NMT, no SYNC parameters; one that sends nothing takes all from files.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from skinnode.errors import NodeError, NodeTimeout, ProfileError
+from skinnode.errors import ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
 from skinnode.host.network import RemoteOd
-from skinnode.model.config import PatchConfig, SyncConfig
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
+from skinnode.wire.coordinates import unpack_coordinates
 from skinnode.wire.profile import PatchProfile
 
 BOOT_DEADLINE_S: Final = 3.0
 """How long a node may take to answer for the first time; controllers boot and tare within a second."""
 
-HEARTBEAT_S: Final = 0.25
-"""Heartbeat the nodes are told to send: a lost node shows within a second, at 0.1 % of the bus for four."""
+HEARTBEATS_WATCHED: Final = 3
+"""Heartbeats of the host that a node may miss before it falls silent, where the host sends one."""
 
 SCAN_SHARE: Final = 0.8
 """Part of the SYNC period in which a node paces its scan; the rest is slack for SDO, EMCY and late frames."""
@@ -35,6 +37,10 @@ _NMT_START: Final = 0x01
 _NMT_PRE_OPERATIONAL: Final = 0x80
 _INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID that switches it off while its parameters are changed."""
+
+_NO_OBJECT: Final = 0x0602_0000
+_NO_COMMAND: Final = 0x0504_0001
+"""Abort codes: object does not exist; command specifier (such as that of a block transfer) unknown."""
 
 _POLL_S: Final = 0.02
 
@@ -49,7 +55,14 @@ class NodeFacts:
     scale: CodeScale
     baseline_ohm: Float
     """(U, K) resistances at rest, as the node encodes with them."""
-    serial: int
+    serial: int | None
+    """None where nobody could ask."""
+    heartbeat_s: float
+    """How often the node sends one."""
+
+    def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
+        """The same patch after a tare."""
+        return replace(self, baseline_ohm=baseline_ohm)
 
 
 class Abandoned(Exception):
@@ -64,32 +77,47 @@ class Bringer:
     """
 
     send: Callable[[int, bytes], None]
-    sync: SyncConfig
+    hand: HandConfig
+    bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
     on_answer: Callable[[PatchConfig], None]
+    search: Callable[[PatchConfig], object]
+    """Looks for a node that does not answer, by its serial number."""
 
-    def bring_up(
-        self, patch: PatchConfig, layout: PatchLayout, profile: PatchProfile, remote: RemoteOd
-    ) -> NodeFacts:
-        """Wait for the node, check who it is, configure it; it ends up pre-operational.
+    def bring_up(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
+        """Wait for the node, check who it is, configure it; on the bus of a master it ends up
+        pre-operational.
 
         Raises NodeTimeout where it does not answer in time, NodeError where it is not the patch of the file
-        or does not keep its configuration, SdoAbort where it refuses.
+        or does not keep its configuration, SdoAbort where it refuses, ConfigError for a baseline file that
+        does not fit the patch.
         """
+        master = self.bus.role == "master"
+        if not (master or self.bus.guest_sends == "sdo"):
+            return self._from_files(patch, profile)
         self._wait_for(patch, remote)
         self.on_answer(patch)
         serial = self._identify(patch, remote)
-        self._check_layout(patch, layout, profile, remote)
-        stand_by(self.send, patch.node_id)
-        self._configure(patch, profile, remote)
+        layout = self._check_layout(patch, profile, remote)
+        if master:
+            stand_by(self.send, patch.node_id)
+            self._configure_communication(remote)
+        heartbeat_s = self._configure_heartbeat(remote, master=master)
+        self._configure(patch, profile, remote, master=master)
         scale = CodeScale(
             patch.code_bits,
             remote.read(od.DESCRIPTOR, od.CODE_LO, "f32"),
             remote.read(od.DESCRIPTOR, od.CODE_HI, "f32"),
         )
-        baseline_ohm = self._read_baseline(patch, profile, remote)
-        return NodeFacts(patch, layout, profile, scale, baseline_ohm, serial)
+        baseline_ohm = self.settle_baseline(patch, profile, remote)
+        return NodeFacts(patch, layout, profile, scale, baseline_ohm, serial, heartbeat_s)
+
+    def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
+        assert patch.baseline is not None  # the hand file was checked
+        baseline_ohm = load_baseline(patch.baseline, profile)
+        scale, heartbeat_s = CodeScale(patch.code_bits), self.hand.bring_up.heartbeat_s
+        return NodeFacts(patch, patch.layout.build(), profile, scale, baseline_ohm, None, heartbeat_s)
 
     def _go_on(self) -> None:
         if self.abandoned():
@@ -99,6 +127,7 @@ class Bringer:
         end_s = time.monotonic() + self.boot_deadline_s
         while not remote.answers():
             self._go_on()
+            self.search(patch)
             if time.monotonic() > end_s:
                 raise NodeTimeout(
                     patch.node_id,
@@ -123,9 +152,7 @@ class Bringer:
             raise _mismatch(patch, "serial number", str(serial), f"{patch.serial} as in the hand file")
         return serial
 
-    def _check_layout(
-        self, patch: PatchConfig, layout: PatchLayout, profile: PatchProfile, remote: RemoteOd
-    ) -> None:
+    def _check_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
         for subindex, what, wanted in (
             (od.ROWS, "upper wires", profile.rows),
             (od.COLUMNS, "lower wires", profile.columns),
@@ -138,33 +165,80 @@ class Bringer:
             if got != wanted:
                 raise _mismatch(patch, what, str(got), f"{wanted} as in the hand file")
         got = remote.read(od.DESCRIPTOR, od.LAYOUT_HASH, "u32")
+        layout, source = patch.layout.build(), "as in the hand file"
+        if patch.layout.coordinates == "node":
+            layout, source = self._read_layout(patch, profile, remote), "of the node's own coordinates"
         if got != layout.layout_hash:
-            wanted_hash = f"0x{layout.layout_hash:08X} ({layout.name} as in the hand file)"
+            wanted_hash = f"0x{layout.layout_hash:08X} ({layout.name} {source})"
             raise _mismatch(patch, "layout hash", f"0x{got:08X}", wanted_hash)
+        return layout
 
-    def _configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
+    def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
+        """The electrodes as the node knows them."""
         self._go_on()
-        period_us = self.sync.period_ms * 1000
+        data = remote.read_block(od.COORDINATES)
+        resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
+        try:
+            return unpack_coordinates(data, profile, resistivity)
+        except ValueError as error:  # ConfigError is one
+            raise _mismatch(patch, "electrode coordinates", f"{len(data)} bytes", str(error)) from None
+
+    def _configure_communication(self, remote: RemoteOd) -> None:
+        """What a master decides: SYNC, and whose heartbeat is watched."""
+        self._go_on()
+        sync = self.hand.sync
         remote.configure(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
         # The overflow value may only change while the cycle period is 0 (CiA 301, 7.5.2.22).
         remote.configure(od.CYCLE_PERIOD, 0, "u32", 0)
-        remote.configure(od.SYNC_COUNTER_OVERFLOW, 0, "u8", self.sync.counter_overflow)
-        remote.configure(od.CYCLE_PERIOD, 0, "u32", period_us)
-        remote.configure(od.HEARTBEAT_PRODUCER, 0, "u16", round(HEARTBEAT_S * 1000))
-        remote.configure(od.ACQUISITION, od.ACQUISITION_PERIOD, "u16", 0)
-        remote.configure(od.SEND_POLICY, od.SEND_MODE, "u8", 0)
+        remote.configure(od.SYNC_COUNTER_OVERFLOW, 0, "u8", sync.counter_overflow)
+        remote.configure(od.CYCLE_PERIOD, 0, "u32", sync.period_ms * 1000)
+        watched = 0
+        if self.bus.heartbeat_node_id is not None:
+            within_ms = HEARTBEATS_WATCHED * self.hand.bring_up.heartbeat_ms
+            watched = self.bus.heartbeat_node_id << 16 | within_ms
+        remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
+
+    def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
+        """Tell the node to beat; a guest does so only where nobody else has. Returns the period, s."""
+        heartbeat_ms = self.hand.bring_up.heartbeat_ms
+        if not master:
+            told_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
+            if told_ms:
+                return told_ms * 1e-3
+        remote.configure(od.HEARTBEAT_PRODUCER, 0, "u16", heartbeat_ms)
+        return heartbeat_ms * 1e-3
+
+    def _configure(
+        self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
+    ) -> None:
+        """What belongs to the patch alone: when it scans and how it sends."""
+        sync = self.hand.sync
+        if not master:
+            overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
+            if overflow != sync.counter_overflow:
+                allowed = f"{sync.counter_overflow} as in sync.counter_overflow of the hand file"
+                raise _mismatch(patch, "SYNC counter overflow, set by another master", str(overflow), allowed)
+        write = remote.configure if master else remote.ensure
+        write(od.ACQUISITION, od.ACQUISITION_PERIOD, "u16", 0)
+        write(od.SEND_POLICY, od.SEND_MODE, "u8", 0)
         self._check_mapping(patch, profile, remote)
-        inhibit_100us = inhibit_time_100us(self.sync.period_ms, profile.n_chunks + 1)
+        inhibit_100us = inhibit_time_100us(sync.period_ms, profile.n_chunks + 1)
         for index, cob_id, kind, inhibit in (
             (od.TPDO1_PARAMETER, od.chunk_cob_id(patch.node_id), 254, inhibit_100us),
             (od.TPDO2_PARAMETER, od.summary_cob_id(patch.node_id), 1, 0),
         ):
             self._go_on()
+            wanted = (
+                (od.PDO_TYPE, "u8", kind),
+                (od.PDO_INHIBIT_TIME, "u16", inhibit),
+                (od.PDO_EVENT_TIMER, "u16", 0),
+                (od.PDO_COB_ID, "u32", cob_id),
+            )
+            if not master and all(remote.read(index, sub, size) == value for sub, size, value in wanted):
+                continue
             remote.configure(index, od.PDO_COB_ID, "u32", cob_id | _INVALID)
-            remote.configure(index, od.PDO_TYPE, "u8", kind)
-            remote.configure(index, od.PDO_INHIBIT_TIME, "u16", inhibit)
-            remote.configure(index, od.PDO_EVENT_TIMER, "u16", 0)
-            remote.configure(index, od.PDO_COB_ID, "u32", cob_id)
+            for sub, size, value in wanted:
+                remote.configure(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
         """The profile's mapping is the only one that the decoder understands."""
@@ -180,17 +254,23 @@ class Bringer:
                     what = f"object mapped by 0x{index:04X}:{subindex}"
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
-    def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """R0 of every wire pair. A node that still tares itself has zeros; it may take the boot deadline."""
+    def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
+        """(U, K) R0 that the node encodes with, in ohm: its own or, written to it where it differs, that of
+        the file. A node that still tares itself has zeros; it may take the boot deadline."""
+        wanted = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = time.monotonic() + self.boot_deadline_s
-        while remote.read(od.BASELINE, 1, "f32") == 0 and time.monotonic() < end_s:
+        while True:
             self._go_on()
+            baseline = self._read_baseline(patch, profile, remote)
+            if wanted is not None and not np.array_equal(baseline, wanted):
+                remote.write_block(od.BASELINE_DOMAIN, wanted.astype("<f4").tobytes())
+                baseline = self._read_baseline(patch, profile, remote)
+                if not np.array_equal(baseline, wanted):
+                    wanted_from = f"those of {patch.baseline}"
+                    raise _mismatch(patch, "baseline (0x2301)", "other values back", wanted_from)
+            if baseline.any() or time.monotonic() > end_s:
+                break
             time.sleep(_POLL_S)
-        baseline = np.empty((profile.rows, profile.columns))
-        for row in range(profile.rows):
-            self._go_on()
-            for column in range(profile.columns):
-                baseline[row, column] = remote.read(od.BASELINE + row, column + 1, "f32")
         bad = np.argwhere(~(np.isfinite(baseline) & (baseline > 0)))
         if len(bad):
             row, column = (int(i) for i in bad[0])
@@ -199,6 +279,45 @@ class Bringer:
                 patch, what, f"{baseline[row, column]:g} ohm", "a positive resistance (tare the patch)"
             )
         return baseline
+
+    def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
+        """As one block; value by value from a node that does not have it so. For 300 values a block is 176
+        frames and single reads are 600: at 1 Mbit/s 86 ms, at the node's own pace, against 75 ms plus 300
+        times what a node takes to answer, and never the bus whole."""
+        try:
+            data = remote.read_block(od.BASELINE_DOMAIN)
+        except SdoAbort as abort:
+            if abort.code not in (_NO_OBJECT, _NO_COMMAND):
+                raise
+            return self._read_baseline_singly(profile, remote)
+        if len(data) != 4 * profile.n_codes:
+            raise _mismatch(patch, "baseline (0x2301)", f"{len(data)} bytes", f"{4 * profile.n_codes} bytes")
+        return np.frombuffer(data, dtype="<f4").reshape(profile.rows, profile.columns).astype(np.float64)
+
+    def _read_baseline_singly(self, profile: PatchProfile, remote: RemoteOd) -> Float:
+        baseline = np.empty((profile.rows, profile.columns))
+        for row in range(profile.rows):
+            self._go_on()
+            for column in range(profile.columns):
+                baseline[row, column] = remote.read(od.BASELINE + row, column + 1, "f32")
+        return baseline
+
+
+def load_baseline(path: Path, profile: PatchProfile) -> Float:
+    """(U, K) resistances of a text file, ohm, as REAL32 has them. Raises ConfigError for what is no table of
+    that many positive numbers."""
+    allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
+    try:
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        values = np.array(lines, dtype=np.float32).astype(np.float64)
+    except (OSError, ValueError) as error:
+        raise ConfigError("baseline", _line(error), allowed, where=str(path)) from None
+    if values.shape != (profile.rows, profile.columns):
+        raise ConfigError("baseline", values.shape, allowed, where=str(path))
+    good = np.isfinite(values) & (values > 0)
+    if not good.all():
+        raise ConfigError("baseline", float(values[~good][0]), allowed, where=str(path))
+    return values
 
 
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:

@@ -5,37 +5,34 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from skinnode.errors import BusError, CodecError, NodeTimeout, SkinError
+from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
-from skinnode.host.bringup import Abandoned, Bringer, NodeFacts, check_eds
-from skinnode.host.dealer import BusStats, Handler
-from skinnode.host.health import OPERATIONAL, NodeMonitor, PatchHealth
+from skinnode.host.bringup import check_eds, load_baseline
+from skinnode.host.dealer import BusStats
+from skinnode.host.health import NodeMonitor, PatchHealth
 from skinnode.host.link import BusLink
-from skinnode.host.pipeline import Lane, LaneStats, Solver, check_solvable
+from skinnode.host.lss import LssMaster
+from skinnode.host.pipeline import Lane, LaneStats, check_solvable
 from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
-from skinnode.host.sync import SyncProducer, SyncStats, Ticks
+from skinnode.host.rivals import Rivals, RivalStats
+from skinnode.host.start import bring_up_all, go_on_unless, start_all
+from skinnode.host.station import Station
+from skinnode.host.supervisor import NodeStats, Supervisor
+from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
 from skinnode.host.workers import Workers
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
+from skinnode.model.config import HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.wire import indices as od
 from skinnode.wire.assembler import ScanAssembler
 from skinnode.wire.profile import PatchProfile
 
 _log = logging.getLogger(__name__)
-
-BRING_UP_THREADS: Final = 16
-"""Nodes brought up at the same time; more would only queue for the bus."""
-
-START_DEADLINE_S: Final = 1.0
-"""How long a node may take to say that it is operational: four heartbeats."""
 
 LAST_SCAN_S: Final = 0.5
 """How long the end of a host may wait for the last scans, at most."""
@@ -49,22 +46,28 @@ class HostStats:
 
     buses: Mapping[str, BusStats]
     patches: Mapping[str, LaneStats]
+    nodes: Mapping[str, NodeStats]
+    """By patch."""
+    rivals: Mapping[str, RivalStats]
+    """By bus: what other masters send there."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
     """The first frame of wrong length on each bus that had one."""
 
 
-class BringUpCancelled(SkinError):
-    """Bring-up was called off by whoever asked for it."""
+@dataclass(frozen=True, slots=True)
+class _Bus:
+    """A bus with what the host does on it besides its patches."""
+
+    link: BusLink
+    ticks: Ticks
+    rivals: Rivals
+    follower: SyncFollower
+    lss: LssMaster
 
 
 def _never() -> bool:
     return False
-
-
-def _go_on_unless(cancelled: Callable[[], bool]) -> None:
-    if cancelled():
-        raise BringUpCancelled("bring-up was cancelled")
 
 
 class Host:
@@ -74,22 +77,24 @@ class Host:
             for field in host.fields():
                 ...
 
-    Inside the block all nodes are operational and SYNC is sent. At its end, and when bring-up fails half-way,
-    the nodes are pre-operational, every thread has ended and every interface is closed.
+    Inside the block all nodes are operational and SYNC is sent; who restarts or comes back is brought up
+    again. At its end, and when bring-up fails half-way, the nodes are pre-operational, every thread has ended
+    and every interface is closed. On a bus where the host is a guest, NMT and SYNC are left to the master.
     """
 
     def __init__(
         self,
         hand: HandConfig,
-        links: Mapping[str, BusLink],
-        lanes: Mapping[str, Lane],
-        monitors: Mapping[str, NodeMonitor],
-        sync: SyncProducer,
+        buses: Mapping[str, _Bus],
+        stations: Sequence[Station],
+        sync: SyncProducer | None,
+        supervisor: Supervisor,
         publisher: Publisher,
     ) -> None:
         self.hand = hand
-        self._links, self._lanes, self._monitors = links, lanes, monitors
-        self._sync, self._publisher = sync, publisher
+        self._buses = buses
+        self._stations = {station.patch.name: station for station in stations}
+        self._sync, self._supervisor, self._publisher = sync, supervisor, publisher
 
     @classmethod
     @contextlib.contextmanager
@@ -130,57 +135,69 @@ class Host:
             boot_deadline_s: how long a node may take to answer for the first time.
             cancelled: asked during bring-up; when it says True, bring-up ends with BringUpCancelled.
 
-        Raises ConfigError for options or EDS files that contradict the hand, and for a layout that cannot be
-        solved; BusError for an interface that does not open or a bus on which no node answers; NodeTimeout
-        for a node that does not answer; NodeError for one that is not what the hand says or does not keep its
-        configuration.
+        Raises ConfigError for options, EDS or baseline files that contradict the hand, and for a layout that
+        cannot be solved; BusError for an interface that does not open or a bus on which no node answers;
+        NodeTimeout for a node that does not answer, both unless ``bring_up.missing`` is ``wait``; NodeError
+        for one that is not what the hand says or does not keep its configuration. After that the host
+        survives whatever comes: see :meth:`health` and :meth:`stats`.
         """
         hand = hand.on(interface, channel)
         for patch in hand.patches:
+            profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
             if patch.eds is not None:
-                check_eds(patch.eds, PatchProfile.from_config(patch, hand.bus(patch.bus)))
-        names = tuple(patch.name for patch in hand.patches)
-        publisher = Publisher(names)
+                check_eds(patch.eds, profile)
+            if patch.baseline is not None:
+                load_baseline(patch.baseline, profile)
+        publisher = Publisher(tuple(patch.name for patch in hand.patches))
         with contextlib.ExitStack() as stack:
             stack.callback(publisher.end)
-            monitors = {patch.name: NodeMonitor(patch.name, patch.node_id) for patch in hand.patches}
-            links = {
-                bus.name: stack.enter_context(BusLink(bus, _handlers(hand, bus, monitors), publisher.fail))
+            ticks = Ticks(hand.sync.counter_overflow)
+            buses = {
+                bus.name: _serve_bus(
+                    hand,
+                    stack.enter_context(contextlib.closing(BusLink(bus, {}, publisher.fail))),
+                    ticks if bus.role == "master" else Ticks(hand.sync.counter_overflow),
+                )
                 for bus in hand.buses
                 if hand.patches_on(bus.name)
             }
-            ticks = Ticks(hand.sync.counter_overflow)
+            workers = stack.enter_context(_workers(hand))
+            stations = [_station(patch, hand, buses[patch.bus], workers, publisher) for patch in hand.patches]
+            for bus in buses.values():  # everybody knows by now what to do with what comes
+                bus.link.run()
             for patch in hand.patches:
-                _go_on_unless(cancelled)
+                go_on_unless(cancelled)
                 check_solvable(patch, hand.solver)
+            # Undone in this order from below: SYNC stops, the scans under way end, nobody is brought up any
+            # more, nodes fall silent, mainlines end, boxes are emptied, workers end, interfaces close,
+            # subscribers hear the end.
+            for station in stations:
+                stack.callback(station.lane.close)
+            for bus in buses.values():
+                stack.callback(bus.link.stop)
             try:
-                facts = _bring_up(hand, links, boot_deadline_s, cancelled)
-                solvers = {name: Solver(known, hand.solver) for name, known in facts.items()}
-                workers = stack.enter_context(_workers(hand))
-                lanes = {
-                    name: _lane(hand, known, solvers[name], workers, publisher, ticks, links, monitors)
-                    for name, known in facts.items()
-                }
-                # Undone in this order from below: SYNC stops, the scans under way end, nodes fall silent,
-                # mainlines end, boxes are emptied, workers end, interfaces close, subscribers hear the end.
-                for lane in lanes.values():
-                    stack.callback(lane.close)
-                for link in links.values():
-                    stack.callback(link.stop)
-                for patch in hand.patches:
-                    stack.callback(_stand_by, links[patch.bus], monitors[patch.name])
-                _start(hand, links, monitors)
+                ready = bring_up_all(stations, hand.bring_up.missing, boot_deadline_s, cancelled)
+                for station in stations:
+                    stack.callback(_stand_by, station)
+                start_all(ready)
             except BusError:
-                for link in links.values():
-                    if link.failure is not None:  # the nodes fell silent because the bus failed
-                        raise link.failure from link.failure.__cause__
+                for bus in buses.values():
+                    if bus.link.failure is not None:  # the nodes fell silent because the bus failed
+                        raise bus.link.failure from bus.link.failure.__cause__
                 if publisher.failure is not None:
                     raise publisher.failure from publisher.failure.__cause__
                 raise
-            senders = [link.send for link in links.values()]
-            stack.callback(_let_scans_end, tuple(lanes.values()), ticks, hand.sync.period_s, publisher)
-            sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
-            yield cls(hand, links, lanes, monitors, sync, publisher)
+            supervisor = stack.enter_context(
+                Supervisor(stations, list(ready), hand.bring_up.heartbeat_s, publisher.fail)
+            )
+            own = [bus.link for bus in buses.values() if bus.link.config.role == "master"]
+            sync: SyncProducer | None = None
+            if own:
+                lanes = [station.lane for station in stations if not station.is_guest]
+                stack.callback(_let_scans_end, lanes, ticks, hand.sync.period_s, publisher)
+                senders = [link.send for link in own]
+                sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
+            yield cls(hand, buses, stations, sync, supervisor, publisher)
 
     def fields(
         self, *, timeout_s: float | None = None, capacity: int = CAPACITY_FIELDS, patch: str | None = None
@@ -198,34 +215,27 @@ class Host:
 
     def health(self, patch: str) -> PatchHealth:
         """How a patch is. Raises KeyError for no such patch."""
-        return self._monitors[patch].health(time.monotonic_ns(), bringup.HEARTBEAT_S, self.hand.sync.period_s)
+        station = self._stations[patch]
+        return station.monitor.health(time.monotonic_ns(), station.heartbeat_s, self.hand.sync.period_s)
 
     def stats(self) -> HostStats:
         """All counters."""
+        buses = self._buses
+        sync = SyncStats(0, 0, 0, 0) if self._sync is None else self._sync.stats()
+        followers = [bus.follower for bus in buses.values()]
+        rejected = (bus.link.first_malformed for bus in buses.values())
         return HostStats(
-            buses={name: link.stats() for name, link in self._links.items()},
-            patches={name: lane.stats() for name, lane in self._lanes.items()},
-            sync=self._sync.stats(),
-            malformed=tuple(
-                link.first_malformed for link in self._links.values() if link.first_malformed is not None
+            buses={name: bus.link.stats() for name, bus in buses.items()},
+            patches={name: station.lane.stats() for name, station in self._stations.items()},
+            nodes=self._supervisor.stats(),
+            rivals={name: bus.rivals.stats() for name, bus in buses.items()},
+            sync=replace(
+                sync,
+                received=sum(follower.received for follower in followers),
+                irregular=sum(follower.irregular for follower in followers),
             ),
+            malformed=tuple(error for error in rejected if error is not None),
         )
-
-
-def _handlers(hand: HandConfig, bus: BusConfig, monitors: Mapping[str, NodeMonitor]) -> dict[int, Handler]:
-    """Who gets what from the moment the bus is open."""
-    handlers: dict[int, Handler] = {}
-    for patch in hand.patches_on(bus.name):
-        monitor, node_id = monitors[patch.name], patch.node_id
-        handlers[od.heartbeat_cob_id(node_id)] = monitor.on_heartbeat
-        handlers[od.emcy_cob_id(node_id)] = monitor.on_emergency
-        # A node that an earlier host left operational may be sending already.
-        handlers[od.chunk_cob_id(node_id)] = handlers[od.summary_cob_id(node_id)] = _ignore
-    return handlers
-
-
-def _ignore(data: bytes, t_ns: int) -> None:
-    pass
 
 
 def _workers(hand: HandConfig) -> Workers:
@@ -233,103 +243,37 @@ def _workers(hand: HandConfig) -> Workers:
     return Workers(min(count, len(hand.patches)), "solve")
 
 
-def _lane(
-    hand: HandConfig,
-    facts: NodeFacts,
-    solver: Solver,
-    workers: Workers,
-    publisher: Publisher,
-    ticks: Ticks,
-    links: Mapping[str, BusLink],
-    monitors: Mapping[str, NodeMonitor],
-) -> Lane:
-    """A lane that gets its frames from the bus of its patch."""
-    patch, link = facts.config, links[facts.config.bus]
+def _station(
+    patch: PatchConfig, hand: HandConfig, bus: _Bus, workers: Workers, publisher: Publisher
+) -> Station:
+    """A patch with a lane that gets its frames from the bus, and withholds what a node may be sending that an
+    earlier host left operational."""
+    monitor = NodeMonitor(patch.name, patch.node_id)
     assembler = ScanAssembler(
-        facts.profile,
-        counter_overflow=ticks.counter_overflow,
+        PatchProfile.from_config(patch, bus.link.config),
+        counter_overflow=bus.ticks.counter_overflow,
         period_ns=hand.sync.period_ms * 1_000_000,
         node_id=patch.node_id,
-        on_reject=link.reject,
+        on_reject=bus.link.reject,
     )
-    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, monitors[patch.name].on_scan)
-    lane.resume(solver, lane.withholdings, anew=True)
-    link.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
-    link.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
-    link.poll_with(lane.poll)
-    return lane
+    lane = Lane(patch.name, assembler, workers, publisher, bus.ticks.find, monitor.on_scan)
+    return Station(patch, hand, bus.link, lane, monitor, bus.lss)
 
 
-def _bring_up(
-    hand: HandConfig, links: Mapping[str, BusLink], boot_deadline_s: float, cancelled: Callable[[], bool]
-) -> dict[str, NodeFacts]:
-    """All nodes side by side. The first failure stops the others at their next transfer."""
-    over = threading.Event()
-    answered: list[PatchConfig] = []
-
-    def abandoned() -> bool:
-        return over.is_set() or cancelled()
-
-    def bring_up(patch: PatchConfig) -> NodeFacts:
-        link = links[patch.bus]
-        bringer = Bringer(link.send, hand.sync, boot_deadline_s, abandoned, answered.append)
-        profile, remote = PatchProfile.from_config(patch, hand.bus(patch.bus)), link.remote_od(patch.node_id)
-        return bringer.bring_up(patch, patch.layout.build(), profile, remote)
-
-    with ThreadPoolExecutor(min(len(hand.patches), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
-        try:
-            jobs = {patch.name: pool.submit(bring_up, patch) for patch in hand.patches}
-            wait(jobs.values(), return_when=FIRST_EXCEPTION)
-        finally:  # whoever still runs after the first failure, or after Ctrl-C, stops
-            over.set()
-            pool.shutdown(cancel_futures=True)
-    for patch in hand.patches:
-        job = jobs[patch.name]
-        failure = None if job.cancelled() else job.exception()
-        if failure is None or isinstance(failure, Abandoned):
-            continue
-        if isinstance(failure, NodeTimeout) and patch not in answered:
-            raise _silence(hand, patch, answered, boot_deadline_s) from None
-        raise failure
-    _go_on_unless(cancelled)
-    return {name: job.result() for name, job in jobs.items()}
+def _serve_bus(hand: HandConfig, link: BusLink, ticks: Ticks) -> _Bus:
+    """Who else is listened to on a bus: its SYNC, if it is another's, rivals, LSS slaves."""
+    rivals, follower, lss = Rivals(link.config), SyncFollower(ticks), LssMaster(link.send)
+    for cob_id, handler in rivals.handlers([p.node_id for p in hand.patches_on(link.config.name)]).items():
+        link.handle(cob_id, handler)
+    if link.config.role == "guest":
+        link.handle(od.SYNC_COB_ID, follower.on_sync)
+        link.handle(od.NMT_COB_ID, _ignore)
+    link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)
+    return _Bus(link, ticks, rivals, follower, lss)
 
 
-def _silence(
-    hand: HandConfig, patch: PatchConfig, answered: list[PatchConfig], boot_deadline_s: float
-) -> BusError:
-    """The error for a silent ``patch``. If all are silent it is the cable, the supply or the bit rate."""
-    bus, on_bus = hand.bus(patch.bus), hand.patches_on(patch.bus)
-    silent = [other for other in on_bus if other not in answered]
-    allowed = f"allowed: an answer within {boot_deadline_s:g} s"
-    names = ", ".join(f"{other.node_id} ({other.name})" for other in silent)
-    if len(silent) == len(on_bus):
-        return BusError(
-            f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: got no answer from any node, "
-            f"{allowed} from {names}"
-        )
-    return NodeTimeout(
-        patch.node_id, f"patch {patch.name!r} on {bus.name}: got no answer, {allowed} from {names}"
-    )
-
-
-def _start(hand: HandConfig, links: Mapping[str, BusLink], monitors: Mapping[str, NodeMonitor]) -> None:
-    """NMT start, and each node says in a heartbeat that it is operational. Raises NodeTimeout."""
-    t_start_ns = time.monotonic_ns()
-    for patch in hand.patches:
-        bringup.start(links[patch.bus].send, patch.node_id)
-    end_s = time.monotonic() + START_DEADLINE_S
-    for patch in hand.patches:
-        monitor = monitors[patch.name]
-        while not monitor.said_since(OPERATIONAL, t_start_ns):
-            if time.monotonic() > end_s:
-                raise NodeTimeout(
-                    patch.node_id,
-                    f"patch {patch.name!r} on {patch.bus}: got NMT state {monitor.nmt_state} after the start "
-                    f"command, allowed: {OPERATIONAL} (operational) within {START_DEADLINE_S:g} s",
-                )
-            time.sleep(_POLL_S)
-        monitor.running = True
+def _ignore(data: bytes, t_ns: int) -> None:
+    """Frames of the robot's own master to its nodes."""
 
 
 def _let_scans_end(lanes: Sequence[Lane], ticks: Ticks, period_s: float, publisher: Publisher) -> None:
@@ -341,9 +285,11 @@ def _let_scans_end(lanes: Sequence[Lane], ticks: Ticks, period_s: float, publish
         time.sleep(_POLL_S)
 
 
-def _stand_by(link: BusLink, monitor: NodeMonitor) -> None:
-    monitor.running = False
+def _stand_by(station: Station) -> None:
+    if station.is_guest or not station.monitor.running:
+        return
+    station.monitor.running = False
     try:
-        bringup.stand_by(link.send, monitor.node_id)
+        bringup.stand_by(station.link.send, station.patch.node_id)
     except BusError as error:  # the bus is gone; the rest of the shutdown must go on
-        _log.warning("node %d was not put on stand-by: %s", monitor.node_id, error)
+        _log.warning("node %d was not put on stand-by: %s", station.patch.node_id, error)

@@ -42,6 +42,8 @@ class Condition(enum.StrEnum):
     """Booted a moment ago without being asked to."""
     FAULTY = "faulty"
     """Its error register is not zero."""
+    REFUSED = "refused"
+    """It answers, but is not what the hand file says, or does not keep its configuration."""
     LOST = "lost"
     """Was there, and its heartbeat stopped."""
 
@@ -63,6 +65,10 @@ class PatchHealth:
     last_emergency: int | None
     """Code of the newest of them."""
     error_register: int
+    rejoins: int = 0
+    """Times the node came back and was brought up again since the host started."""
+    refusal: str | None = None
+    """Why a node that answers is not taken up: another identity or layout, a configuration not kept."""
 
 
 class NodeMonitor:
@@ -78,6 +84,24 @@ class NodeMonitor:
         self._last_emergency: int | None = None
         self.running = False
         """Set once the node was started: from then on a boot-up is a restart."""
+        self.rejoins = 0
+        self.refusal: str | None = None
+        """Set by the supervisor."""
+
+    @property
+    def boot_ups(self) -> int:
+        """Boot-up messages so far."""
+        return self._boot_ups
+
+    @property
+    def t_heartbeat_ns(self) -> int | None:
+        """When the newest heartbeat or boot-up was received."""
+        return self._t_heartbeat_ns
+
+    @property
+    def t_scan_ns(self) -> int | None:
+        """When the last frame of the newest scan was received."""
+        return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
         """Heartbeat or boot-up. One of another length than a byte is ignored."""
@@ -124,6 +148,7 @@ class NodeMonitor:
             late_scans=None if scan_age_s is None else scan_age_s / scan_s,
             restarted=restart_age_s is not None and restart_age_s < RESTART_MEMORY_NS * 1e-9,
             error_register=self._error_register,
+            refused=self.refusal is not None,
         )
         return PatchHealth(
             patch=self.patch,
@@ -136,6 +161,8 @@ class NodeMonitor:
             emergencies=self._emergencies,
             last_emergency=self._last_emergency,
             error_register=self._error_register,
+            rejoins=self.rejoins,
+            refusal=self.refusal,
         )
 
 
@@ -146,8 +173,11 @@ def judge(
     late_scans: float | None,
     restarted: bool,
     error_register: int,
+    refused: bool = False,
 ) -> Condition:
     """The worst that the facts say. Ages are in periods, None for never."""
+    if refused:
+        return Condition.REFUSED
     if late_heartbeats is None:
         return Condition.NEVER_SEEN
     if late_heartbeats > HEARTBEATS_MISSED:

@@ -28,7 +28,8 @@ _REOPEN_S: Final = 0.1
 
 
 class BusLink(Dealer):
-    """An open bus. Its threads run from construction to :meth:`close`.
+    """An open bus. It receives from construction to :meth:`close`, and deals out from :meth:`run` or the
+    beginning of a ``with`` block on.
 
     ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once, from
     the mainline, if a handler fails. Raises BusError where the interface does not open. An interface that
@@ -41,16 +42,21 @@ class BusLink(Dealer):
         super().__init__(config, handlers, time.monotonic_ns())
         self._on_failure = on_failure
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
-        self._jobs: deque[Callable[[], None]] = deque()
+        self._jobs: deque[Callable[[], object]] = deque()
         self.failure: BusError | None = None
         """Why the bus is away; None while it is there."""
         self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
         self._outages = self._dropped_before = 0
+        self.t_dealt_ns = 0
+        """What was received up to then has been dealt out, monotonic."""
         self._stop = threading.Event()
         self._port = CanPort(config)
         self.network = SkinNetwork(self.send)
         self._receiver = Receiver(self._port)
         self._thread = threading.Thread(target=self._run, name=f"mainline {config.name}", daemon=True)
+
+    def run(self) -> None:
+        """Begin to deal frames out; those received before come first."""
         self._thread.start()
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -61,13 +67,14 @@ class BusLink(Dealer):
         for listener in self._sent_listeners:
             listener(Frame(can_id, data, t_ns, fd=len(data) > 8))
 
-    def remote_od(self, node_id: int) -> RemoteOd:
-        """The object dictionary of a node on this bus."""
+    def remote_od(self, node_id: int, on_answer: Callable[[int], None] = lambda t_ns: None) -> RemoteOd:
+        """The object dictionary of a node on this bus; ``on_answer`` is told when it answers."""
 
         def on_response(data: bytes, t_ns: int) -> None:
             if len(data) != 8:
                 self.reject(CodecError(sdo_response_cob_id(node_id), data, "8 bytes (SDO response)"))
                 return
+            on_answer(t_ns)
             self.network.notify(sdo_response_cob_id(node_id), bytearray(data), t_ns * 1e-9)
 
         self.handle(sdo_response_cob_id(node_id), on_response)
@@ -85,7 +92,7 @@ class BusLink(Dealer):
         the interface, on the thread that sent it."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
-    def call(self, job: Callable[[], None]) -> None:
+    def call(self, job: Callable[[], object]) -> None:
         """Have ``job`` done by the mainline, before any frame that is received from now on."""
         self._jobs.append(job)
 
@@ -99,7 +106,8 @@ class BusLink(Dealer):
     def stop(self) -> None:
         """End and join the mainline; frames can still be sent."""
         self._stop.set()
-        self._thread.join()
+        if self._thread.ident is not None:
+            self._thread.join()
 
     def close(self) -> None:
         """End all threads and close the interface."""
@@ -108,6 +116,7 @@ class BusLink(Dealer):
         self._port.close()
 
     def __enter__(self) -> Self:
+        self.run()
         return self
 
     def __exit__(
@@ -154,6 +163,7 @@ class BusLink(Dealer):
         while self._jobs:
             self._jobs.popleft()()
         self.deal(batch)
-        # While frames wait, the time is that of the newest one dealt out: a scan is not late because we are.
-        self.poll(batch[-1].t_ns if batch else time.monotonic_ns())
+        # While frames wait, the time is that of the newest one dealt out: nothing is late because we are.
+        self.t_dealt_ns = batch[-1].t_ns if batch else time.monotonic_ns()
+        self.poll(self.t_dealt_ns)
         return bool(batch)

@@ -68,6 +68,24 @@ class RemoteOd:
         """The value as it came."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._client.upload(index, subindex)))
 
+    def read_block(self, index: int) -> bytes:
+        """A value of many bytes by block transfer with CRC."""
+
+        def ask() -> bytes:
+            with self._client.open(index, 0, "rb", block_transfer=True) as stream:
+                return bytes(stream.read())
+
+        return bytes(self._transfer(index, 0, "block read", ask))
+
+    def write_block(self, index: int, data: bytes) -> None:
+        """Write a value of many bytes by block transfer with CRC."""
+
+        def ask() -> None:
+            with self._client.open(index, 0, "wb", size=len(data), block_transfer=True) as stream:
+                stream.write(data)
+
+        self._transfer(index, 0, "block write", ask)
+
     def read(self, index: int, subindex: int, kind: str) -> Any:
         """The value, decoded."""
         layout = struct.Struct(_PLAIN[kind])
@@ -87,6 +105,11 @@ class RemoteOd:
     def write_bytes(self, index: int, subindex: int, data: bytes) -> None:
         """Write the value as it is to travel."""
         self._transfer(index, subindex, "write", lambda: self._client.download(index, subindex, data))
+
+    def ensure(self, index: int, subindex: int, kind: str, value: float) -> None:
+        """Write, and read back, only what differs."""
+        if self.read(index, subindex, kind) != value:
+            self.configure(index, subindex, kind, value)
 
     def configure(self, index: int, subindex: int, kind: str, value: float) -> None:
         """Write and read back. Raises NodeError where the node kept something else."""

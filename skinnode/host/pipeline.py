@@ -26,7 +26,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.solve.tracker import Tracker
 from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.wire.codec import decode
+from skinnode.wire.codec import SummaryFlag, decode
 
 _log = logging.getLogger(__name__)
 
@@ -131,6 +131,8 @@ class Lane:
         self.tap: LaneTap | None = None
         self.withholdings = 0
         """How often scans began to be withheld."""
+        self.doubtful = False
+        """A summary was lost, which may have said that the baseline changed."""
         self._withheld = 0
         self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
         self._newest = 0
@@ -157,12 +159,18 @@ class Lane:
                 self.tap.polled(self._patch, t_ns)
             self._offer(scan)
 
-    def withhold(self) -> None:
-        """Let no scan through from now on, the one under way included."""
+    def withhold(self) -> int:
+        """Let no scan through from now on, the one under way included. Returns ``withholdings``."""
         self._solver = None
         self.withholdings += 1
         if self.tap is not None:
             self.tap.withheld(self._patch)
+        return self.withholdings
+
+    @property
+    def withholding(self) -> bool:
+        """Whether no scan is let through."""
+        return self._solver is None
 
     def resume(self, solver: Solver, withholdings: int, *, anew: bool) -> None:
         """Let scans through from now on, decoded and solved by ``solver``; unless there was another reason to
@@ -171,6 +179,7 @@ class Lane:
         if withholdings != self.withholdings:
             return
         self._solver = solver
+        self.doubtful = False
         if anew:
             self._assembler.reset()
         if self.tap is not None:
@@ -182,6 +191,10 @@ class Lane:
 
     def _offer(self, scan: Scan) -> None:
         self._on_scan(scan.t_last_ns)
+        if scan.flags & SummaryFlag.BASELINE_CHANGED:  # this scan is the first with the new one
+            self.withhold()
+        elif scan.device_time_us is None:
+            self.doubtful = True
         solver = self._solver
         if solver is None:
             self._withheld += 1

@@ -31,6 +31,11 @@ class SyncStats:
     """SYNCs that a bus did not take."""
     latest_ns: int
     """The longest delay of a SYNC behind its due time."""
+    received: int = 0
+    """Of another's, on buses where the host is a guest."""
+    irregular: int = 0
+    """Those of them whose counter did not follow the one before, or is none: lost, or of a second
+    producer."""
 
 
 class Ticks:
@@ -52,6 +57,31 @@ class Ticks:
     def find(self, counter: int) -> Tick | None:
         """The newest SYNC that carried ``counter``, None if none did."""
         return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
+
+
+class SyncFollower:
+    """Takes the SYNC of another producer for ``ticks``. Mainline only."""
+
+    def __init__(self, ticks: Ticks) -> None:
+        self._ticks = ticks
+        self.received = self.irregular = 0
+
+    def on_sync(self, data: bytes, t_ns: int) -> None:
+        """A SYNC came. Without a counter, where there should be one, it cannot be numbered."""
+        self.received += 1
+        overflow = self._ticks.counter_overflow
+        if len(data) != (1 if overflow else 0) or (overflow and not 1 <= data[0] <= overflow):
+            self.irregular += 1
+            return
+        if not overflow:
+            return
+        newest = self._ticks.newest
+        ahead = (data[0] - newest - 1) % overflow + 1  # 1 is the next
+        if newest == 0:
+            self._ticks.note(data[0], t_ns)
+            return
+        self.irregular += ahead != 1
+        self._ticks.note(newest + ahead, t_ns)
 
 
 class SyncProducer:

@@ -37,6 +37,10 @@ Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time 
 
 Preset = Literal["aligned", "symmetric", "staggered"]
 Method = Literal["auto", "exact", "posterior"]
+Coordinates = Literal["preset", "node"]
+Role = Literal["master", "guest"]
+GuestSends = Literal["nothing", "sdo"]
+Missing = Literal["refuse", "wait"]
 Operator = Literal["gauss_newton", "levenberg_marquardt", "dogleg"]
 
 
@@ -88,6 +92,15 @@ class BusConfig(_Table):
         int, Field(ge=10_000, le=8_000_000), _Allowed("an integer from 10000 to 8000000")
     ] = 5_000_000
     """Of CAN FD frames, from ESI to the CRC delimiter."""
+    role: Annotated[Role, _Allowed(" or ".join(get_args(Role)))] = "master"
+    """``guest``: a robot's own master has NMT and SYNC on this bus; the host sends neither."""
+    guest_sends: Annotated[GuestSends, _Allowed(" or ".join(get_args(GuestSends)))] = "nothing"
+    """What a guest sends: ``sdo`` to identify and configure the patches and to fetch what they know."""
+    heartbeat_node_id: Annotated[
+        int | None, Field(ge=1, le=127), _Allowed("an integer from 1 to 127 that no node has")
+    ] = None
+    """Node-ID under which a master sends a heartbeat, which its patches then watch: they go pre-operational
+    when it stops. None sends none."""
 
 
 class LayoutConfig(_Table):
@@ -101,6 +114,9 @@ class LayoutConfig(_Table):
     lower_wires: _Wires | None = None
     lower_electrodes: _Wires | None = None
     resistivity_ohm_per_m: _Resistivity = 1e7
+    coordinates: Annotated[Coordinates, _Allowed(" or ".join(get_args(Coordinates)))] = "preset"
+    """``node``: the patch itself says where its electrodes are (0x2300); the preset stands for it in plans
+    and simulations, and its numbers of wires and electrodes must be right."""
 
     def build(self) -> PatchLayout:
         """The layout. Raises ValueError where the geometry is impossible."""
@@ -136,10 +152,15 @@ class PatchConfig(_Table):
         None
     )
     """Serial number the node must have (0x1018:4); None takes any."""
+    """With it a node that does not answer at its node-ID is searched for by LSS and given it."""
     relative_noise: _Ratio = 3e-6
     """Standard deviation of the analogue noise of a resistance, relative, without quantisation."""
+    baseline: Annotated[
+        Path | None, Field(strict=False), _Allowed("the path of a file of resistances in ohm")
+    ] = None
+    """Resistances at rest as text, a line an upper wire and a number a lower wire; None: the node says."""
 
-    @field_validator("eds")
+    @field_validator("eds", "baseline")
     @classmethod
     def _existing_file(cls, value: Path | None, info: ValidationInfo) -> Path | None:
         """A relative path is relative to the folder of the hand file."""
@@ -148,7 +169,8 @@ class PatchConfig(_Table):
         folder = (info.context or {}).get("folder", Path())
         path = Path(folder, value)
         if not path.is_file():
-            raise ValueError(f"the path of an EDS file; there is no file {path}")
+            what = "an EDS file" if info.field_name == "eds" else "a file of resistances in ohm"
+            raise ValueError(f"the path of {what}; there is no file {path}")
         return path
 
     def chunks_per_scan(self, *, fd: bool) -> int:
@@ -164,12 +186,30 @@ class SyncConfig(_Table):
     """The SYNC the host produces. One SYNC is one scan of every patch."""
 
     period_ms: Annotated[int, Field(ge=1, le=60_000), _Allowed("an integer from 1 to 60000")] = 80
-    counter_overflow: Annotated[int, Field(ge=2, le=240), _Allowed("an integer from 2 to 240")] = 240
-    """Highest value of the SYNC counter (0x1019), which starts at 1 and names the scan."""
+    counter_overflow: Annotated[
+        int, Field(ge=0, le=240), _Allowed("an integer from 2 to 240; 0 where all buses are a guest's")
+    ] = 240
+    """Highest value of the SYNC counter (0x1019), which starts at 1 and names the scan; 0: the SYNC of
+    another master has none, and scans are numbered by each patch for itself."""
 
     @property
     def period_s(self) -> float:
         return self.period_ms * 1e-3
+
+
+class BringUpConfig(_Table):
+    """How patches are taken up, at the start and later."""
+
+    missing: Annotated[Missing, _Allowed(" or ".join(get_args(Missing)))] = "refuse"
+    """A patch that does not answer at the start: refuse to start, or start with those that are there and take
+    up the others when they come."""
+    heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), _Allowed("an integer from 20 to 10000")] = 250
+    """Heartbeat the nodes are told to send, or do send where a guest does not tell them: a lost node shows
+    within a second, at 0.1 % of the bus for four."""
+
+    @property
+    def heartbeat_s(self) -> float:
+        return self.heartbeat_ms * 1e-3
 
 
 class SolverConfig(_Table):
@@ -221,6 +261,7 @@ class HandConfig(_Table):
         tuple[PatchConfig, ...], Field(min_length=1, strict=False), _Allowed("at least one [[patches]]")
     ]
     sync: SyncConfig = SyncConfig()
+    bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
     simulation: SimulationConfig = SimulationConfig()
 
@@ -278,6 +319,7 @@ class HandConfig(_Table):
             except ValueError as error:
                 raise ConfigError(f"patches[{i}].layout", patch.layout.preset, str(error)) from None
         _require_unique("patches", "node_id", [(patch.bus, patch.node_id) for patch in self.patches])
+        self._check_roles()
         for i, bus in enumerate(self.buses):
             load = self.bus_load(bus.name)
             if load > MAX_BUS_LOAD:
@@ -288,6 +330,30 @@ class HandConfig(_Table):
                     f"at most {MAX_BUS_LOAD:.0%}; sync.period_ms = {needed_ms:.0f} or fewer patches would do",
                 )
         return self
+
+    def _check_roles(self) -> None:
+        """What a bus cannot give its host, or its patches, in the role it has."""
+        overflow, guest = self.sync.counter_overflow, all(bus.role == "guest" for bus in self.buses)
+        if overflow == 1 or (overflow == 0 and not guest):
+            allowed = "an integer from 2 to 240; 0 where all buses are a guest's"
+            raise ConfigError("sync.counter_overflow", overflow, allowed)
+        for i, bus in enumerate(self.buses):
+            node_ids = [patch.node_id for patch in self.patches_on(bus.name)]
+            if bus.role == "guest" and bus.heartbeat_node_id is not None:
+                raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, "none for a guest")
+            if bus.heartbeat_node_id in node_ids:
+                allowed = "an integer from 1 to 127 that no node has"
+                raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, allowed)
+        for i, patch in enumerate(self.patches):
+            bus = self.bus(patch.bus)
+            if bus.role == "master" or bus.guest_sends == "sdo":
+                continue
+            if patch.baseline is None:
+                allowed = f"a file: on {bus.name} the host is a guest that sends nothing"
+                raise ConfigError(f"patches[{i}].baseline", _NOTHING, allowed)
+            if patch.layout.coordinates == "node":
+                allowed = f"preset: on {bus.name} the host is a guest that sends nothing"
+                raise ConfigError(f"patches[{i}].layout.coordinates", "node", allowed)
 
 
 def load_hand(path: Path | str) -> HandConfig:

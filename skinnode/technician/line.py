@@ -57,6 +57,7 @@ class Line:
         self.link.listen(self.heard.on_frames)
         self.lss = LssMaster(self.link.send)
         self.link.handle(od.LSS_RESPONSE_COB_ID, self.lss.on_response)
+        self.link.run()
 
     def od(self, node_id: int) -> RemoteOd:
         """The object dictionary of a node."""

@@ -7,12 +7,17 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from typing import Any
 
 import pytest
 
-from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.config import BusConfig, HandConfig, parse_hand
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import Float
+from skinnode.node import NodeRunner, PatchNode
 from skinnode.transport import CanPort, Frame
+from skinnode.wire.profile import PatchProfile
 from vcan_sim.fleet import Fleet
 
 SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
@@ -38,6 +43,13 @@ def make_hand() -> Callable[..., HandConfig]:
         return parse_hand({"buses": [bus], "patches": listed, "sync": {"period_ms": 25}, **tables})
 
     return make
+
+
+@pytest.fixture
+def crossing_hand(make_hand: Callable[..., HandConfig], crossing_bus: BusConfig) -> HandConfig:
+    """A hand on each interface that crosses processes."""
+    table = {"name": "can0", "interface": crossing_bus.interface, "channel": crossing_bus.channel}
+    return make_hand(buses=[table])
 
 
 @pytest.fixture
@@ -79,3 +91,78 @@ def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> bool:
             return False
         time.sleep(0.01)
     return True
+
+
+class Still:
+    """The resistances of a patch that does not move, until a test changes them."""
+
+    def __init__(self, ohm: Float) -> None:
+        self.ohm = ohm
+
+    def read(self, t_ns: int) -> Float:
+        return self.ohm
+
+
+class Rack:
+    """The patches of a hand as the real node, each plugged in and pulled out by itself."""
+
+    def __init__(self, hand: HandConfig) -> None:
+        self.hand = hand
+        self.sources = {}
+        for patch in hand.patches:
+            layout = patch.layout.build()
+            self.sources[patch.name] = Still(resistance_ohm(layout, layout.upper_m))
+        self.nodes: dict[str, PatchNode] = {}
+        self._plugged: dict[str, ExitStack] = {}
+
+    def plug(
+        self,
+        name: str,
+        *,
+        node_id: int | None = None,
+        lets_through: Callable[[int, bytes], bool] = lambda can_id, data: True,
+        **options: Any,
+    ) -> PatchNode:
+        """Power a patch on: a new node every time. Only what ``lets_through`` says reaches the bus."""
+        patch = self.hand.patch(name)
+        bus = self.hand.bus(patch.bus)
+        options = {"serial": patch.serial or 0, "layout": patch.layout.build(), **options}
+        options.setdefault("profile", PatchProfile.from_layout(options["layout"], patch.code_bits))
+        with ExitStack() as stack:
+            port = stack.enter_context(CanPort(bus))
+
+            def send(can_id: int, data: bytes) -> None:
+                if lets_through(can_id, data):
+                    port.send(can_id, data)
+
+            node = PatchNode(
+                patch.node_id if node_id is None else node_id, source=self.sources[name], send=send, **options
+            )
+            stack.enter_context(NodeRunner(port, [node]))
+            self._plugged[name] = stack.pop_all()
+        self.nodes[name] = node
+        return node
+
+    def pull(self, name: str) -> None:
+        """Cut its power."""
+        self._plugged.pop(name).close()
+
+    def close(self) -> None:
+        for name in list(self._plugged):
+            self.pull(name)
+
+
+@pytest.fixture
+def rack_of() -> Iterator[Callable[[HandConfig], Rack]]:
+    """A rack with nothing plugged in."""
+    with ExitStack() as racks:
+        yield lambda hand: racks.enter_context(closing(Rack(hand)))
+
+
+@pytest.fixture
+def rack(hand: HandConfig, rack_of: Callable[[HandConfig], Rack]) -> Rack:
+    """The patches of ``hand``, all plugged in."""
+    rack = rack_of(hand)
+    for patch in hand.patches:
+        rack.plug(patch.name)
+    return rack

@@ -237,9 +237,10 @@ def test_configuration_that_is_refused(make_hand: Callable[..., HandConfig]) -> 
 
 
 def test_baseline_that_is_no_resistance(make_hand: Callable[..., HandConfig]) -> None:
-    tamper = answer_instead(0x2202, 4, struct.pack("<f", float("nan")))
-    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))) == (
-        "node 5: patch 'p0' on can0: baseline of upper wire 2, lower wire 3: got nan ohm, "
+    baseline_ohm = Rest(LAYOUT).read(0).copy()
+    baseline_ohm[2, 3] = 0.0  # a wire that was open when the patch was tared
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, baseline_ohm=baseline_ohm))) == (
+        "node 5: patch 'p0' on can0: baseline of upper wire 2, lower wire 3: got 0 ohm, "
         "allowed: a positive resistance (tare the patch)"
     )
 

@@ -169,6 +169,7 @@ def test_scans_are_withheld_until_somebody_says_how_to_decode_them(
     fields = publisher.subscribe(10, 10.0, None)
     stub.go.set()
     feed(lane, 1, 0)
+    assert eventually(lambda: lane.stats().solved == 1)
     lane.withhold()
     feed(lane, 2, MS)
     known = lane.withholdings

@@ -28,7 +28,7 @@ from skinnode.transport import CanPort
 from skinnode.wire.profile import PatchProfile
 from vcan_sim.fleet import Fleet
 
-from .conftest import SMALL, eventually, heard
+from .conftest import SMALL, Rack, eventually, heard
 
 
 def take(fields: Subscription, count: int) -> list[FieldFrame]:
@@ -182,17 +182,19 @@ def test_silence_is_a_timeout_and_a_lost_patch(hand: HandConfig) -> None:
         assert eventually(lambda: host.health("p0").condition is Condition.LOST)
 
 
-def test_node_that_restarts_by_itself(
-    hand: HandConfig, fleet: Fleet, listener: CanPort, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_node_that_restarts_by_itself(hand: HandConfig, rack: Rack, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING), Host.from_config(hand) as host:
         take(host.fields(timeout_s=10), 4)
         boot_ups = host.health("p1").boot_ups
-        listener.send(0x000, bytes([0x81, 6]))  # as a watchdog would
+        rack.pull("p1")
+        rack.plug("p1")
         assert eventually(lambda: host.health("p1").condition is Condition.RESTARTING)
         assert host.health("p1").boot_ups == boot_ups + 1
         assert host.health("p0").condition is Condition.OPERATIONAL
-    assert [record.getMessage() for record in caplog.records] == ["node 6 (p1) restarted by itself"]
+        assert eventually(lambda: host.health("p1").rejoins == 1)
+        take(host.fields(timeout_s=10, patch="p1"), 4)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == ["node 6 (p1) restarted by itself", "node 6 (p1) was brought up and runs"]
 
 
 def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(
@@ -204,10 +206,10 @@ def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(
     with caplog.at_level(logging.WARNING), Host.from_config(hand) as host:
         fields = host.fields(timeout_s=10)
         take(fields, 4)
-        bus = host._links["can0"]._port._bus  # where a driver would fail
+        bus = host._buses["can0"].link._port._bus  # where a driver would fail
         monkeypatch.setattr(bus, "_recv_internal", broken)
         assert eventually(lambda: host.stats().buses["can0"].outages == 1)
-        assert eventually(lambda: host._links["can0"].failure is None)
+        assert eventually(lambda: host._buses["can0"].link.failure is None)
         take(fields, 10)
     said = [record.getMessage() for record in caplog.records]
     assert "does not receive (Network is down); tried again until it is back" in said[0]

@@ -84,13 +84,13 @@ def test_example_says_the_defaults() -> None:
             ["patches", 1, "nodeid"],
             3,
             "patches[1].nodeid: got 3, allowed: no such key (did you mean node_id?); the keys here are "
-            "name, node_id, bus, eds, layout, code_bits, serial, relative_noise",
+            "name, node_id, bus, eds, layout, code_bits, serial, relative_noise, baseline",
         ),
         (
             ["colour"],
             "red",
             "colour: got 'red', allowed: no such key; the keys here are "
-            "name, buses, patches, sync, solver, simulation",
+            "name, buses, patches, sync, bring_up, solver, simulation",
         ),
         (
             ["sync", "overflow"],
@@ -155,7 +155,8 @@ def test_example_says_the_defaults() -> None:
         (
             ["sync", "counter_overflow"],
             241,
-            "sync.counter_overflow: got 241, allowed: an integer from 2 to 240",
+            "sync.counter_overflow: got 241, "
+            "allowed: an integer from 2 to 240; 0 where all buses are a guest's",
         ),
         (
             ["solver", "operator"],

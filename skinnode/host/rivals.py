@@ -1,0 +1,67 @@
+"""Who else acts as a master on a bus: the host does not hear its own frames, so these are somebody else's."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.model.config import BusConfig
+from skinnode.wire import indices as od
+
+_log = logging.getLogger(__name__)
+
+QUIET_NS: Final = 10_000_000_000
+"""Silence after which a rival that is heard again is told of again."""
+
+SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
+
+
+@dataclass(frozen=True, slots=True)
+class RivalStats:
+    """Frames that only a master sends, from others than this host. A guest expects the first two."""
+
+    syncs: int
+    nmt_commands: int
+    sdo_requests: int
+    """To nodes of the hand: a second host, or a technician's tool."""
+    heartbeats: int
+    """With the node-ID of the host."""
+    last_ns: int | None
+    """When the newest of them was received, monotonic."""
+
+
+class Rivals:
+    """Counts them on one bus, and says once that they are there. Mainline only."""
+
+    def __init__(self, bus: BusConfig) -> None:
+        self._bus = bus
+        self._counts = dict.fromkeys((SYNC, NMT, SDO, HEARTBEAT), 0)
+        self._last_ns: dict[str, int] = {}
+
+    def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
+        """For the frames that only a master sends; of a guest those that its master does not."""
+
+        def heard(what: str) -> Callable[[bytes, int], None]:
+            return lambda data, t_ns: self._on(what, t_ns)
+
+        handlers = {od.sdo_request_cob_id(node_id): heard(SDO) for node_id in node_ids}
+        if self._bus.role == "master":
+            handlers |= {od.SYNC_COB_ID: heard(SYNC), od.NMT_COB_ID: heard(NMT)}
+        if self._bus.heartbeat_node_id is not None:
+            handlers[od.heartbeat_cob_id(self._bus.heartbeat_node_id)] = heard(HEARTBEAT)
+        return handlers
+
+    def stats(self) -> RivalStats:
+        counts = self._counts
+        last_ns = max(self._last_ns.values(), default=None)
+        return RivalStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)
+
+    def _on(self, what: str, t_ns: int) -> None:
+        self._counts[what] += 1
+        before_ns = self._last_ns.get(what)
+        self._last_ns[what] = t_ns
+        expected = self._bus.role == "guest" and what == SDO
+        if not expected and (before_ns is None or t_ns - before_ns > QUIET_NS):
+            _log.warning("%s: somebody else sends %s: a second host or master?", self._bus.name, what)

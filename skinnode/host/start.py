@@ -1,0 +1,146 @@
+"""The start of a host: all nodes side by side from whatever they are to operational."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from typing import Final
+
+from skinnode.errors import BusError, NodeTimeout, SkinError
+from skinnode.host.bringup import Abandoned
+from skinnode.host.health import OPERATIONAL
+from skinnode.host.pipeline import Solver
+from skinnode.host.station import Station
+from skinnode.host.supervisor import START_DEADLINE_S
+from skinnode.model.config import Missing, PatchConfig
+
+BRING_UP_THREADS: Final = 16
+"""Nodes brought up at the same time; more would only queue for the bus."""
+
+_BRING_UPS: Final = 3
+"""Tries for a node that boots while it is brought up, as those do that LSS has just found."""
+
+_POLL_S: Final = 0.005
+
+
+class BringUpCancelled(SkinError):
+    """Bring-up was called off by whoever asked for it."""
+
+
+def go_on_unless(cancelled: Callable[[], bool]) -> None:
+    """Raise BringUpCancelled if it was."""
+    if cancelled():
+        raise BringUpCancelled("bring-up was cancelled")
+
+
+def bring_up_all(
+    stations: Sequence[Station], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
+) -> dict[Station, Solver]:
+    """Those that are there, ready to start. The first failure stops the others at their next transfer.
+
+    Raises what the bring-up of a node raises, NodeTimeout or BusError for silence unless it is to be waited
+    for, BringUpCancelled.
+    """
+    over = threading.Event()
+    answered: list[PatchConfig] = []
+
+    def abandoned() -> bool:
+        return over.is_set() or cancelled()
+
+    def bring_up(station: Station) -> Solver:
+        if station.is_silent:
+            _listen(station, deadline_s, abandoned)
+            answered.append(station.patch)
+        for _ in range(_BRING_UPS - 1):
+            try:
+                solver = station.bring_up(deadline_s, abandoned, answered.append)
+                if station.monitor.boot_ups == station.boot_ups:
+                    return solver
+            except BusError:
+                if station.patch not in answered or station.monitor.boot_ups == station.boot_ups:
+                    raise
+        return station.bring_up(deadline_s, abandoned, answered.append)
+
+    def may_wait(station: Station, failure: BaseException | None) -> bool:
+        return missing == "wait" and isinstance(failure, NodeTimeout) and station.patch not in answered
+
+    with ThreadPoolExecutor(min(len(stations), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
+        try:
+            jobs = {station: pool.submit(bring_up, station) for station in stations}
+            pending = set(jobs.values())
+            while pending:
+                done, pending = wait(pending, return_when=FIRST_EXCEPTION)
+                failures = {station: job.exception() for station, job in jobs.items() if job in done}
+                if any(failure and not may_wait(station, failure) for station, failure in failures.items()):
+                    break
+        finally:  # whoever still runs after the first failure, or after Ctrl-C, stops
+            over.set()
+            pool.shutdown(cancel_futures=True)
+    ready: dict[Station, Solver] = {}
+    for station, job in jobs.items():
+        failure = None if job.cancelled() else job.exception()
+        if job.cancelled() or isinstance(failure, Abandoned):
+            continue
+        if failure is None:
+            ready[station] = job.result()
+        elif isinstance(failure, NodeTimeout) and station.patch not in answered:
+            if not may_wait(station, failure):
+                raise _silence(station, stations, answered, deadline_s) from None
+        else:
+            raise failure
+    go_on_unless(cancelled)
+    return ready
+
+
+def start_all(ready: dict[Station, Solver]) -> None:
+    """NMT start where the host is master, and each node says in a heartbeat that it is operational. Raises
+    NodeTimeout."""
+    t_start_ns = time.monotonic_ns()
+    for station, solver in ready.items():
+        station.start(solver, station.lane.withholdings)
+    end_s = time.monotonic() + START_DEADLINE_S
+    for station in ready:
+        patch, monitor = station.patch, station.monitor
+        while not station.is_guest and not monitor.said_since(OPERATIONAL, t_start_ns):
+            if time.monotonic() > end_s:
+                raise NodeTimeout(
+                    patch.node_id,
+                    f"patch {patch.name!r} on {patch.bus}: got NMT state {monitor.nmt_state} after the start "
+                    f"command, allowed: {OPERATIONAL} (operational) within {START_DEADLINE_S:g} s",
+                )
+            time.sleep(_POLL_S)
+
+
+def _listen(station: Station, deadline_s: float, abandoned: Callable[[], bool]) -> None:
+    """Wait for a sign of a node that may not be asked. Raises NodeTimeout."""
+    end_s = time.monotonic() + deadline_s
+    while not station.heard:
+        if abandoned():
+            raise Abandoned
+        if time.monotonic() > end_s:
+            patch = station.patch
+            raise NodeTimeout(
+                patch.node_id, f"patch {patch.name!r} on {patch.bus}: heard nothing within {deadline_s:g} s"
+            )
+        time.sleep(_POLL_S)
+
+
+def _silence(
+    station: Station, stations: Sequence[Station], answered: list[PatchConfig], deadline_s: float
+) -> BusError:
+    """The error for a silent ``station``. If all are silent it is the cable, the supply or the bit rate."""
+    bus, patch = station.bus, station.patch
+    on_bus = [other.patch for other in stations if other.bus is bus]
+    silent = [other for other in on_bus if other not in answered]
+    allowed = f"allowed: an answer within {deadline_s:g} s"
+    names = ", ".join(f"{other.node_id} ({other.name})" for other in silent)
+    if len(silent) == len(on_bus):
+        return BusError(
+            f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: got no answer from any node, "
+            f"{allowed} from {names}"
+        )
+    return NodeTimeout(
+        patch.node_id, f"patch {patch.name!r} on {bus.name}: got no answer, {allowed} from {names}"
+    )

@@ -1,0 +1,158 @@
+"""A patch as its host sees it: the node on its bus, what is known of it, and the lane of its scans."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+from typing import Final
+
+from skinnode.errors import BusError, NodeError, NodeTimeout
+from skinnode.host import bringup
+from skinnode.host.bringup import Bringer, NodeFacts
+from skinnode.host.health import BOOT_UP, STOPPED, NodeMonitor
+from skinnode.host.link import BusLink
+from skinnode.host.lss import LssMaster
+from skinnode.host.pipeline import Lane, Solver
+from skinnode.model.config import HandConfig, PatchConfig
+from skinnode.wire import indices as od
+from skinnode.wire.profile import PatchProfile
+
+_MAINLINE_S: Final = 1.0
+"""How long the mainline may take to do a small job; it turns fifty times a second unless its bus is away."""
+
+
+class Station:
+    """One patch. Its methods without a mark may be called by one thread at a time, which is not the mainline:
+    whoever brings the node up."""
+
+    def __init__(
+        self,
+        patch: PatchConfig,
+        hand: HandConfig,
+        link: BusLink,
+        lane: Lane,
+        monitor: NodeMonitor,
+        lss: LssMaster,
+    ) -> None:
+        self.patch, self.link, self.lane, self.monitor = patch, link, lane, monitor
+        self.bus = hand.bus(patch.bus)
+        self.is_guest = self.bus.role == "guest"
+        self.is_silent = self.is_guest and self.bus.guest_sends == "nothing"
+        """Whether nothing at all may be sent to the node."""
+        self.facts: NodeFacts | None = None
+        self.boot_ups = 0
+        """Boot-up messages when its bring-up began: more of them, and it has to be done again."""
+        self.t_answer_ns = 0
+        """When it last answered an SDO request."""
+        self._hand, self._lss = hand, lss
+        self._profile = PatchProfile.from_config(patch, self.bus)
+        self._remote = link.remote_od(patch.node_id, self._on_answer)
+        link.handle(od.heartbeat_cob_id(patch.node_id), self._on_heartbeat)
+        link.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency)
+        link.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
+        link.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
+        link.poll_with(lane.poll)
+
+    # --- mainline
+
+    def _on_heartbeat(self, data: bytes, t_ns: int) -> None:
+        self.monitor.on_heartbeat(data, t_ns)
+        if len(data) == 1 and data[0] & 0x7F == BOOT_UP:
+            self.lane.withhold()  # what it sends from here on is not as it was configured
+
+    def _on_answer(self, t_ns: int) -> None:
+        self.t_answer_ns = t_ns
+
+    # --- bring-up
+
+    @property
+    def heard(self) -> bool:
+        """Whether anything of the node was heard since the host opened its bus."""
+        return self.monitor.t_heartbeat_ns is not None or self.lane.stats().withheld > 0
+
+    @property
+    def heartbeat_s(self) -> float:
+        """How often the node says that it is there."""
+        return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
+
+    def bring_up(
+        self,
+        deadline_s: float,
+        abandoned: Callable[[], bool],
+        on_answer: Callable[[PatchConfig], None] | None = None,
+    ) -> Solver:
+        """Bring the node up and learn what it is; scans are withheld meanwhile. Raises as
+        :meth:`Bringer.bring_up`."""
+        self.boot_ups = self.monitor.boot_ups
+        if self.monitor.running and self.monitor.nmt_state == STOPPED and not self.is_guest:
+            bringup.stand_by(self.link.send, self.patch.node_id)  # one of ours that somebody stopped is deaf
+
+        def answered(patch: PatchConfig) -> None:
+            self.boot_ups = self.monitor.boot_ups  # those of before were waited for
+            if on_answer is not None:
+                on_answer(patch)
+
+        bringer = self._bringer(deadline_s, abandoned, answered)
+        self.facts = bringer.bring_up(self.patch, self._profile, self._remote)
+        try:
+            return Solver(self.facts, self._hand.solver)
+        except ValueError as error:  # of electrodes that only the node knew
+            raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
+
+    def start(self, solver: Solver, withholdings: int) -> None:
+        """Let scans through to ``solver`` and, as master, tell the node to send them. Raises BusError."""
+        self.link.call(lambda: self.lane.resume(solver, withholdings, anew=True))
+        if not self.is_guest:
+            bringup.start(self.link.send, self.patch.node_id)
+        self.monitor.running = True
+
+    def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> Solver | None:
+        """A solver with the baseline that the node has now; None where that is the one known and scans go
+        through. Raises as :meth:`Bringer.settle_baseline`."""
+        facts = self.facts
+        assert facts is not None  # asked of nodes that run
+        bringer = self._bringer(deadline_s, abandoned, lambda patch: None)
+        baseline_ohm = bringer.settle_baseline(self.patch, self._profile, self._remote)
+        if (baseline_ohm == facts.baseline_ohm).all() and not self.lane.withholding:
+            return None
+        self.facts = facts.with_baseline(baseline_ohm)
+        return Solver(self.facts, self._hand.solver)
+
+    def withhold(self) -> int:
+        """Have the mainline withhold scans; returns the number that :meth:`start` wants. Raises NodeTimeout
+        where the mainline is held up, as while the bus is away."""
+        answer: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self.link.call(lambda: answer.put(self.lane.withhold()))
+        try:
+            return answer.get(timeout=_MAINLINE_S)
+        except queue.Empty:
+            raise NodeTimeout(
+                self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: the bus is away"
+            ) from None
+
+    def probe(self) -> None:
+        """Ask the node for its device type, without waiting for the answer. Raises BusError."""
+        request = b"\x40" + od.DEVICE_TYPE.to_bytes(2, "little") + bytes(5)
+        self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
+
+    @property
+    def searchable(self) -> bool:
+        """Whether the hand file has its serial number, and the host is not a guest."""
+        return not self.is_guest and self.patch.serial is not None
+
+    def search(self) -> bool:
+        """Look for the patch by its serial number, if there is one; whether it was found. It will boot at its
+        node-ID."""
+        if self.is_guest or self.patch.serial is None:
+            return False
+        try:
+            return self._lss.give_node_id(self.patch.serial, self.patch.node_id)
+        except BusError:
+            return False
+
+    def _bringer(
+        self, deadline_s: float, abandoned: Callable[[], bool], answered: Callable[[PatchConfig], None]
+    ) -> Bringer:
+        return Bringer(
+            self.link.send, self._hand, self.bus, deadline_s, abandoned, answered, lambda _: self.search()
+        )

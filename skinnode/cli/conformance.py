@@ -42,11 +42,11 @@ def conformance(
 
     Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
     """
+    from skinnode.cli._bus import find_bus
     from skinnode.cli._files import require_writable
     from skinnode.conformance import connect, parse_eds, run_cases, select
     from skinnode.conformance.report import list_lines, result_line, summary_line
     from skinnode.errors import ConfigError
-    from skinnode.model.config import BusConfig
     from skinnode.transport import CanPort
 
     cases = select(only.split(",") if only else ())
@@ -59,7 +59,7 @@ def conformance(
         if file is not None:
             require_writable(option, file)
     sheet = parse_eds(eds.read_text(encoding="latin-1"), str(eds)) if eds is not None else None
-    bus = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate)
+    bus = find_bus(interface, channel, bitrate, False, None, None).bus
     with CanPort(bus) as port:
         dut = connect(port, node_id, sheet)
         report = run_cases(dut, cases, lambda result: typer.echo(result_line(result)))

@@ -76,7 +76,8 @@ def eds(
             raise ConfigError(option, value, "nothing without --dcf: an EDS is of no node in particular")
     if output is not None:
         require_writable("--output", output)
-    text = eds_text(profile) if node_id is None else dcf_text(profile, node_id, bitrate or 1_000_000)
+    bitrate_bps = 1_000_000 if bitrate is None else bitrate
+    text = eds_text(profile) if node_id is None else dcf_text(profile, node_id, bitrate_bps)
     if output is None:
         typer.echo(text, nl=False)
     else:

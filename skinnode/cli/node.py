@@ -58,7 +58,8 @@ def node(
     A source is a class, or a function, that takes the layout and gives an object
     whose read(t_ns) returns (U, K) ohms. `--source simulated` needs no hardware.
     Ctrl-C ends it. A line a second says how it does. Exit status 1 if the source
-    failed, scans were skipped or frames not sent; 2 if it could not run.
+    failed, scans were skipped, frames not sent or what --store names was of no
+    use; 2 if it could not run.
     """
     from skinnode.cli._files import require_writable
     from skinnode.cli._layouts import find_layout, import_from_here
@@ -128,6 +129,7 @@ class _Progress:
     source_failures: int
     source_error: str
     bus_errors: int
+    memory_problem: str
 
 
 def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
@@ -144,6 +146,7 @@ def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
         board.source_failures,
         board.source_error,
         runner.bus_errors,
+        board.memory_problem,
     )
 
 
@@ -154,7 +157,8 @@ def _faults(end: _Progress) -> list[str]:
         (end.overruns, "scans skipped, for the ones before were still to be sent"),
         (end.bus_errors, "errors of the bus; frames were not sent"),
     )
-    return [f"{count} {what}" for count, what in counted if count]
+    faults = [f"{count} {what}" for count, what in counted if count]
+    return [*faults, f"memory: {end.memory_problem}"] if end.memory_problem else faults
 
 
 def _watch(

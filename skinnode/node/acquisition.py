@@ -74,16 +74,22 @@ class Acquisition:
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
         """Take a scan: the mean of ``readings`` readings, as codes."""
-        resistance = self.read(t_ns)
-        for _ in range(readings - 1):
-            resistance = resistance + self.read(t_ns)
+        resistance = self._total(t_ns, readings)
         self.codes = encode(resistance / readings, self.baseline_ohm, self.scale)
         self.faults = find_faults(self.codes, self.scale)
 
+    def _total(self, t_ns: int, readings: int) -> Float:
+        """Sum of so many readings; no number, which counts as open, where they are infinite both ways."""
+        total = self.read(t_ns)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(readings - 1):
+                total += self.read(t_ns)
+        return total
+
     def tare(self, t_ns: int, readings: int = TARE_READS) -> None:
         """Make the present resistances the baseline. Pairs without a resistance keep the one they have."""
-        total = sum((self.read(t_ns) for _ in range(readings)), start=np.zeros(self.codes.shape))
-        mean = (total / readings).astype(np.float32)
+        with np.errstate(over="ignore", under="ignore"):  # what REAL32 cannot hold is no resistance either
+            mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
         self.tared = True

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
+from skinnode.errors import BusError
 from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
@@ -90,7 +92,7 @@ class EmcyProducer:
     def allow(self, allowed: bool, t_ns: int) -> None:
         """Whether the state of the node lets messages out; they wait otherwise."""
         self._allowed = allowed
-        self.on_timer(t_ns)
+        self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
         """Send what may be sent. What the bus refuses stays to be sent later."""
@@ -126,7 +128,13 @@ class EmcyProducer:
             self._waiting.popleft()
             self._lost += 1
         self._waiting.append(message)
-        self.on_timer(t_ns)
+        self._try(t_ns)
+
+    def _try(self, t_ns: int) -> None:
+        """Send at once if the bus lets it. Whoever tells of an error has more to do because of it than to
+        tell, so what the bus refuses is left to the next turn of the timer."""
+        with contextlib.suppress(BusError):
+            self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
         """How many emergencies gave way; the first two bytes are those of the application's lost scans."""

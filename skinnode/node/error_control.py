@@ -5,10 +5,12 @@ A node beats or is guarded, never both: with a producer heartbeat time (0x1017) 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 
-from skinnode.node.clock import Clock
+from skinnode.errors import BusError
+from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
@@ -37,6 +39,7 @@ class ErrorControl:
         self._cob_id = 0  # known when there is a node-ID
         self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
         self._listen = listen
+        self._booted_ns: int | None = None  # when there is a boot-up message that nobody has got yet
         self._producer = HeartbeatProducer()
         self._guarding = Guarding(store, emcy, failed)
         self._consumer = HeartbeatConsumer(store, emcy, failed)
@@ -48,7 +51,8 @@ class ErrorControl:
     @property
     def deadline_ns(self) -> int:
         """When :meth:`on_timer` has something to do."""
-        return min(self._producer.deadline_ns, self.silent_from_ns)
+        boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
+        return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns)
 
     @property
     def silent_from_ns(self) -> int:
@@ -71,9 +75,11 @@ class ErrorControl:
         self._consumer.reset()
 
     def boot_up(self, t_ns: int) -> None:
-        """Tell that the node is there; heartbeats follow if 0x1017 says so."""
+        """Tell that the node is there, as soon as the bus lets it; heartbeats follow if 0x1017 says so."""
         self._producer.boot_up(self._store.integer(od.HEARTBEAT_PRODUCER), t_ns)
-        self._send(self._cob_id, bytes((NmtState.INITIALISING,)))
+        self._booted_ns = t_ns
+        with contextlib.suppress(BusError):
+            self._tell_boot_up()
 
     def on_request(self, state: NmtState, t_ns: int) -> None:
         """A remote frame asked for the state."""
@@ -82,10 +88,16 @@ class ErrorControl:
 
     def on_timer(self, state: NmtState, t_ns: int) -> None:
         """Do what is due."""
+        self._tell_boot_up()
         if self._producer.beat(t_ns):
             self._send(self._cob_id, bytes((state,)))
         self._guarding.on_timer(t_ns)
         self._consumer.on_timer(t_ns)
+
+    def _tell_boot_up(self) -> None:
+        if self._booted_ns is not None:
+            self._send(self._cob_id, bytes((NmtState.INITIALISING,)))
+            self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
         """Somebody else has this node-ID. Told once until a reset, and counted: what to do about it is for

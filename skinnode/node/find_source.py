@@ -28,7 +28,7 @@ def load(reference: str, option: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except Exception as error:  # whatever the module does when it is imported
+    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
         raise ConfigError(option, reference, f"MODULE:NAME that can be imported ({_line(error)})") from error
     return found
 
@@ -52,7 +52,7 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
         raise ConfigError(option, name, "a class or a function that takes the layout")
     try:
         source: ResistanceSource = factory(layout)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(option, name, f"one that takes the layout ({_line(error)})") from error
     if not callable(getattr(source, "read", None)):
         raise ConfigError(option, name, f"one that gives an object with read(t_ns), not {source!r:.80}")
@@ -63,5 +63,5 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
     return source
 
 
-def _line(error: Exception) -> str:
+def _line(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")

@@ -87,6 +87,11 @@ class PatchNode(CanopenDevice):
         return self._patch.source_error
 
     @property
+    def memory_problem(self) -> str:
+        """What went wrong with the memory last, in one line; empty if nothing did."""
+        return self._storage.problem
+
+    @property
     def overruns(self) -> int:
         """Scans skipped because two others were still to be sent."""
         return self._patch.overruns

@@ -56,7 +56,7 @@ class NodeRunner:
         self._bus_state = BusState.ACTIVE
         self._sent_before = 0  # frames, when everything had begun to fail: one more, and the bus is back
         self._stopping = threading.Event()
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
 
     @property
@@ -98,7 +98,7 @@ class NodeRunner:
             for node in self.nodes:
                 node.power_on(now_ns)
             self._drive()
-        except Exception as error:  # whatever it is, it belongs to whoever calls stop()
+        except BaseException as error:  # whatever it is, it belongs to whoever calls stop()
             self._error = error
         finally:
             for node in self.nodes:

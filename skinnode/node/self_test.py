@@ -25,6 +25,7 @@ NOISE_LIMIT: Final = 1e-3
 the solver is promised."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers that no converter gives
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
     """Test a patch. ``read`` gives (U, K) resistances in ohm or raises SourceFailed; ``baseline_ohm`` is of
     the same shape."""
@@ -45,7 +46,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
     stack = np.array(readings)
     measured = (np.isfinite(stack) & (stack > 0)).all(axis=0)
     noise = _noise(stack[:, measured])
-    if noise > NOISE_LIMIT:
+    if not noise <= NOISE_LIMIT:
         faults |= SelfTestFault.NOISE
     codes = encode(stack.mean(axis=0), baseline_ohm, scale)
     wires = find_faults(codes, scale)

@@ -35,15 +35,16 @@ class SourceFailed(Exception):
 
 
 def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> Float:
-    """A reading of ``source``, as (U, K) float64. Raises SourceFailed, with one line, whatever it did."""
+    """A reading of ``source``, as (U, K) float64, copied. Raises SourceFailed, with one line, whatever it
+    did."""
     try:
         reading = source.read(t_ns)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a source does not end the thread that reads it
         what = " ".join(str(error).split())
         raise SourceFailed(
             SourceFault.RAISED, f"source.read(): {type(error).__name__}: {what}".rstrip(": ")
         ) from error
     try:
-        return require_array("source.read()", reading, shape, finite=False)
+        return require_array("source.read()", reading, shape, finite=False).copy()  # it may be overwritten
     except ValueError as error:
         raise SourceFailed(SourceFault.WRONG_ARRAY, str(error)) from None

@@ -46,6 +46,8 @@ class Storage:
         self._store, self._emcy, self._memory = store, emcy, memory
         self._untold: list[bytes] = []
         self._kept = Kept(patch)
+        self.problem = ""
+        """What went wrong with the memory last, in one line; empty if nothing did."""
         self.baseline_ohm: Callable[[], Rows] = tuple
         """The present R0; the application says what it is."""
         able = int(memory is not None).to_bytes(4, "little")  # 1: saves, restores, on command
@@ -70,19 +72,20 @@ class Storage:
     def load(self) -> None:
         """Power came. A memory whose content is of no use counts as empty."""
         patch = self._kept.patch
-        self._kept, self._untold = Kept(patch), []
+        self._kept, self._untold, self.problem = Kept(patch), [], ""
         try:
             kept = self._memory.load() if self._memory is not None else None
         except MemoryFault as error:
-            self.note(error.fault)
+            self.note(error.fault, why=str(error))
             return
         if kept is not None and kept.patch != patch:
-            self.note(Fault.FOREIGN)
+            self.note(Fault.FOREIGN, why=f"it is of another patch, {kept.patch!r}; this one is {patch!r}")
         elif kept is not None:
             self._kept = kept
 
-    def note(self, fault: Fault, index: int = 0, subindex: int = 0) -> None:
+    def note(self, fault: Fault, index: int = 0, subindex: int = 0, why: str = "") -> None:
         """Something that :meth:`tell` is to tell."""
+        self.problem = why or f"0x{index:04X}:{subindex} as it was kept is not allowed"
         self._untold.append(struct.pack("<BHB", fault, index, subindex))
 
     def tell(self, t_ns: int) -> None:
@@ -113,8 +116,8 @@ class Storage:
             return
         try:
             self._keep(replace(self._kept, baseline_ohm=self.baseline_ohm()))
-        except OSError:
-            self.note(Fault.NOT_SAVED)
+        except OSError as error:
+            self.note(Fault.NOT_SAVED, why=f"baseline not saved: {error}")
 
     def keep_lss(self, node_id: int, bit_rate_bps: int | None) -> None:
         """LSS stores its configuration. Raises OSError if that fails."""

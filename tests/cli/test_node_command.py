@@ -200,6 +200,33 @@ def test_what_was_stored_is_there_at_the_next_start(
     assert (sources / "patch.json").is_file()
 
 
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("{", "/patch.json: no memory of a node"),
+        (None, "memory: it is of another patch, 'skinnode-10x30-u24"),
+    ],
+)
+def test_a_memory_that_is_of_no_use_is_a_fault(
+    sources: Path, multicast_group: str, content: str | None, says: str
+) -> None:
+    def run(*options: str) -> subprocess.CompletedProcess[str]:
+        source = ["--source", "my_sources:Board", "--store", "patch.json", "--seconds", "0.2"]
+        command = arguments(multicast_group, *source, *options, node_id=4)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+
+    if content is None:
+        assert run("--code-bits", "24").returncode == 0
+    else:
+        (sources / "patch.json").write_text(content)
+    done = run()
+    assert done.returncode == 1
+    assert "fault: memory: " in done.stdout
+    assert says in done.stdout
+    assert run().returncode == 0  # put aside, and a new one begun
+
+
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:
     """Switch state global, configure node-ID 9, store, waiting state (CiA 305); then as after a power cut."""
     options = ["--source", "my_sources:Board", "--store", "patch.json", "--serial", "5"]

@@ -114,6 +114,7 @@ def test_the_list_names_every_case_once(capsys: pytest.CaptureFixture[str]) -> N
         (("--node-id", "4", "--eds", "no-such-file.eds"), "no-such-file.eds"),
         (("--node-id", "4", "--html", "no such folder/report.html"), "--html"),
         (("--node-id", "4", "--interface", "virtual", "--eds", __file__), "EDS"),
+        (("--node-id", "4", "--interface", "virtual", "--bitrate", "5"), "--bitrate: got 5"),
     ],
 )
 def test_what_cannot_run_is_one_line_and_status_2(
@@ -124,6 +125,7 @@ def test_what_cannot_run_is_one_line_and_status_2(
     assert captured.out == ""
     (line,) = captured.err.strip().splitlines()
     assert told in line
+    assert "pydantic" not in line
 
 
 def test_no_node_is_status_2(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

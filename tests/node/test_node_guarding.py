@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from skinnode.errors import BusError
 from skinnode.node import NmtState
 
 LOST = (0x084, "30 81 11 00 00 00 00 00")
@@ -92,6 +93,19 @@ def test_error_behaviour(operational, behaviour: int, state: NmtState) -> None:
     desk.run(300)
     assert LOST in desk.take()
     assert desk.node.nmt_state is state
+
+
+def test_error_behaviour_does_not_wait_for_a_bus_that_refuses_the_emergency(operational) -> None:
+    desk = operational
+    guarded(desk)
+    ask(desk)
+    desk.bus_refuses = True
+    with pytest.raises(BusError):
+        desk.run(301)
+    assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+    desk.bus_refuses = False
+    desk.run(1)
+    assert desk.take() == [LOST]
 
 
 @pytest.mark.parametrize(("guard_ms", "factor"), [(0, 3), (100, 0)])

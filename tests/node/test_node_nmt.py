@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from skinnode.errors import BusError
 from skinnode.node import NmtState, PatchNode
 
 
@@ -16,6 +17,20 @@ def test_boot_up_is_one_zero_byte(make: Callable) -> None:
     desk.power_on()
     assert desk.take() == [(0x704, "00")]
     assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+
+
+@pytest.mark.parametrize("reset", ["81 00", "82 04"])
+def test_boot_up_that_the_bus_refuses_is_told_as_soon_as_it_does_not(desk, reset: str) -> None:
+    """A queue that is full of chunks when the manager resets the node: it must not fall silent for ever."""
+    desk.write(0x1017, 0, 100, 2)
+    desk.bus_refuses = True
+    desk.node.on_frame(0, bytes.fromhex(reset), desk.t_ns)
+    assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
+    with pytest.raises(BusError):  # whoever drives it hears of it
+        desk.run(0)
+    desk.bus_refuses = False
+    desk.run(500)
+    assert desk.take() == [(0x704, "00")]  # once; without a heartbeat, since the reset took 0x1017 back
 
 
 def test_silent_before_power_on_and_after_power_off(layout) -> None:

@@ -92,6 +92,47 @@ def test_averaging_over_a_failure_is_a_failure(failing) -> None:
     assert [can_id for can_id, _ in scan(failing, 1)] == [EMCY, SUMMARY]
 
 
+def test_a_source_may_reuse_its_array(failing, rest_ohm) -> None:
+    """The mean of two readings, 1 % up and 1 % down, is the baseline."""
+    array, turns = rest_ohm.copy(), iter(range(100))
+
+    def read(t_ns: int) -> Float:
+        array[:] = rest_ohm * (1.01 if next(turns) % 2 else 0.99)
+        return array
+
+    failing.source.read = read
+    failing.write(0x2021, 2, 2, 1)
+    scan(failing, 1)
+    assert abs(failing.read(0x2100, 1) - round(0.75 * 65532)) <= 1
+    assert failing.sdo(TestSelfTest.RUN).startswith("60")
+    (noise,) = struct.unpack("<f", failing.read(0x2023, 4).to_bytes(4, "little"))
+    assert noise == pytest.approx(0.01 * (16 / 15) ** 0.5, rel=1e-6)  # 16 readings, one degree of freedom
+
+
+def test_a_source_that_calls_exit_is_a_failure_and_ends_nothing(failing) -> None:
+    failing.failing.error = SystemExit(3)
+    assert [can_id for can_id, _ in scan(failing, 1)] == [EMCY, SUMMARY]
+    assert failing.node.source_error == "source.read(): SystemExit: 3"
+
+
+def test_numbers_that_no_converter_gives_warn_nobody(failing) -> None:
+    """Warnings are errors here, as in a program that wants it so: nothing may come out of the node."""
+    signs = iter([1.0, -1.0] * 50)
+    row = [1e300, 1e-300, np.nan, -5.0, 0.0, np.inf]
+
+    def read(t_ns: int) -> Float:
+        return np.array([row, [1.7e308, 1.7e308, 1e4, 1e4, 1e4, next(signs) * np.inf]])
+
+    failing.source.read = read
+    failing.write(0x2021, 2, 4, 1)
+    assert failing.sdo("23 21 20 04 74 61 72 65").startswith("60")
+    assert [can_id for can_id, _ in scan(failing, 1)] == [EMCY] + [CHUNK] * 4 + [SUMMARY]
+    codes = [failing.read(0x2100, column) for column in range(1, 7)]
+    assert codes[2:] == [0xFFFF, 0xFFFE, 0xFFFE, 0xFFFF]  # open, shorted, shorted, open
+    assert failing.sdo(TestSelfTest.RUN).startswith("60")
+    assert failing.read(0x2023, 1) == 2
+
+
 def test_a_tare_without_a_converter_is_refused_and_changes_nothing(failing, rest_ohm) -> None:
     failing.failing.error = OSError()
     answer = failing.sdo("23 21 20 04 74 61 72 65")

@@ -132,7 +132,11 @@ def test_hardware_failure(desk, memory: Breakable) -> None:
     desk.write(0x2020, 2, 78, 2)
     assert desk.sdo("23 10 10 01 73 61 76 65") == f"80 10 10 01 {HARDWARE}"
     assert desk.sdo("23 11 10 01 6c 6f 61 64") == f"80 11 10 01 {HARDWARE}"
+    assert desk.node.memory_problem == ""  # whoever asked has been told
+    desk.write(0x2021, 4, int.from_bytes(b"tare", "little"), 4)
+    assert desk.node.memory_problem == "baseline not saved: no space left on device"
     cycle(desk)
+    assert desk.node.memory_problem == ""
     assert desk.read(0x2020, 2) == 77
 
 
@@ -261,6 +265,7 @@ def test_value_that_is_not_allowed_any_more(
     frames = cycle(desk)
     assert frames[0] == (0x704, "00")  # the boot-up message comes first
     assert emergencies(frames) == [f"00 63 81 04 {told} 00"]
+    assert desk.node.memory_problem == f"0x{key[0]:04X}:{key[1]} as it was kept is not allowed"
     assert desk.read(0x1017, 0) == 100
     assert desk.read(0x1019, 0) == 0
     assert desk.read(0x1014, 0) == 0x84

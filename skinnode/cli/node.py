@@ -129,6 +129,7 @@ class _Progress:
     source_failures: int
     source_error: str
     bus_errors: int
+    bus_error: str
     memory_problem: str
 
 
@@ -146,6 +147,7 @@ def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
         board.source_failures,
         board.source_error,
         runner.bus_errors,
+        runner.bus_error,
         board.memory_problem,
     )
 
@@ -155,7 +157,7 @@ def _faults(end: _Progress) -> list[str]:
     counted = (
         (end.source_failures, f"failures of the source, the last: {end.source_error}"),
         (end.overruns, "scans skipped, for the ones before were still to be sent"),
-        (end.bus_errors, "errors of the bus; frames were not sent"),
+        (end.bus_errors, f"errors of the bus, the last began with: {end.bus_error}"),
     )
     faults = [f"{count} {what}" for count, what in counted if count]
     return [*faults, f"memory: {end.memory_problem}"] if end.memory_problem else faults

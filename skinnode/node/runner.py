@@ -29,16 +29,18 @@ _CATCH_UP_FRAMES: Final = 4096
 OFF_AFTER_S: Final = 0.1
 """A bus on which everything has failed for this long is off to the nodes: a full queue drains sooner."""
 
-PATIENCE_S: Final = 5.0
-"""An interface that does nothing but fail for this long has gone."""
+REOPEN_S: Final = 1.0
+"""An interface that does nothing but fail for this long may be another one by now, plugged in again: it is
+opened anew, and again after as long."""
 
 
 class NodeRunner:
     """Powers ``nodes`` on and keeps them going until :meth:`stop`.
 
     Raises ValueError for no nodes, or for two with the same node-ID; any number may have none yet. A runner
-    runs once. The nodes belong to the thread from :meth:`start` to :meth:`stop`; only counters may be looked
-    at meanwhile. The port stays open. Timers are kept as closely as the most exact of the nodes wants it.
+    runs once. It does not end because of the bus, however long that is away. The nodes belong to the thread
+    from :meth:`start` to :meth:`stop`; only counters may be looked at meanwhile. The port stays open. Timers
+    are kept as closely as the most exact of the nodes wants it.
     """
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
@@ -53,6 +55,9 @@ class NodeRunner:
         self._slack_ns = min(node.pacing.slack_ns for node in self.nodes)
         self.bus_errors = 0
         """Errors of the bus that the nodes got over."""
+        self.bus_error = ""
+        """What they began with the last time, in one line."""
+        self._heard = 0
         self._bus_state = BusState.ACTIVE
         self._sent_before = 0  # frames, when everything had begun to fail: one more, and the bus is back
         self._stopping = threading.Event()
@@ -69,8 +74,8 @@ class NodeRunner:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join the thread; the nodes are off. Raises what ended the thread before, as a
-        bus that has gone (BusError). Stopping again does nothing."""
+        """End and join the thread; the nodes are off. Raises what ended the thread before, and does nothing
+        when called again."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -106,24 +111,30 @@ class NodeRunner:
 
     def _drive(self) -> None:
         failing_since_s: float | None = None
+        opened_s = time.monotonic()
         while not self._stopping.is_set():
+            moved = self._port.sent + self._heard
             try:
                 self._turn()
-                failing_since_s = None
-                if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
-                    self._tell(BusState.ACTIVE)
-            except BusError:
-                # What could not be sent is lost, as on any bus; the nodes go on. A bus that stays away ends
-                # them.
+            except BusError as error:
+                # What could not be sent is lost, as on any bus; the nodes go on.
                 self.bus_errors += 1
                 now_s = time.monotonic()
-                failing_since_s = now_s if failing_since_s is None else failing_since_s
-                if now_s - failing_since_s > PATIENCE_S:
-                    raise
+                if failing_since_s is None:
+                    failing_since_s = opened_s = now_s
+                    self.bus_error = str(error)
                 if now_s - failing_since_s > OFF_AFTER_S and self._bus_state is not BusState.OFF:
                     self._tell(BusState.OFF)
                     self._sent_before = self._port.sent
+                if now_s - opened_s > REOPEN_S:
+                    opened_s = now_s
+                    with contextlib.suppress(BusError):
+                        self._port.reopen()
                 self._stopping.wait(_RETRY_S)
+            if self._port.sent + self._heard > moved:  # a turn with nothing to do proves nothing
+                failing_since_s = None
+            if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
+                self._tell(BusState.ACTIVE)
 
     def _tell(self, state: BusState) -> None:
         self._bus_state = state
@@ -182,8 +193,9 @@ class NodeRunner:
         if frame.error:
             self._on_error_frame(frame)
         elif not (frame.extended or (frame.fd and not self._fd)):
+            self._heard += 1
             if self._bus_state is BusState.OFF:
-                self._tell(BusState.ACTIVE)  # a frame was heard
+                self._tell(BusState.ACTIVE)
             for node in self.nodes:
                 try:
                     node.on_frame(frame.can_id, frame.data, frame.t_ns, frame.remote)

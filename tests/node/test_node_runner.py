@@ -345,6 +345,49 @@ def test_bus_that_goes_away_and_comes_back(virtual: BusConfig, layout: PatchLayo
             eventually(lambda: (0x704, "05") in heard())
 
 
+@pytest.mark.parametrize("heartbeat", ["05 00", "c8 00"])  # 5 ms; 200 ms, with turns of nothing between
+def test_bus_that_is_away_for_long_is_opened_anew(
+    virtual: BusConfig, layout: PatchLayout, monkeypatch: pytest.MonkeyPatch, heartbeat: str
+) -> None:
+    """An adapter that is pulled and plugged in again is another one: it takes frames when it is opened."""
+    monkeypatch.setattr("skinnode.node.runner.REOPEN_S", 0.3)
+    there, tries = threading.Event(), []
+
+    class Adapter(CanPort):
+        gone = False
+
+        def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+            if self.gone:
+                raise BusError("can0: no such device")
+            super().send(can_id, data)
+
+        def reopen(self) -> None:
+            tries.append(time.monotonic())
+            if not there.is_set():
+                raise BusError("can0: does not open")
+            super().reopen()
+            self.gone = False
+
+    with Adapter(virtual) as port, CanPort(virtual) as manager:
+
+        def heard() -> list[tuple[int, str]]:
+            frame = manager.recv(0.01)
+            return [] if frame is None else [(frame.can_id, frame.data.hex(" "))]
+
+        node = PatchNode(4, layout, Steady(layout), send=port.send)
+        with NodeRunner(port, [node]) as runner:
+            manager.send(0x604, bytes.fromhex(f"2b171000 {heartbeat} 0000"))
+            manager.send(0x000, bytes((1, 0)))
+            eventually(lambda: (0x704, "05") in heard())
+            port.gone = True
+            eventually(lambda: node.nmt_state is NmtState.PRE_OPERATIONAL)
+            eventually(lambda: len(tries) >= 3)
+            assert runner.bus_error == "can0: no such device"
+            there.set()
+            eventually(lambda: (0x084, "40 81 11 00 00 00 00 00") in heard())
+            eventually(lambda: (0x704, "7f") in heard())
+
+
 def test_heartbeats_that_came_while_the_thread_was_kept_busy_were_not_missed(
     virtual: BusConfig, layout: PatchLayout
 ) -> None:

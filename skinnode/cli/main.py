@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from skinnode.cli import bench, conformance, demo, eds, host, info, node, od, scan
+from skinnode.cli import bench, conformance, demo, eds, host, info, lss, nmt, node, od, scan
 from skinnode.errors import SkinError
 
 app = typer.Typer(
@@ -29,6 +29,8 @@ app.command(name="eds")(eds.eds)
 app.command(name="scan")(scan.scan)
 app.command(name="info")(info.info)
 app.command(name="od")(od.od)
+app.command(name="nmt")(nmt.nmt)
+app.add_typer(lss.app, name="lss")
 app.command(name="conformance")(conformance.conformance)
 app.add_typer(bench.app, name="bench")
 

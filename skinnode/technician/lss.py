@@ -21,6 +21,9 @@ _SCAN_ANSWERS_S: Final = (0.03, 0.15)
 """The same within a fastscan, where every *no* is waited for; the longer one where the first found nobody
 who agrees in the end."""
 
+_TRIES: Final = 2
+"""Questions of which silence means that nobody is there; a busy machine may miss one."""
+
 _RESET_SCAN: Final = 0x80
 _PARTS: Final = 4
 _LIKELY: Final = (od.VENDOR_ID, od.PRODUCT_CODE, od.REVISION_NUMBER)
@@ -48,7 +51,7 @@ class LssMaster:
     def any_unconfigured(self) -> bool:
         """Whether there is a node without a node-ID (identify non-configured remote slave)."""
         wanted = LssCommand.IDENTIFIED_NOT_CONFIGURED
-        return self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) is not None
+        return any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) for _ in range(_TRIES))
 
     def find_unconfigured(self) -> LssAddress | None:
         """One node without a node-ID, by fastscan; it is in configuration until :meth:`release`. None where

@@ -1,0 +1,143 @@
+"""``skinnode lss``: node-ID and bit rate of nodes that have no switches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
+
+if TYPE_CHECKING:
+    from skinnode.technician.commission import Commissioned
+
+app = typer.Typer(help="Layer setting services: give nodes their node-ID and bit rate.", no_args_is_help=True)
+
+
+@app.command(name="list")
+def list_nodes(
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    fd: Fd = False,
+    hand: Hand = None,
+    bus: Bus = None,
+    as_json: Json = False,
+) -> None:
+    """Find all nodes without a node-ID, by fastscan. Changes nothing."""
+    from skinnode.cli._bus import find_bus
+    from skinnode.cli._console import console, print_json, progress, table
+    from skinnode.technician.line import Line
+    from skinnode.technician.survey import find_unconfigured
+
+    place = find_bus(interface, channel, bitrate, fd, hand, bus)
+    with progress(as_json) as tell, Line(place.bus) as line:
+        tell("fastscan")
+        found, more = find_unconfigured(line)
+    if as_json:
+        print_json({"unconfigured": [address._asdict() for address in found], "more": more})
+        return
+    if found:
+        listed = table("serial", "vendor", "product", "revision", right=("serial",))
+        for item in found:
+            revision = f"{item.revision_number >> 16}.{item.revision_number & 0xFFFF}"
+            listed.add_row(
+                str(item.serial_number), f"{item.vendor_id:08X}", f"{item.product_code:08X}", revision
+            )
+        console().print(listed)
+    typer.echo(f"{len(found)} nodes without a node-ID" + (", and more" if more else ""))
+
+
+@app.command(name="set")
+def set_node(
+    serial: Annotated[
+        int | None,
+        typer.Option(min=0, max=0xFFFF_FFFF, help="Which; default: the only one without a node-ID."),
+    ] = None,
+    node_id: Annotated[int | None, typer.Option(min=1, max=127, help="Its new node-ID.", metavar="N")] = None,
+    bit_rate: Annotated[
+        int | None, typer.Option(help="Its bit rate from its next power-on on.", metavar="BPS")
+    ] = None,
+    store: Annotated[bool, typer.Option(help="Have it keep both over a power cycle.")] = True,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    vendor: Annotated[int | None, typer.Option(help="Of a device of others.", metavar="N")] = None,
+    product: Annotated[int | None, typer.Option(help="Of a device of others.", metavar="N")] = None,
+    revision: Annotated[int | None, typer.Option(help="Of a device of others.", metavar="N")] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    fd: Fd = False,
+    hand: Hand = None,
+    bus: Bus = None,
+    as_json: Json = False,
+) -> None:
+    """Set node-ID or bit rate of one node, and store them.
+
+    A node that has a node-ID is reset to take the new one. Exit status 0 if all
+    was done, 1 if the node did not store or boot, 2 if it could not be done.
+    """
+    from skinnode.cli._bus import find_bus
+    from skinnode.cli._console import print_json, progress
+    from skinnode.errors import ConfigError
+    from skinnode.node.lss import BIT_RATES_BPS, LssAddress
+    from skinnode.technician.commission import commission, only_unconfigured
+    from skinnode.technician.line import Line
+    from skinnode.wire import indices as od
+
+    if node_id is None and bit_rate is None:
+        raise ConfigError("--node-id, --bit-rate", None, "one of them at least")
+    if bit_rate is not None and bit_rate not in BIT_RATES_BPS.values():
+        allowed = ", ".join(str(rate) for rate in BIT_RATES_BPS.values())
+        raise ConfigError("--bit-rate", bit_rate, allowed)
+    place = find_bus(interface, channel, bitrate, fd, hand, bus)
+    with Line(place.bus) as line:
+        if serial is None:
+            with progress(as_json) as tell:
+                tell("fastscan")
+                address = only_unconfigured(line)
+        else:
+            address = LssAddress(
+                od.VENDOR_ID if vendor is None else vendor,
+                od.PRODUCT_CODE if product is None else product,
+                od.REVISION_NUMBER if revision is None else revision,
+                serial,
+            )
+
+        def agreed(before: int | None) -> bool:
+            return yes or _confirmed(address.serial_number, before, node_id, bit_rate, store)
+
+        done = commission(line, address, node_id=node_id, bitrate_bps=bit_rate, store=store, agreed=agreed)
+    if done is None:
+        raise ConfigError("--yes", False, "a yes to the question; nothing was changed")
+    if as_json:
+        from dataclasses import asdict
+
+        print_json({**asdict(done), "address": done.address._asdict()})
+    else:
+        _print(done)
+    if done.faults:
+        raise typer.Exit(1)
+
+
+def _confirmed(
+    serial: int, before: int | None, node_id: int | None, bit_rate: int | None, store: bool
+) -> bool:
+    changes = []
+    if node_id is not None:
+        changes.append(f"node-ID {before or 'none'} → {node_id}")
+    if bit_rate is not None:
+        changes.append(f"bit rate → {bit_rate} from its next power-on on")
+    changes.append("stored" if store else "not stored")
+    return bool(typer.confirm(f"serial {serial}: {', '.join(changes)}. Do it?", err=True))
+
+
+def _print(done: Commissioned) -> None:
+    what = []
+    if done.node_id is not None:
+        what.append(f"node-ID {done.node_id_before or 'none'} → {done.node_id}")
+    if done.bitrate_bps is not None:
+        what.append(f"bit rate {done.bitrate_bps} from its next power-on on")
+    what.append("stored" if done.stored else "not stored")
+    typer.echo(f"serial {done.address.serial_number}: {', '.join(what)}")
+    for fault in done.faults:
+        typer.echo(f"fault: {fault}")

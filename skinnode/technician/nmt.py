@@ -1,0 +1,118 @@
+"""NMT commands (CiA 301, 7.2.8) whose effect is looked at."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from skinnode.technician.line import Line, State, state_name
+from skinnode.wire import indices as od
+
+FOLLOW_S: Final = 1.5
+"""How long a node may take to say that it is in its new state, beyond its heartbeat period."""
+
+BOOT_S: Final = 5.0
+"""How long a node may take to boot."""
+
+_ALL_NODES: Final = 0
+_GUARD_EACH_S: Final = 0.1
+
+
+class Command(StrEnum):
+    """What a node is told."""
+
+    START = "start"
+    STOP = "stop"
+    PRE_OPERATIONAL = "pre-operational"
+    RESET_NODE = "reset-node"
+    RESET_COMMUNICATION = "reset-communication"
+
+    @property
+    def resets(self) -> bool:
+        return self in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
+
+
+_SPECIFIERS: Final = {
+    Command.START: 1,
+    Command.STOP: 2,
+    Command.PRE_OPERATIONAL: 128,
+    Command.RESET_NODE: 129,
+    Command.RESET_COMMUNICATION: 130,
+}
+_STATES: Final = {Command.START: 5, Command.STOP: 4, Command.PRE_OPERATIONAL: 127}
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What became of a command at one node."""
+
+    node_id: int
+    before: str
+    after: str
+    followed: bool
+    known_by: str
+    """How the state after is known, or why the node counts as not following."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Watch:
+    """How the state of a node can be known."""
+
+    node_id: int
+    heartbeat_s: float | None
+    guarding: bool
+    before: State
+    boot_ups: int
+
+
+def command_nodes(line: Line, node_ids: Sequence[int], command: Command, *, at_once: bool) -> list[Change]:
+    """Command these nodes, ``at_once`` by one message to all nodes of the bus, else one after the other, and
+    see what they do. Raises BusError."""
+    watches = [_watch(line, node_id) for node_id in node_ids]
+    sent_ns = time.monotonic_ns()
+    for node_id in [_ALL_NODES] if at_once else node_ids:
+        line.link.send(od.NMT_COB_ID, bytes((_SPECIFIERS[command], node_id)))
+    return [
+        _booted(line, w, sent_ns) if command.resets else _followed(line, w, command, sent_ns) for w in watches
+    ]
+
+
+def _watch(line: Line, node_id: int) -> _Watch:
+    """What can only be asked beforehand: a stopped node does not answer."""
+    heartbeat_s = line.heartbeat_s(node_id)
+    guarding = not line.guarded(node_id)
+    before = line.state(node_id, heartbeat_s, guarding=guarding)
+    return _Watch(node_id, heartbeat_s, guarding, before, line.heard.node(node_id).boot_ups)
+
+
+def _followed(line: Line, watch: _Watch, command: Command, sent_ns: int) -> Change:
+    """Whether the node says that it is in the state it was told to enter."""
+    wanted, since_ns = _STATES[command], sent_ns
+    end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
+    while True:
+        now = line.state(watch.node_id, watch.heartbeat_s, guarding=watch.guarding, since_ns=since_ns)
+        if now.state == wanted:
+            return Change(watch.node_id, str(watch.before), str(now), True, now.how)
+        if time.monotonic() > end_s:
+            why = now.how if now.state is None else f"by {now.how}, not {state_name(wanted)}"
+            return Change(watch.node_id, str(watch.before), str(now), False, why)
+        since_ns = time.monotonic_ns()
+        line.wait_until(lambda: False, _GUARD_EACH_S)
+
+
+def _booted(line: Line, watch: _Watch, sent_ns: int) -> Change:
+    """Whether the node booted, and the state in which it then is."""
+    node_id = watch.node_id
+    if not line.wait_until(lambda: line.heard.node(node_id).boot_ups > watch.boot_ups, BOOT_S):
+        why = f"no boot-up message within {BOOT_S:g} s"
+        now = line.heard.newest_beat(node_id, sent_ns)
+        after = "silent" if now is None else state_name(now.state)
+        return Change(node_id, str(watch.before), after, False, why)
+    booted_ns = time.monotonic_ns()
+    heartbeat_s = line.heartbeat_s(node_id)  # it may have been reset, too
+    now_in = line.state(node_id, heartbeat_s, guarding=not line.guarded(node_id), since_ns=booted_ns)
+    how = "boot-up message" + (f", {now_in.how}" if now_in.state is not None else "")
+    return Change(node_id, str(watch.before), str(now_in), True, how)

@@ -5,6 +5,7 @@ Exit status: 0 ended as asked (Ctrl-C, SIGTERM or ``--seconds``), 2 could not ru
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -38,6 +39,13 @@ def simulate(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
     ] = None,
+    fault: Annotated[
+        str,
+        typer.Option(
+            help="What goes wrong with every node, such as lost=0.01,restart_every_s=5,frozen.",
+            metavar="FAULTS",
+        ),
+    ] = "",
 ) -> None:
     """Simulate the patches of a hand: CANopen nodes on a bus, a sphere pressing and sliding over each.
 
@@ -46,14 +54,18 @@ def simulate(
     from skinnode.model.config import load_hand
     from skinnode.pauses import short_pauses
     from skinnode.signals import until_told
+    from vcan_sim.faults import parse_faults
     from vcan_sim.fleet import Fleet
 
-    plan = load_hand(hand).on(interface, channel)
-    with until_told() as ended, Fleet(plan) as fleet, short_pauses():
+    plan, faults = load_hand(hand).on(interface, channel), parse_faults(fault)
+    with until_told() as ended, Fleet(plan, faults=faults) as fleet, short_pauses():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         _say(f"{len(plan.patches)} patches of {plan.name!r} on {where}; Ctrl-C ends")
         _watch(fleet, ended.wait, seconds)
+        injected = _injected(fleet) if fault else []
     _say(_summary(fleet.report()))
+    for line in injected:
+        _say(line)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -96,6 +108,16 @@ def _words(state: NmtState) -> str:
 def _summary(reports: Sequence[NodeReport]) -> str:
     scans, frames = sum(r.scans_sent for r in reports), sum(r.frames_sent for r in reports)
     return f"sent {scans} scans in {frames} frames from {len(reports)} nodes"
+
+
+def _injected(fleet: Fleet) -> list[str]:
+    """What went wrong, a line a patch."""
+    lines = []
+    for patch in fleet.patches:
+        counts = dataclasses.asdict(fleet.injected(patch))
+        told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        lines.append(f"{patch}: {told or 'nothing injected'}")
+    return lines
 
 
 def _say(line: str) -> None:

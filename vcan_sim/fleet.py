@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
+from skinnode.errors import BusError
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.layout import Float
-from skinnode.node import NmtState, NodeRunner, PatchNode
-from skinnode.transport import CanPort
+from skinnode.node import NmtState, NodeRunner
+from skinnode.node.source import ResistanceSource
+from skinnode.transport import CanPort, Frame
 from skinnode.wire.indices import chunk_cob_id, summary_cob_id
 from skinnode.wire.profile import PatchProfile
+from vcan_sim.faults import NO_FAULTS, Faults, Injected
+from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
@@ -43,34 +47,47 @@ class Fleet:
         hand: buses, patches and scene.
         interface, channel: instead of those of the file. Raises ConfigError for a channel that is meant for
             several buses.
+        faults: what goes wrong with every node from the start; see also :meth:`inject`.
+        wire_up: what the converter of each patch is connected to, in place of the simulated patch itself.
     """
 
-    def __init__(self, hand: HandConfig, *, interface: str | None = None, channel: str | None = None) -> None:
+    def __init__(
+        self,
+        hand: HandConfig,
+        *,
+        interface: str | None = None,
+        channel: str | None = None,
+        faults: Faults = NO_FAULTS,
+        wire_up: Callable[[SimulatedPatch], ResistanceSource] = lambda patch: patch,
+    ) -> None:
         self.hand = hand.on(interface, channel)
         self._stations = {
             patch.name: _Station(
                 patch,
                 PatchProfile.from_config(patch, hand.bus(patch.bus)),
                 SimulatedPatch(Scene(patch.layout.build(), hand.simulation, number)),
+                wire_up,
+                faults,
             )
             for number, patch in enumerate(hand.patches)
         }
         self._runners: list[NodeRunner] = []
+        self._ports: dict[str, FaultyPort] = {}
         self._running = ExitStack()
 
     def start(self) -> None:
         """Open the buses, power the nodes on. Raises BusError, and leaves nothing open, if a bus does not."""
         with ExitStack() as opened:
-            runners = []
+            runners, ports = [], {}
             for bus in self.hand.buses:
-                port = opened.enter_context(CanPort(bus))
+                port = ports[bus.name] = opened.enter_context(FaultyPort(bus))
                 stations = [self._stations[patch.name] for patch in self.hand.patches_on(bus.name)]
                 runner = NodeRunner(port, [station.connect(port.send) for station in stations])
                 runner.start()
                 opened.callback(runner.stop)
                 runners.append(runner)
             self._running = opened.pop_all()
-        self._runners = runners
+        self._runners, self._ports = runners, ports
 
     def stop(self) -> None:
         """Nodes to pre-operational, threads joined, buses closed. Raises what ended a thread early. Stopping
@@ -90,6 +107,21 @@ class Fleet:
     def report(self) -> tuple[NodeReport, ...]:
         """Where each node stands, in the order of the file."""
         return tuple(station.report() for station in self._stations.values())
+
+    def inject(self, faults: Faults, patch: str | None = None) -> None:
+        """From now on these faults and no others, on one patch or on all; the seed is that of the start."""
+        for name, station in self._stations.items():
+            if patch in (None, name):
+                station.inject(faults)
+
+    def injected(self, patch: str) -> Injected:
+        """A count of what went wrong so far with the node of a patch."""
+        return self._stations[patch].injected()
+
+    def bus_off(self, bus: str, *, off: bool) -> None:
+        """Take the controller of the nodes on a bus off it, or back. The nodes end if it lasts longer than
+        :data:`skinnode.node.runner.PATIENCE_S`."""
+        self._ports[bus].off = off
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
         """(U, N, 3) true electrodes of the scan whose summary carried ``device_time_us``, metres.
@@ -112,38 +144,71 @@ class Fleet:
         self.stop()
 
 
+class FaultyPort(CanPort):
+    """A port whose controller may go off the bus: then it sends nothing, and what passes is lost to it."""
+
+    off = False
+
+    def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+        if self.off:
+            raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
+        super().send(can_id, data, remote=remote)
+
+    def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
+        if self.off:
+            while super().recv_batch(0.0):
+                pass
+            raise BusError(f"{self.config.name}: bus-off, nothing received")
+        return super().recv_batch(timeout_s, most)
+
+
 class _Station:
     """A node, its analogue front end, and a count of what it sends."""
 
-    def __init__(self, config: PatchConfig, profile: PatchProfile, source: SimulatedPatch) -> None:
+    def __init__(
+        self,
+        config: PatchConfig,
+        profile: PatchProfile,
+        source: SimulatedPatch,
+        wire_up: Callable[[SimulatedPatch], ResistanceSource],
+        faults: Faults,
+    ) -> None:
         self.source = source
-        self._profile = profile
-        self._config = config
-        self._node: PatchNode | None = None
+        self._converter = wire_up(source)
+        self._profile, self._config, self._faults = profile, config, faults
+        self._pdo_ids = {chunk_cob_id(config.node_id), summary_cob_id(config.node_id)}
+        self._node: FaultyNode | None = None
         self._frames = self._pdos = 0
 
-    def connect(self, send: Callable[[int, bytes], None]) -> PatchNode:
-        """A new node on the patch, sending by ``send``."""
-        config, source = self._config, self.source
-        pdos = {chunk_cob_id(config.node_id), summary_cob_id(config.node_id)}
-
-        def counted(can_id: int, data: bytes) -> None:
-            send(can_id, data)
-            self._frames += 1
-            self._pdos += can_id in pdos
-            if not source.started and node.scans_sent:
-                source.start(source.last_read_ns)
-
-        node = PatchNode(
+    def connect(self, emit: Emit) -> FaultyNode:
+        """A new node on the patch, sending by ``emit``."""
+        config = self._config
+        self._node = FaultyNode(
             config.node_id,
-            source.scene.layout,
-            source,
-            send=counted,
+            self.source.scene.layout,
+            self._converter,
+            emit=emit,
+            on_sent=self._on_sent,
             serial=config.node_id if config.serial is None else config.serial,
             profile=self._profile,
+            faults=self._faults,
         )
-        self._node = node
-        return node
+        return self._node
+
+    def inject(self, faults: Faults) -> None:
+        self._faults = faults
+        if self._node is not None:
+            self._node.faults = faults
+
+    def injected(self) -> Injected:
+        return Injected() if self._node is None else replace(self._node.injected)
+
+    def _on_sent(self, can_id: int) -> None:
+        self._frames += 1
+        self._pdos += can_id in self._pdo_ids
+        source, node = self.source, self._node
+        if not source.started and node is not None and node.scans_sent:
+            source.start(source.last_read_ns)
 
     def report(self) -> NodeReport:
         node, config = self._node, self._config

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import enum
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
+
+from skinnode.errors import CodecError
+from skinnode.wire.indices import emcy_cob_id, heartbeat_cob_id
 
 _log = logging.getLogger(__name__)
 
@@ -74,8 +78,12 @@ class PatchHealth:
 class NodeMonitor:
     """Facts about one node, written by the mainline only."""
 
-    def __init__(self, patch: str, node_id: int) -> None:
+    def __init__(
+        self, patch: str, node_id: int, on_reject: Callable[[CodecError], None] = lambda error: None
+    ) -> None:
         self.patch, self.node_id = patch, node_id
+        self.on_reject = on_reject
+        """Told of each heartbeat and EMCY of a length that they do not have."""
         self.nmt_state: int | None = None
         self._t_heartbeat_ns: int | None = None
         self._t_scan_ns: int | None = None
@@ -104,8 +112,9 @@ class NodeMonitor:
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Heartbeat or boot-up. One of another length than a byte is ignored."""
+        """Heartbeat or boot-up. One of another length than a byte is rejected."""
         if len(data) != 1:
+            self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
         state = data[0] & 0x7F  # bit 7 is the toggle bit of node guarding
         if state == BOOT_UP:
@@ -119,6 +128,7 @@ class NodeMonitor:
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """EMCY: u16 code, u8 error register, five bytes of the maker. Code 0 says that the error is gone."""
         if len(data) != 8:
+            self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
             return
         code = int.from_bytes(data[:2], "little")
         self._error_register = data[2]

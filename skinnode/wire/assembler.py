@@ -7,6 +7,10 @@ while counter range × period is longer than the timeout and the age of the olde
 counted from the SYNC of its scan to its arrival. The timeout is three periods (less where counters come round
 sooner), so with the usual range of 240 scans a frame may be 237 periods old.
 
+**Two scans under one counter**, from a node that did not count on or from two nodes with one node-ID, show
+in a frame that comes twice with other content. Nobody can tell then whose the rest is: such a scan is thrown
+away whole. Two halves of which no frame overlaps cannot be told from one scan.
+
 **Order of counters.** Up to half the counter range ahead is newer, the rest is late and dropped. After a
 timeout without an accepted frame whatever comes is believed to be a new stream: a node or the SYNC producer
 was restarted.
@@ -83,6 +87,8 @@ class AssemblerStats:
     """Numbers between two scans of which no frame was seen."""
     scans_discarded: int
     """Open at a reset, never published."""
+    scans_mixed: int
+    """Thrown away, because frames of two scans had their counter."""
     chunks_accepted: int
     """*"""
     summaries_accepted: int
@@ -95,7 +101,7 @@ class AssemblerStats:
     duplicates: int
     """* Same scan, same index, same content."""
     conflicts: int
-    """* Open scan, same index, other content: two nodes with one id? That chunk counts as lost."""
+    """* Open scan, same index, other content: the scan is thrown away."""
     late: int
     """* Of a scan that was published without it, or older."""
     bad_length: int
@@ -157,7 +163,7 @@ class ScanAssembler:
         self._last_counter = _NEVER
         self._scan = _NEVER
         self._frames: list[bytes | None] = self._no_frames()
-        self._spoiled: set[int] = set()
+        self._mixed = False
         self._received = 0
         self._sent = _NEVER
         self._summary: Summary | None = None
@@ -168,7 +174,7 @@ class ScanAssembler:
         self._follows = False
         self._changed_only = False
 
-        self._complete = self._torn = self._missed = self._discarded = self._resyncs = 0
+        self._complete = self._torn = self._missed = self._discarded = self._thrown = self._resyncs = 0
         self._chunks = self._summaries = self._chunks_lost = self._summaries_lost = 0
         self._duplicates = self._conflicts = self._late = 0
         self._bad_length = self._bad_index = self._bad_counter = 0
@@ -251,7 +257,8 @@ class ScanAssembler:
             scans_torn=self._torn,
             scans_missed=self._missed,
             scans_discarded=self._discarded,
-            chunks_accepted=self._chunks + is_open * (self._received + len(self._spoiled)),
+            scans_mixed=self._thrown,
+            chunks_accepted=self._chunks + is_open * self._received,
             summaries_accepted=self._summaries + (is_open and self._summary is not None),
             chunks_lost=self._chunks_lost,
             summaries_lost=self._summaries_lost,
@@ -283,17 +290,14 @@ class ScanAssembler:
         if index >= self._n:
             self._bad_index += 1
             return
-        same = self._frames[index] == data
-        self._count_repeat(same=same)
-        if not same and index not in self._spoiled:
-            self._spoiled.add(index)
-            self._received -= 1
+        self._count_repeat(same=self._frames[index] == data)
 
     def _count_repeat(self, *, same: bool) -> None:
         if same:
             self._duplicates += 1
         else:
             self._conflicts += 1
+            self._mixed = True
 
     def _reject_length(self, cob_id: int, data: bytes, length: int, what: str) -> None:
         self._bad_length += 1
@@ -342,7 +346,7 @@ class ScanAssembler:
                 self._resyncs += 1
         self._counter = self._last_counter = counter
         self._frames = self._no_frames()
-        self._spoiled = set()
+        self._mixed = False
         self._received = 0
         self._sent = _NEVER
         self._summary = None
@@ -355,13 +359,17 @@ class ScanAssembler:
 
     def _book(self) -> None:
         """Enter the frames of the open scan into the counters."""
-        self._chunks += self._received + len(self._spoiled)
+        self._chunks += self._received
         self._summaries += self._summary is not None
 
-    def _close(self) -> Scan:
-        """Publish the open scan."""
+    def _close(self) -> Scan | None:
+        """Publish the open scan, or throw it away."""
         self._book()
         self._counter = _NONE_OPEN
+        if self._mixed:
+            self._thrown += 1
+            self._held = [None] * self._n
+            return None
         summary = self._summary
         if summary is not None:
             self._changed_only = bool(summary.flags & SummaryFlag.CHANGED_ONLY)
@@ -398,8 +406,6 @@ class ScanAssembler:
     def _hold(self, *, carry: bool) -> None:
         """Bring what is known about the chunks up to the scan that ends; ``carry``: it changed no other."""
         frames = self._frames[: self._n]
-        for index in self._spoiled:
-            frames[index] = None
         if carry and self._received < self._n:
             frames = [old if new is None else new for new, old in zip(frames, self._held, strict=True)]
         self._held = frames

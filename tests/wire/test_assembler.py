@@ -262,6 +262,7 @@ def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
         scans_torn=sum(not all(copies[:n]) for _, copies in seen),
         scans_missed=seen[-1][0] - seen[0][0] + 1 - len(seen) if seen else 0,
         scans_discarded=0,
+        scans_mixed=0,
         chunks_accepted=sum(min(count, 1) for _, copies in seen for count in copies[:n]),
         summaries_accepted=sum(min(copies[n], 1) for _, copies in seen),
         chunks_lost=sum(count == 0 for _, copies in seen for count in copies[:n]),
@@ -495,19 +496,37 @@ def test_an_overrun_full_scan_is_torn_although_all_it_sent_arrived(
     assert assembler.stats.chunks_lost == 0
 
 
-def test_chunks_that_contradict_each_other_are_not_believed(
-    node: ModelNode, assembler: ScanAssembler
+@pytest.mark.parametrize("twice", ["chunk", "summary"])
+def test_scan_with_frames_that_contradict_each_other_is_thrown_away(
+    node: ModelNode, assembler: ScanAssembler, twice: str
 ) -> None:
+    """Two scans, or two nodes, under one counter: nobody knows whose the other chunks are."""
     *chunks, summary = node.scan(7)
-    other = pack_chunk(2, 7, [1, 2, 3])
-    receive(assembler, chunks)
-    for _ in range(2):
-        assembler.on_chunk(other, chunks[-1].t_ns)
-    (scan,) = receive(assembler, [summary], until_ns=summary.t_ns + GRACE)
-    assert not scan.complete
-    assert scan.valid.ravel().tolist() == [True] * 6 + [False] * 3 + [True]
-    assert (assembler.stats.conflicts, assembler.stats.duplicates) == (2, 0)
-    assert frames_counted(assembler.stats) == 7
+    receive(assembler, chunks[:-1])
+    for k in range(2):
+        if twice == "chunk":
+            assembler.on_chunk(pack_chunk(2, 7, [1, 2, 3]), chunks[-1].t_ns)
+        else:
+            assembler.on_summary(pack_summary(7, SummaryFlag(0), 4, k), chunks[-1].t_ns)
+    assert receive(assembler, [chunks[-1], summary], until_ns=summary.t_ns + GRACE) == []
+    stats = assembler.stats
+    assert stats.conflicts == (2 if twice == "chunk" else 1)  # the third summary comes after the end
+    assert (stats.duplicates, stats.scans_mixed) == (0, 1)
+    assert (stats.scans_complete, stats.scans_torn, stats.chunks_lost) == (0, 0, 0)
+    assert frames_counted(stats) == 7
+    (healed,) = receive(assembler, node.scan(8))
+    assert healed.complete
+    assert healed.valid.all()
+
+
+def test_nothing_is_kept_of_a_scan_thrown_away(node: ModelNode, assembler: ScanAssembler) -> None:
+    """Where only changed chunks are sent, the next scan knows those alone."""
+    receive(assembler, node.scan(7))
+    *chunks, summary = node.scan(8, [1])
+    assembler.on_chunk(pack_chunk(1, 8, [1, 2, 3]), chunks[0].t_ns - 1)
+    assert receive(assembler, [*chunks, summary], until_ns=summary.t_ns + GRACE) == []
+    (scan,) = receive(assembler, node.scan(9, [0]))
+    assert scan.valid.ravel().tolist() == [True] * 3 + [False] * 7
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,307 @@
+"""A node with faults: everything between it and its bus passes here, and so do its readings.
+
+The node itself is the real one. What is injected is drawn from a seed and the order of frames, not from the
+clock, except for what happens so often a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, Protocol
+
+import numpy as np
+
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.node import NmtState, PatchNode
+from skinnode.node.nmt import NmtCommand
+from skinnode.node.source import ResistanceSource
+from skinnode.wire import indices as od
+from skinnode.wire.profile import PatchProfile
+from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS, Faults, Injected
+
+BABBLE_COB_ID: Final = 0x3F0
+_STORM: Final = bytes.fromhex("0fff810000000000")
+"""EMCY 0xFF0F, error register: generic and manufacturer's."""
+_MOST_AT_ONCE: Final = 32
+"""Frames of a storm that are sent in one turn at most: nobody saves up for a burst."""
+_CHUNK_COUNTER_BYTE: Final = 1
+_SUMMARY_COUNTER_BYTE: Final = 0
+
+
+class Emit(Protocol):
+    """Puts a frame on the bus, as :meth:`skinnode.transport.CanPort.send` does."""
+
+    def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> None: ...
+
+
+class FaultyNode(PatchNode):
+    """A :class:`PatchNode` that suffers :attr:`faults`, which may be replaced at any time from any thread.
+
+    Args as of PatchNode; ``emit`` sends to the bus, ``on_sent`` is told of each frame of the node's own after
+    it was sent or lost.
+    """
+
+    def __init__(
+        self,
+        node_id: int,
+        layout: PatchLayout,
+        source: ResistanceSource,
+        *,
+        emit: Emit,
+        on_sent: Callable[[int], None],
+        serial: int,
+        profile: PatchProfile,
+        faults: Faults = NO_FAULTS,
+    ) -> None:
+        self.faults = faults
+        self.injected = Injected()
+        self._emit, self._on_sent = emit, on_sent
+        self._source = source
+        self._reading: Float | None = None
+        self._random = np.random.default_rng([faults.seed, node_id])
+        self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
+        self._counter = -1  # of the scan being sent, as the node gave it
+        self._chunks = 0  # of it, so far
+        self._half = max(1, profile.n_chunks // 2)
+        self._fate = ""  # of this scan: one of OF_SCANS
+        self._spoilt = False
+        self._counter_instead: int | None = None  # of a scan that follows a torn one
+        self._swapped: tuple[int, bytes] | None = None
+        self._late: list[tuple[int, bytes]] = []  # with the counter they had
+        self._to_reset = self._unplugged = self._stormed = False
+        self._due_ns = dict.fromkeys(("restart", "emcy", "babble"), 0)
+        super().__init__(node_id, layout, self, send=self._out, serial=serial, profile=profile)
+
+    # --- the analogue port
+
+    def read(self, t_ns: int) -> Float:
+        """A reading, or the one before again."""
+        if self.faults.frozen and self._reading is not None:
+            self.injected.frozen += 1
+        else:
+            self._reading = self._source.read(t_ns)
+        return self._reading
+
+    # --- what drives it
+
+    def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
+        if self.faults.deaf or self._unplugged:
+            self.injected.unheard += 1
+            return
+        if can_id == od.SYNC_COB_ID and self._draw(self.faults.sync_lost):
+            self.injected.sync_lost += self.nmt_state is NmtState.OPERATIONAL
+            return
+        super().on_frame(can_id, data, t_ns, remote)
+        self._reset_if_due(t_ns)
+
+    def on_timer(self, t_ns: int) -> None:
+        if self.faults.unplugged != self._unplugged:
+            self._plug(t_ns)
+        if self._unplugged:
+            return
+        super().on_timer(t_ns)
+        self._reset_if_due(t_ns)
+        self._by_the_clock(t_ns)
+
+    def next_deadline_ns(self) -> int | None:
+        faults = self.faults
+        if faults.unplugged != self._unplugged:
+            return 0
+        if self._unplugged:
+            return None
+        own = super().next_deadline_ns()
+        due = [self._due_ns[name] for name, period_ns in _periods_ns(faults).items() if period_ns]
+        if self._stormed and not faults.emcy_per_s:
+            due.append(0)
+        if not due or self.nmt_state is NmtState.INITIALISING:
+            return own
+        return min(due) if own is None else min(own, *due)
+
+    def _plug(self, t_ns: int) -> None:
+        self._unplugged = self.faults.unplugged
+        if self._unplugged:
+            self.power_off()
+            self._swapped, self._late = None, []
+            self.injected.unplugged += 1
+        else:
+            self.power_on(t_ns)
+
+    def _reset_if_due(self, t_ns: int) -> None:
+        if self._to_reset:
+            self._to_reset = False
+            self._reset_node(t_ns)
+
+    def _reset_node(self, t_ns: int) -> None:
+        super().on_frame(od.NMT_COB_ID, bytes([NmtCommand.RESET_NODE, self.node_id]), t_ns)
+
+    def _by_the_clock(self, t_ns: int) -> None:
+        for name, period_ns in _periods_ns(self.faults).items():
+            if not period_ns:
+                self._due_ns[name] = 0
+                continue
+            if not self._due_ns[name]:  # just set
+                self._due_ns[name] = t_ns + period_ns
+            for _ in range(_MOST_AT_ONCE):
+                if self._due_ns[name] > t_ns:
+                    break
+                self._due_ns[name] += period_ns
+                self._do(name, t_ns)
+            else:
+                self._due_ns[name] = t_ns + period_ns
+        if self._stormed and not self.faults.emcy_per_s:
+            self._stormed = False
+            self._pass(od.emcy_cob_id(self.node_id), bytes(8))
+
+    def _do(self, name: str, t_ns: int) -> None:
+        match name:
+            case "restart":
+                self.injected.restarts += 1
+                self._reset_node(t_ns)
+            case "emcy":
+                self._stormed = True
+                self.injected.emergencies += self._pass(od.emcy_cob_id(self.node_id), _STORM)
+            case _:
+                self.injected.babbled += self._pass(BABBLE_COB_ID, bytes(8))
+
+    # --- what the node sends
+
+    def _out(self, can_id: int, data: bytes) -> None:
+        if can_id == self._chunk_id:
+            self._out_chunk(data)
+        elif can_id == self._summary_id:
+            self._out_summary(data)
+        elif can_id == od.heartbeat_cob_id(self.node_id) and self._draw(self.faults.long):
+            self.injected.long += self._pass(can_id, data + b"\0")
+        else:
+            self._pass(can_id, self._imposture(can_id, data))
+        self._on_sent(can_id)
+
+    def _out_chunk(self, data: bytes) -> None:
+        counter = data[_CHUNK_COUNTER_BYTE]
+        if counter != self._counter:
+            self._begin_scan(counter)
+        self._chunks += 1
+        injected = self.injected
+        if self._fate == "reset" and self._chunks > self._half and not self._to_reset:
+            self._to_reset, self._fate = True, ""
+            injected.reset += 1
+        if self._fate == "torn":
+            if self._chunks > self._half:
+                return
+            injected.torn_chunks += 1
+        if self._counter_instead is not None:
+            data = _with_byte(data, _CHUNK_COUNTER_BYTE, self._counter_instead)
+        fault = self._draw_one(OF_CHUNKS) if self._fate == "" and self._counter_instead is None else ""
+        swapped, self._swapped = self._swapped, None
+        self._send_chunk(fault, data)
+        if swapped is not None:
+            self._pass(*swapped)
+
+    def _begin_scan(self, counter: int) -> None:
+        was_torn, before = self._fate == "torn", self._counter
+        self._counter, self._chunks, self._spoilt = counter, 0, False
+        self._counter_instead = before if was_torn else None
+        self._fate = "" if was_torn else self._draw_one(OF_SCANS)
+        if self._fate == "torn":
+            self.injected.torn += 1
+
+    def _send_chunk(self, fault: str, data: bytes) -> None:
+        injected, chunk_id = self.injected, self._chunk_id
+        match fault:
+            case "":
+                self._pass(chunk_id, data)
+                return
+            case "duplicated":
+                self._pass(chunk_id, data)
+                self._pass(chunk_id, data)
+            case "reordered":
+                self._swapped = chunk_id, data
+            case "late":
+                self._late.append((data[_CHUNK_COUNTER_BYTE], data))
+            case "short":
+                self._pass(chunk_id, data[:-1])
+            case "remote":
+                self._pass(chunk_id, b"", remote=True)
+            case "miscounted":
+                self._pass(chunk_id, _with_byte(data, _CHUNK_COUNTER_BYTE, self._another(self._counter)))
+        setattr(injected, fault, getattr(injected, fault) + 1)
+        if fault not in ("duplicated", "reordered") and not self._spoilt:
+            self._spoilt = True
+            injected.scans_spoilt += 1
+
+    def _another(self, counter: int) -> int:
+        off = self.faults.miscounted_by
+        return (counter + (int(self._random.integers(1, 256)) if off is None else off)) & 0xFF
+
+    def _out_summary(self, data: bytes) -> None:
+        if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
+            self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
+        swapped, self._swapped = self._swapped, None
+        if self._fate == "summary_lost":
+            self.injected.summary_lost += 1
+        elif self._fate != "torn":
+            if self._counter_instead is not None:
+                data = _with_byte(data, _SUMMARY_COUNTER_BYTE, self._counter_instead)
+            self._pass(self._summary_id, data)
+        if swapped is not None:
+            self._pass(*swapped)
+
+    def _imposture(self, can_id: int, data: bytes) -> bytes:
+        """The answer to an upload, changed where it is about who the node is."""
+        faults = self.faults
+        if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
+            self.node_id
+        ):
+            return data
+        index, subindex = int.from_bytes(data[1:3], "little"), data[3]
+        about_identity = (index, subindex) == (od.IDENTITY, od.IDENTITY_PRODUCT)
+        about_layout = (index, subindex) == (od.DESCRIPTOR, od.LAYOUT_HASH)
+        expedited_upload = data[0] & 0xE2 == 0x42
+        if expedited_upload and (
+            (about_identity and faults.wrong_identity) or (about_layout and faults.wrong_layout)
+        ):
+            self.injected.impostures += 1
+            return _with_byte(data, 4, data[4] ^ 0xFF)
+        return data
+
+    def _pass(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
+        """On the bus with it, and whatever waited for it; whether it was let out."""
+        if self.faults.silent or self._unplugged or self._to_reset:
+            self.injected.silenced += 1
+            return False
+        self._emit(can_id, data, remote=remote)
+        is_pdo = can_id in (self._chunk_id, self._summary_id) and not remote
+        self.injected.pdos += is_pdo
+        if self._late and is_pdo and self._counter != self._late[0][0]:
+            late, self._late = self._late, []
+            for _, chunk in late:
+                self._pass(self._chunk_id, chunk)
+        return True
+
+    # --- chance
+
+    def _draw(self, share: float) -> bool:
+        return share > 0.0 and bool(self._random.random() < share)
+
+    def _draw_one(self, names: tuple[str, ...]) -> str:
+        """One of the faults by its share, or none."""
+        faults = self.faults
+        if faults is NO_FAULTS:
+            return ""
+        left = self._random.random()
+        for name in names:
+            left -= getattr(faults, name)
+            if left < 0.0:
+                return name
+        return ""
+
+
+def _with_byte(data: bytes, at: int, value: int) -> bytes:
+    return data[:at] + bytes([value]) + data[at + 1 :]
+
+
+def _periods_ns(faults: Faults) -> dict[str, int]:
+    """How often each thing is done that is done by the clock; 0: never."""
+    rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
+    periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
+    return {"restart": round(faults.restart_every_s * 1e9), **periods}

@@ -153,10 +153,13 @@ class Lane:
 
     def poll(self, t_ns: int) -> None:
         """Let a scan go that has waited long enough for what it lacks."""
+        deadline_ns = self._assembler.next_deadline_ns()
+        if deadline_ns is None or t_ns < deadline_ns:
+            return
+        if self.tap is not None:
+            self.tap.polled(self._patch, t_ns)
         scan = self._assembler.poll(t_ns)
-        if scan is not None:
-            if self.tap is not None:
-                self.tap.polled(self._patch, t_ns)
+        if scan is not None:  # it may have been thrown away
             self._offer(scan)
 
     def withhold(self) -> int:

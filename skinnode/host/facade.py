@@ -248,7 +248,7 @@ def _station(
 ) -> Station:
     """A patch with a lane that gets its frames from the bus, and withholds what a node may be sending that an
     earlier host left operational."""
-    monitor = NodeMonitor(patch.name, patch.node_id)
+    monitor = NodeMonitor(patch.name, patch.node_id, bus.link.reject)
     assembler = ScanAssembler(
         PatchProfile.from_config(patch, bus.link.config),
         counter_overflow=bus.ticks.counter_overflow,

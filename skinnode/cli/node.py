@@ -25,7 +25,7 @@ def node(
     ],
     node_id: Annotated[
         int | None,
-        typer.Option(min=1, max=127, help="Node-ID; with --store LSS may give it.", metavar="N"),
+        typer.Option(min=1, max=127, help="Node-ID, unless LSS has stored another in --store.", metavar="N"),
     ] = None,
     layout: Annotated[str, typer.Option(help=LAYOUT_HELP, metavar="LAYOUT")] = "staggered",
     interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",
@@ -58,8 +58,8 @@ def node(
     A source is a class, or a function, that takes the layout and gives an object
     whose read(t_ns) returns (U, K) ohms. `--source simulated` needs no hardware.
     Ctrl-C ends it. A line a second says how it does. Exit status 1 if the source
-    failed, scans were skipped, frames not sent or what --store names was of no
-    use; 2 if it could not run.
+    failed, scans were skipped, frames not sent, another node had its node-ID or
+    what --store names was of no use; 2 if it could not run.
     """
     from skinnode.cli._files import require_writable
     from skinnode.cli._layouts import find_layout, import_from_here
@@ -130,6 +130,7 @@ class _Progress:
     source_error: str
     bus_errors: int
     bus_error: str
+    rival_frames: int
     memory_problem: str
 
 
@@ -148,6 +149,7 @@ def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
         board.source_error,
         runner.bus_errors,
         runner.bus_error,
+        board.rival_frames,
         board.memory_problem,
     )
 
@@ -157,6 +159,7 @@ def _faults(end: _Progress) -> list[str]:
     counted = (
         (end.source_failures, f"failures of the source, the last: {end.source_error}"),
         (end.overruns, "scans skipped, for the ones before were still to be sent"),
+        (end.rival_frames, "boot-ups or heartbeats of another node with this node-ID"),
         (end.bus_errors, f"errors of the bus, the last began with: {end.bus_error}"),
     )
     faults = [f"{count} {what}" for count, what in counted if count]

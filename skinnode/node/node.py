@@ -11,6 +11,7 @@ from skinnode.node.application import PatchApplication
 from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.device import CanopenDevice, Send, Services
 from skinnode.node.memory import Memory
+from skinnode.node.rejected import Rejected
 from skinnode.node.source import ResistanceSource
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile, eds_name
@@ -85,6 +86,11 @@ class PatchNode(CanopenDevice):
     def source_error(self) -> str:
         """What the source failed of last, in one line; empty if it never did."""
         return self._patch.source_error
+
+    @property
+    def rival_frames(self) -> int:
+        """Boot-up messages and heartbeats of another node with this node-ID."""
+        return self._rejected.counted(Rejected.OWN_ERROR_CONTROL)
 
     @property
     def memory_problem(self) -> str:

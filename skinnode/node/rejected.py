@@ -41,6 +41,10 @@ class RejectedFrames:
         """One more."""
         self._counts[kind] = min(self._counts[kind] + 1, _MOST)
 
+    def counted(self, kind: Rejected) -> int:
+        """How many so far."""
+        return self._counts[kind]
+
     def reset(self) -> None:
         """As after power-on."""
         self._counts = dict.fromkeys(Rejected, 0)

@@ -227,6 +227,19 @@ def test_a_memory_that_is_of_no_use_is_a_fault(
     assert run().returncode == 0  # put aside, and a new one begun
 
 
+def test_another_node_with_the_same_node_id_is_a_fault(
+    sources: Path, multicast_group: str, master: Master
+) -> None:
+    with running(multicast_group, "--source", "my_sources:Board", cwd=sources) as process:
+        assert bytes(master.next(0x704).data) == b"\0"
+        master.send(0x704, "00")
+        assert bytes(master.next(0x084).data)[:2] == b"\x50\x81"
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=20)
+        assert (process.returncode, err) == (1, "")
+        assert "fault: 1 boot-ups or heartbeats of another node with this node-ID" in out
+
+
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:
     """Switch state global, configure node-ID 9, store, waiting state (CiA 305); then as after a power cut."""
     options = ["--source", "my_sources:Board", "--store", "patch.json", "--serial", "5"]

@@ -16,6 +16,7 @@ def conformance(
     interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",
     channel: Annotated[str, typer.Option(help="Channel of the interface.", metavar="NAME")] = "can0",
     bitrate: Annotated[int, typer.Option(help="Bits per second.", metavar="BPS")] = 1_000_000,
+    fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")] = False,
     eds: Annotated[
         Path | None,
         typer.Option(help="Its data sheet; not needed for a patch of this project.", metavar="FILE"),
@@ -59,7 +60,7 @@ def conformance(
         if file is not None:
             require_writable(option, file)
     sheet = parse_eds(eds.read_text(encoding="latin-1"), str(eds)) if eds is not None else None
-    bus = find_bus(interface, channel, bitrate, False, None, None).bus
+    bus = find_bus(interface, channel, bitrate, fd, None, None).bus
     with CanPort(bus) as port:
         dut = connect(port, node_id, sheet)
         report = run_cases(dut, cases, lambda result: typer.echo(result_line(result)))

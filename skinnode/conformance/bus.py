@@ -59,6 +59,8 @@ class Tester:
 
     def __init__(self, port: CanPort) -> None:
         self._port = port
+        self.fd = port.config.fd
+        """Whether PDOs may be CAN FD frames of up to 64 bytes."""
         self._inbox: deque[Frame] = deque(maxlen=_INBOX_FRAMES)
         self._trace: deque[TraceLine] = deque(maxlen=_TRACE_FRAMES)
         self._begun_ns = time.monotonic_ns()
@@ -155,7 +157,7 @@ class Tester:
 
     def _receive(self, timeout_s: float) -> bool:
         frame = self._port.recv(timeout_s)
-        if frame is None or frame.error or frame.extended or frame.fd:
+        if frame is None or frame.error or frame.extended or (frame.fd and not self.fd):
             return False
         self._note(frame.t_ns, False, frame.can_id, frame.data, frame.remote)
         self._inbox.append(frame)

@@ -14,6 +14,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode, VolatileMemory
 from skinnode.transport import CanPort
+from skinnode.wire.profile import PatchProfile
 
 NODE_ID = 4
 
@@ -30,21 +31,28 @@ class Source:
 
 @contextmanager
 def patch_on(
-    channel: str, wrap: Callable[[CanPort], CanPort] = lambda port: port, interface: str = "virtual"
+    channel: str,
+    wrap: Callable[[CanPort], CanPort] = lambda port: port,
+    interface: str = "virtual",
+    *,
+    fd: bool = False,
 ) -> Iterator[PatchNode]:
     """A running patch of 2 × 6 wires; ``wrap`` may stand between it and its bus."""
     layout = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=6)
-    with CanPort(BusConfig(interface=interface, channel=channel)) as bare:
+    profile = PatchProfile.from_layout(layout, bus="fd" if fd else "classic")
+    with CanPort(BusConfig(interface=interface, channel=channel, fd=fd)) as bare:
         port = wrap(bare)
-        node = PatchNode(NODE_ID, layout, Source(layout), send=port.send, memory=VolatileMemory())
+        node = PatchNode(
+            NODE_ID, layout, Source(layout), send=port.send, profile=profile, memory=VolatileMemory()
+        )
         with NodeRunner(port, [node]):
             yield node
 
 
 @contextmanager
-def bench_on(channel: str) -> Iterator[Dut]:
+def bench_on(channel: str, *, fd: bool = False) -> Iterator[Dut]:
     """The tester, connected to the patch."""
-    with CanPort(BusConfig(channel=channel)) as port:
+    with CanPort(BusConfig(channel=channel, fd=fd)) as port:
         yield connect(port, NODE_ID)
 
 

@@ -26,7 +26,6 @@ from skinnode.conformance.sdo import Aborted, expedited
 NOT_MAPPABLE = (0x0602_0000, 0x0604_0041)
 TOO_MUCH = (0x0602_0000, 0x0604_0041, 0x0604_0042)
 OUT_OF_ORDER = (0x0601_0000, 0x0604_0041)
-_MOST_BITS = 64
 
 Fits = Callable[[EdsEntry], bool]
 
@@ -64,12 +63,17 @@ def _clear(dut: Dut, pdo: Pdo) -> int:
     return cob_id
 
 
+def _most_bytes(dut: Dut) -> int:
+    """That a frame of the bus holds."""
+    return 64 if dut.bus.fd else 8
+
+
 def _slots(dut: Dut, pdo: Pdo) -> int:
     """How many entries the mapping has."""
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
-@case("PDO-21", "Mapped by default are objects of the EDS, mappable, of their length, at most 64 bits in all",
+@case("PDO-21", "Mapped by default are objects of the EDS, mappable, of their length, and fit a frame",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def default_mapping(dut: Dut) -> None:
     pdos = [*rpdos(dut), *tpdos(dut)]
@@ -77,8 +81,8 @@ def default_mapping(dut: Dut) -> None:
         raise NotApplicable("the EDS has no PDO")
     for pdo in pdos:
         words = mapped(dut, pdo)
-        if payload_bytes(words) * 8 > _MOST_BITS:
-            raise Failed(f"{pdo} of at most 64 bits", f"{8 * payload_bytes(words)} bits")
+        if payload_bytes(words) > _most_bytes(dut):
+            raise Failed(f"{pdo} of at most {_most_bytes(dut)} bytes", f"{payload_bytes(words)} bytes")
         for subindex, word in enumerate(words, 1):
             _check_mapped(dut, pdo, subindex, word)
 
@@ -169,13 +173,13 @@ def too_many(dut: Dut) -> None:
             raise Failed(f"{pdo} still without entries", str(dut.sdo.integer(pdo.mapping, 0)))
 
 
-@case("PDO-26", "Objects of more than 64 bits in all are refused", "7.5.2.36, 7.5.2.38")
+@case("PDO-26", "Objects of more bits in all than a frame holds are refused", "7.5.2.36, 7.5.2.38")
 def too_long(dut: Dut) -> None:
     tried = False
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
         sizes = [e for e in dut.eds.entries.values() if 0 < e.size <= 8 and _fits(e, pdo)]
         entry = max(sizes, key=lambda e: e.size, default=None)
-        count = 8 // entry.size + 1 if entry is not None else 0
+        count = _most_bytes(dut) // entry.size + 1 if entry is not None else 0
         if entry is None or count > _slots(dut, pdo):
             continue
         tried = True
@@ -191,7 +195,7 @@ def too_long(dut: Dut) -> None:
         what = f"{pdo}: {count} × {8 * entry.size} bits"
         dut.sdo.aborts(request, pdo.mapping, 0, TOO_MUCH, what)
     if not tried:
-        raise NotApplicable("no PDO has room for more than 64 bits")
+        raise NotApplicable("no PDO has room for more than a frame holds")
 
 
 def _fits(entry: EdsEntry, pdo: Pdo) -> bool:

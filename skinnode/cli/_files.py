@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,25 @@ def require_writable(option: str, file: Path) -> None:
     target = file if file.exists() else file.absolute().parent
     if not os.access(target, os.W_OK):
         raise ConfigError(option, str(file), "a file in an existing folder that can be written")
+
+
+@contextlib.contextmanager
+def sole_user(option: str, file: Path) -> Iterator[None]:
+    """Raises ConfigError where another process is in here with ``file``, the value of ``option``. What is
+    locked is a file beside it, since the file itself is replaced when it is saved."""
+    path = file.resolve()
+    try:
+        lock = os.open(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise ConfigError(option, str(file), f"a file in a folder to write to ({error.strerror})") from error
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(option, str(file), "a file that no other process uses now") from None
+        yield
+    finally:
+        os.close(lock)
 
 
 def write_text(option: str, file: Path, text: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,7 +62,7 @@ def node(
     failed, scans were skipped, frames not sent, another node had its node-ID or
     what --store names was of no use; 2 if it could not run.
     """
-    from skinnode.cli._files import require_writable
+    from skinnode.cli._files import require_writable, sole_user
     from skinnode.cli._layouts import find_layout, import_from_here
     from skinnode.errors import ConfigError
     from skinnode.model.config import BusConfig
@@ -91,7 +92,8 @@ def node(
         data_bitrate_bps=data_bitrate,
     )
     measuring = make_source(source, patch, "--source")
-    with until_told() as told, CanPort(bus) as port:
+    alone = nullcontext() if store is None else sole_user("--store", store)
+    with alone, until_told() as told, CanPort(bus) as port:
         board = PatchNode(
             NOT_CONFIGURED if node_id is None else node_id,
             patch,

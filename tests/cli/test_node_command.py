@@ -227,6 +227,18 @@ def test_a_memory_that_is_of_no_use_is_a_fault(
     assert run().returncode == 0  # put aside, and a new one begun
 
 
+def test_two_processes_do_not_share_a_memory(sources: Path, multicast_group: str, master: Master) -> None:
+    options = ["--source", "my_sources:Board", "--store", "patch.json"]
+    with running(multicast_group, *options, cwd=sources):
+        assert bytes(master.next(0x704).data) == b"\0"
+        command = arguments(multicast_group, *options, node_id=5)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+        assert (done.returncode, done.stdout) == (2, "")
+        says = "error: --store: got 'patch.json', allowed: a file that no other process uses now\n"
+        assert done.stderr == says
+
+
 def test_another_node_with_the_same_node_id_is_a_fault(
     sources: Path, multicast_group: str, master: Master
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
 from collections.abc import Callable
 from typing import Any
@@ -189,3 +190,31 @@ def test_a_tare_is_followed_and_no_scan_is_decoded_with_the_wrong_baseline(
         assert stats.patches["p0"].withheld == 0
         assert stats.nodes["p1"].rejoins == 0
         assert stats.rivals["can0"].sdo_requests == 1
+
+
+@pytest.mark.vcan
+def test_an_interface_that_goes_down_and_comes_up_again(
+    make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
+) -> None:
+    """The other bus does not notice."""
+    hand = make_hand()
+    table = hand.model_dump(mode="json")
+    table["buses"].append({"name": "kernel", "interface": "socketcan", "channel": "vcan0"})
+    table["patches"][1]["bus"] = "kernel"
+    hand = parse_hand(table)
+    rack = rack_of(hand)
+    for name in ("p0", "p1"):
+        rack.plug(name)
+    with Host.from_config(hand) as host:
+        take(host.fields(timeout_s=10, patch="p1"), 2)
+        try:
+            subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+            assert eventually(lambda: host.stats().buses["kernel"].outages == 1)
+            take(host.fields(timeout_s=10, patch="p0"), 50)  # more than a second
+        finally:
+            subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+        take(host.fields(timeout_s=10, patch="p1"), 10)
+        assert eventually(lambda: runs(host, "p1"))
+        stats = host.stats()
+        assert (stats.buses["can0"].outages, stats.nodes["p0"].rejoins) == (0, 0)
+        assert (stats.patches["p0"].withheld, stats.patches["p0"].assembler.scans_torn) == (0, 0)

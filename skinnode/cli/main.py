@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from skinnode.cli import bench, conformance, demo, eds, host, info, lss, nmt, node, od, scan
+from skinnode.cli import bench, conformance, demo, doctor, eds, host, info, lss, nmt, node, od, scan
 from skinnode.errors import SkinError
 
 app = typer.Typer(
@@ -31,6 +31,7 @@ app.command(name="info")(info.info)
 app.command(name="od")(od.od)
 app.command(name="nmt")(nmt.nmt)
 app.add_typer(lss.app, name="lss")
+app.command(name="doctor")(doctor.doctor)
 app.command(name="conformance")(conformance.conformance)
 app.add_typer(bench.app, name="bench")
 

@@ -31,6 +31,10 @@ LISTEN_S: Final = 1.2
 LSS_S: Final = 1.5
 """Nodes without a node-ID are counted for this long; what is left is told as more."""
 
+OTHERS_S: Final = 1.0
+"""How long another client's SDO transfers are waited for at most."""
+
+_QUIET_S: Final = 0.1
 _THREADS: Final = 16
 _ASK_DEVICE_TYPE: Final = bytes((0x40, 0x00, 0x10, 0x00))
 _ASK_SERIAL: Final = bytes((0x40, 0x18, 0x10, od.IDENTITY_SERIAL))
@@ -80,6 +84,7 @@ class Survey:
 def survey(line: Line, progress: Callable[[str], None] = lambda _: None) -> Survey:
     """Find everybody. ``progress`` is told what is being done. Raises BusError."""
     begun_s = time.monotonic()
+    _let_others_finish(line)
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="survey") as pool:
         lss = pool.submit(find_unconfigured, line)
         progress("asking node-IDs 1 to 127")
@@ -92,6 +97,22 @@ def survey(line: Line, progress: Callable[[str], None] = lambda _: None) -> Surv
     silent = [_only_heard(line, node_id) for node_id in line.heard.nodes if node_id not in answered]
     found = sorted((*nodes, *filter(None, silent)), key=lambda node: node.node_id)
     return Survey(tuple(found), unconfigured, more, time.monotonic() - begun_s)
+
+
+def _let_others_finish(line: Line) -> None:
+    """Wait while another client's SDO transfers are under way: a question of ours would abort them. A host
+    has some at bring-up, and none while it runs."""
+    end_s = time.monotonic() + OTHERS_S
+    while time.monotonic() < end_s:
+        before = _sdo_frames(line)
+        line.wait_until(lambda: False, _QUIET_S)
+        if _sdo_frames(line) == before:
+            return
+
+
+def _sdo_frames(line: Line) -> int:
+    first, end = od.sdo_response_cob_id(1), od.sdo_request_cob_id(128)
+    return sum(count for cob_id, count in dict(line.heard.cob_ids).items() if first <= cob_id < end)
 
 
 def find_unconfigured(line: Line) -> tuple[tuple[LssAddress, ...], bool]:

@@ -18,7 +18,7 @@ def skinnode(*arguments: str, timeout_s: float = 60.0) -> subprocess.CompletedPr
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "host", "scan", "info", "od", "nmt", "lss", "eds", "conformance", "bench"]
+    "command", ["demo", "host", "scan", "info", "od", "nmt", "lss", "doctor", "eds", "conformance", "bench"]
 )
 def test_help_names_the_command(command: str) -> None:
     assert command in skinnode("--help").stdout

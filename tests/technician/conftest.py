@@ -8,6 +8,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -100,3 +101,34 @@ def run(arguments: Sequence[object], bus: BusConfig | None = None, answers: str 
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return Done(result.exit_code, result.stdout, result.stderr)
+
+
+SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
+
+
+@pytest.fixture
+def hand_file(tmp_path: Path) -> Callable[..., Path]:
+    """A hand of two small patches on a virtual bus of its own; ``first`` are further lines of the first."""
+
+    def make(first: str = "", layout: str = "staggered") -> Path:
+        sizes = ", ".join(f"{key} = {value}" for key, value in SMALL.items())
+        file = tmp_path / f"{uuid.uuid4().hex}.toml"
+        file.write_text(
+            f'[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
+            "[sync]\nperiod_ms = 50\n"
+            f'[[patches]]\nname = "thumb"\nnode_id = 5\nrelative_noise = 1e-4\n{first}\n'
+            f'layout = {{ preset = "{layout}", {sizes} }}\n'
+            f'[[patches]]\nname = "index"\nnode_id = 6\nrelative_noise = 1e-4\n'
+            f'layout = {{ preset = "staggered", {sizes} }}\n'
+            "[simulation]\nconverter_noise = 1e-4\ncycle_s = 3600.0\n"
+        )
+        return file
+
+    return make
+
+
+@pytest.fixture
+def on() -> Iterator[Callable[[Any], Any]]:
+    """Whatever is entered stays so until the end of the test."""
+    with ExitStack() as stack:
+        yield stack.enter_context

@@ -1,0 +1,136 @@
+"""What the doctor knows, as plain data: the checks see nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.config import PatchConfig
+from skinnode.model.layout import Float
+from skinnode.node.lss import LssAddress
+from skinnode.technician.heard import Emergency
+from skinnode.technician.info import NodeInfo
+from skinnode.technician.survey import FoundNode
+from skinnode.wire.assembler import AssemblerStats
+
+Counts = NDArray[np.int64]
+
+
+class Sure(StrEnum):
+    """How sure a finding is."""
+
+    CERTAIN = "certain"
+    """A node or a counter says so."""
+    LIKELY = "likely"
+    """The figures have hardly another cause."""
+    POSSIBLE = "possible"
+    """It may be as it should be: somebody has to look."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong."""
+
+    area: str
+    """bus, nodes, configuration, wires, baseline, timing or losses"""
+    where: str
+    what: str
+    sure: Sure
+    evidence: str
+    advice: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanFacts:
+    """Scans of one patch as they came, T of them, U upper and K lower wires."""
+
+    ratio: Float
+    """(T, U, K) R/R0, NaN where there was no measurement."""
+    n_open: Counts
+    n_short: Counts
+    n_over: Counts
+    """(U, K) scans in which a crossing was open, shorted, out of range."""
+    t_s: Float
+    """(T,) when the last frame came, since the first scan."""
+    latency_s: Float
+    """(T,) from SYNC to the last frame, NaN where no SYNC was heard."""
+    device_us: Counts
+    """(T,) the node's clock, -1 where the summary was lost."""
+    complete: NDArray[np.bool_]
+    """(T,)"""
+    step: float
+    """A code as a share of R0."""
+    told_noise: float
+    """Relative, of the converter, as the hand file says."""
+    stats: AssemblerStats
+
+    @property
+    def scans(self) -> int:
+        return len(self.ratio)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchFacts:
+    """One patch: what is wanted of it and what is there. None where it is not known."""
+
+    name: str
+    node_id: int
+    wanted: PatchConfig | None = None
+    layout_hash: int | None = None
+    """The one that the hand file asks for."""
+    inhibit_100us: int | None = None
+    """The one that the host sets."""
+    eds_problem: str = ""
+    """Why the EDS of the hand file is not that of the patch; empty where it is, or where none is given."""
+    found: FoundNode | None = None
+    info: NodeInfo | None = None
+    failure: str = ""
+    """Why there is no ``info`` of a node that was found."""
+    boot_ups: int = 0
+    """Heard while listening."""
+    emergencies: tuple[Emergency, ...] = ()
+    scans: ScanFacts | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BusFacts:
+    """One bus and the patches on it."""
+
+    name: str
+    interface: str
+    channel: str
+    bitrate_bps: int
+    failure: str = ""
+    """Why it does not open, or failed; empty where it is well."""
+    link_state: str | None = None
+    """Of the controller, as the kernel tells (ERROR-ACTIVE …)."""
+    link_bitrate_bps: int | None = None
+    seconds: float = 0.0
+    """How long was listened."""
+    frames: int = 0
+    load: float = 0.0
+    error_frames: int = 0
+    dropped: int = 0
+    outages: int = 0
+    foreign: Mapping[int, int] = field(default_factory=dict)
+    """Frames by COB-ID that nothing explains."""
+    unconfigured: tuple[LssAddress, ...] = ()
+    strangers: tuple[FoundNode, ...] = ()
+    """Nodes that are not in the hand."""
+    period_s: float | None = None
+    """Of SYNC, as the hand file says."""
+    sync_s: Float = field(default_factory=lambda: np.empty(0))
+    """When SYNCs were heard; not our own."""
+    sync_ours: bool = False
+    heartbeat_ms: int | None = None
+    """As the hand file wants it."""
+    patches: tuple[PatchFacts, ...] = ()
+
+    @property
+    def running(self) -> bool:
+        """Whether somebody runs the hand."""
+        return any(patch.found is not None and patch.found.state == "operational" for patch in self.patches)

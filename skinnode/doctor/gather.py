@@ -1,0 +1,237 @@
+"""Gathers the facts of one bus. It listens and reads; unless told to be active it changes nothing, so that a
+hand that runs goes on as before."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from skinnode.doctor.capture import Capture
+from skinnode.doctor.facts import BusFacts, PatchFacts
+from skinnode.errors import BusError, NodeError, ProfileError
+from skinnode.host.bringup import check_eds, inhibit_time_100us
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig
+from skinnode.technician.heard import Heard
+from skinnode.technician.info import NodeInfo, read_info
+from skinnode.technician.line import Line
+from skinnode.technician.sheet import read_profile
+from skinnode.technician.survey import survey
+from skinnode.wire import indices as od
+from skinnode.wire.codec import CodeScale
+from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
+
+SCANS: Final = 50
+"""Scans that noise is judged from: a standard deviation is then known to a tenth."""
+
+LONGEST_S: Final = 15.0
+"""How long scans are waited for, however long the period."""
+
+DEFAULT_NOISE: Final = 3e-6
+"""Of the converter, where no hand file tells."""
+
+_START, _PRE_OPERATIONAL = 1, 128
+_FIRST_SYNC_S: Final = 0.5
+_KNOWN_TO_ALL: Final = frozenset(
+    {od.NMT_COB_ID, od.SYNC_COB_ID, od.TIME_COB_ID, od.LSS_REQUEST_COB_ID, od.LSS_RESPONSE_COB_ID}
+)
+
+Progress = Callable[[str], None]
+
+
+def gather(
+    bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
+) -> BusFacts:
+    """Everything of one bus. ``active``: nodes that do not run are started, SYNC is sent where nobody does,
+    and they are pre-operational again at the end. A bus that fails is a fact, not an error."""
+    facts = BusFacts(
+        bus.name,
+        bus.interface,
+        bus.channel,
+        bus.bitrate_bps,
+        period_s=None if hand is None else hand.sync.period_s,
+        heartbeat_ms=None if hand is None else hand.bring_up.heartbeat_ms,
+        patches=() if hand is None else tuple(_wanted(p, hand, bus) for p in hand.patches_on(bus.name)),
+    )
+    state, bitrate = link_facts(bus)
+    facts = replace(facts, link_state=state, link_bitrate_bps=bitrate)
+    try:
+        with Line(bus) as line:
+            return _examine(line, facts, hand, active, progress)
+    except BusError as error:
+        return replace(facts, failure=str(error))
+
+
+def _wanted(patch: PatchConfig, hand: HandConfig, bus: BusConfig) -> PatchFacts:
+    profile = PatchProfile.from_config(patch, bus)
+    problem = ""
+    if patch.eds is not None:
+        try:
+            check_eds(patch.eds, profile)
+        except ProfileError as error:
+            problem = str(error)
+    known = patch.layout.coordinates == "preset"
+    return PatchFacts(
+        patch.name,
+        patch.node_id,
+        patch,
+        layout_hash=patch.layout.build().layout_hash if known else None,
+        inhibit_100us=inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1),
+        eds_problem=problem,
+    )
+
+
+def _examine(
+    line: Line, facts: BusFacts, hand: HandConfig | None, active: bool, progress: Progress
+) -> BusFacts:
+    begun_s = time.monotonic()
+    capture = Capture()
+    line.link.listen(capture.on_frames)
+    found = survey(line, lambda text: progress(f"{facts.name}: {text}"))
+    nodes = {node.node_id: node for node in found.nodes}
+    patches = facts.patches
+    if hand is None:
+        patches = tuple(PatchFacts(f"node {n.node_id}", n.node_id) for n in found.nodes if n.is_patch)
+    profiles: dict[int, PatchProfile] = {}
+    asked: list[PatchFacts] = []
+    for patch in patches:
+        node = nodes.get(patch.node_id)
+        if node is not None and node.answers and node.is_patch:
+            progress(f"{facts.name}: reading {patch.name}")
+            info, failure = _info(line, patch.node_id)
+            patch = replace(patch, info=info, failure=failure)
+            profile = _profile(line, patch.node_id)
+            if profile is not None and info is not None:
+                profiles[patch.node_id] = profile
+        asked.append(replace(patch, found=node))
+    period_s = facts.period_s or DEFAULT_PERIOD_MS * 1e-3
+    ours = _listen(line, capture, asked, profiles, period_s, active, facts.name, progress)
+    stats = line.link.stats()
+    heard = line.heard
+    return replace(
+        facts,
+        seconds=time.monotonic() - begun_s,
+        frames=stats.received,
+        load=stats.load,
+        error_frames=heard.errors,
+        dropped=stats.dropped,
+        outages=stats.outages,
+        foreign=_foreign(heard, list(nodes)),
+        unconfigured=found.unconfigured,
+        strangers=tuple(n for n in found.nodes if n.node_id not in {p.node_id for p in asked}),
+        sync_s=np.empty(0) if ours else np.array([t_ns for t_ns, _ in list(capture.syncs)]) * 1e-9,
+        sync_ours=ours,
+        patches=tuple(_with_scans(patch, heard, capture, profiles) for patch in asked),
+    )
+
+
+def _info(line: Line, node_id: int) -> tuple[NodeInfo | None, str]:
+    try:
+        return read_info(line, node_id), ""
+    except NodeError as error:
+        return None, str(error)
+
+
+def _profile(line: Line, node_id: int) -> PatchProfile | None:
+    try:
+        return read_profile(line.od(node_id))
+    except NodeError:
+        return None
+
+
+def _listen(
+    line: Line,
+    capture: Capture,
+    patches: Sequence[PatchFacts],
+    profiles: dict[int, PatchProfile],
+    period_s: float,
+    active: bool,
+    name: str,
+    progress: Progress,
+) -> bool:
+    """Take scans of the patches that run, or that are made to; whether SYNC was ours."""
+    overflows: dict[int, int] = {}
+    for node_id, profile in profiles.items():
+        overflows[node_id] = _overflow(line, node_id)
+        capture.add(node_id, profile, overflows[node_id], period_s)
+    states = {p.node_id: p.found.state for p in patches if p.found is not None and p.node_id in profiles}
+    start = [node_id for node_id, state in states.items() if active and state == "pre-operational"]
+    running = [node_id for node_id, state in states.items() if state == "operational"] + start
+    for node_id in start:
+        line.link.send(od.NMT_COB_ID, bytes((_START, node_id)))
+    if not running:
+        return False
+    try:
+        heard = len(capture.syncs)
+        line.wait_until(lambda: len(capture.syncs) > heard, max(_FIRST_SYNC_S, 2.5 * period_s))
+        ours = active and len(capture.syncs) == heard
+        due_s, end_s = time.monotonic(), time.monotonic() + min(LONGEST_S, 2 * SCANS * period_s)
+        number = 0
+        while min(map(capture.scans, running)) < SCANS and time.monotonic() < end_s:
+            if ours:
+                number += 1
+                overflow = max(overflows.values())
+                counter = (number - 1) % overflow + 1 if overflow else 0
+                capture.note_sync(time.monotonic_ns(), counter)
+                line.link.send(od.SYNC_COB_ID, bytes((counter,)) if counter else b"")
+            due_s += period_s
+            line.wait_until(lambda: False, max(0.0, due_s - time.monotonic()))
+            progress(f"{name}: {min(map(capture.scans, running))} of {SCANS} scans")
+        return ours
+    finally:
+        for node_id in start:
+            line.link.send(od.NMT_COB_ID, bytes((_PRE_OPERATIONAL, node_id)))
+
+
+def _overflow(line: Line, node_id: int) -> int:
+    try:
+        value = int(line.od(node_id).read(od.SYNC_COUNTER_OVERFLOW, 0, "u8"))
+    except NodeError:
+        return 0
+    return value if 2 <= value <= 240 else 0
+
+
+def _with_scans(
+    patch: PatchFacts, heard: Heard, capture: Capture, profiles: dict[int, PatchProfile]
+) -> PatchFacts:
+    node = heard.node(patch.node_id)
+    scans = None
+    if patch.node_id in profiles and patch.info is not None and patch.info.patch is not None:
+        own = patch.info.patch
+        scale = CodeScale(own.code_bits, own.code_lo, own.code_hi)
+        noise = DEFAULT_NOISE if patch.wanted is None else patch.wanted.relative_noise
+        scans = capture.facts(patch.node_id, scale, noise)
+    return replace(patch, boot_ups=node.boot_ups, emergencies=tuple(node.emergencies), scans=scans)
+
+
+def _foreign(heard: Heard, node_ids: Sequence[int]) -> dict[int, int]:
+    """COB-IDs that neither the services nor the nodes found explain: those of the pre-defined connection set
+    of a node that was found belong to it, whatever it is."""
+    kinds = {0x080, *range(0x180, 0x680, 0x80), 0x700}
+    explained = {kind + node_id for kind in kinds for node_id in node_ids} | _KNOWN_TO_ALL
+    return {cob_id: count for cob_id, count in dict(heard.cob_ids).items() if cob_id not in explained}
+
+
+def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
+    """State and bit rate of a kernel interface, as `ip` tells; None where it does not, or there is none."""
+    if bus.interface != "socketcan":
+        return None, None
+    try:
+        done = subprocess.run(
+            ["ip", "-details", "-json", "link", "show", "dev", bus.channel],
+            capture_output=True,
+            text=True,
+            timeout=2,
+            check=True,
+        )
+        (link,) = json.loads(done.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return None, None
+    data = link.get("linkinfo", {}).get("info_data", {})
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    return data.get("state"), bitrate if isinstance(bitrate, int) else None

@@ -1,0 +1,271 @@
+"""What some fifty scans say of the skin: wires, noise, frozen values, steps, baseline. Pure functions.
+
+Noise is taken from second differences of successive scans, which a slow touch leaves alone: their variance is
+6 σ². A crossing that moves is one whose means of five scans wander by more than that noise explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.doctor.facts import BusFacts, Counts, Finding, PatchFacts, ScanFacts, Sure
+from skinnode.model.layout import Float
+
+LEAST_SCANS: Final = 20
+"""A standard deviation of fewer is known to worse than a quarter."""
+
+NOISY: Final = 5.0
+"""Times the noise told above which a crossing is noisy: far beyond what 20 scans leave open."""
+
+_BLOCK: Final = 5
+_WANDER: Final = 6.0
+_STEP: Final = 20.0
+_DRIFT: Final = 0.003
+"""|R/R0 − 1| at rest that is worth a tare: a hundred times the noise of a good converter, 1 % of a press."""
+
+_MANY: Final = 0.8
+_FEW: Final = 0.1
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quiet:
+    """Crossing by crossing, (U, K)."""
+
+    noise: Float
+    """Relative to R0; NaN where it could not be had."""
+    told: Float
+    """What converter and codes explain."""
+    level: Float
+    """Median R/R0."""
+    moves: Mask
+    steps: Mask
+    step_at: Counts
+    step_by: Float
+
+
+def analyse(scans: ScanFacts) -> Quiet:
+    """Figures of each crossing over all scans. Needs LEAST_SCANS."""
+    ratio = scans.ratio[scans.complete] if scans.complete.sum() >= LEAST_SCANS else scans.ratio
+    known = np.isfinite(ratio).all(axis=0)
+    safe = np.where(known, ratio, 1.0)
+    noise = np.sqrt(np.mean(np.diff(safe, 2, axis=0) ** 2, axis=0) / 6.0)
+    level = np.median(safe, axis=0)
+    told = np.hypot(scans.told_noise * level, scans.step / np.sqrt(12.0))
+    whole = len(safe) // _BLOCK * _BLOCK
+    blocks = safe[:whole].reshape(-1, _BLOCK, *safe.shape[1:]).mean(axis=1)
+    wander = np.ptp(blocks, axis=0)
+    jumps = np.abs(np.diff(safe, axis=0))
+    at = jumps.argmax(axis=0)
+    by = np.take_along_axis(jumps, at[None], axis=0)[0]
+    # A step stays, and is all there is: the medians before and after it differ by about as much.
+    stays = np.zeros(known.shape)
+    for row, column in np.argwhere(by > _STEP * told):
+        k = int(at[row, column]) + 1
+        if 3 <= k <= len(safe) - 3:
+            series = safe[:, row, column]
+            stays[row, column] = abs(np.median(series[k:]) - np.median(series[:k]))
+    steps = known & (stays > 0.7 * by) & (stays < 1.4 * by) & (by > _STEP * told)
+    moves = known & ~steps & (wander > _WANDER * np.maximum(noise, told))
+    return Quiet(np.where(known, noise, np.nan), told, np.where(known, level, np.nan), moves, steps, at, by)
+
+
+def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, Quiet]]:
+    for patch in bus.patches:
+        if patch.scans is not None and patch.scans.scans >= LEAST_SCANS:
+            yield patch, patch.scans, analyse(patch.scans)
+
+
+def check_wires(bus: BusFacts) -> Iterator[Finding]:
+    """Open, short, out of range: by the node's own masks and by the codes."""
+    for patch in bus.patches:
+        own = patch.info.patch if patch.info is not None else None
+        upper: set[int] = set()
+        lower: set[int] = set()
+        if own is not None:
+            upper, lower = {*own.open_upper, *own.shorted_upper}, {*own.open_lower, *own.shorted_lower}
+            for what, wires, advice in (
+                ("upper wires open", own.open_upper, "connector and solder joint of these wires"),
+                ("lower wires open", own.open_lower, "connector and solder joint of these wires"),
+                ("upper wires shorted", own.shorted_upper, "a short to a lower wire, or moisture"),
+                ("lower wires shorted", own.shorted_lower, "a short to an upper wire, or moisture"),
+            ):
+                if wires:
+                    by = "the node says so (0x2030, 0x2031)"
+                    yield Finding("wires", patch.name, f"{what}: {_listed(wires)}", Sure.CERTAIN, by, advice)
+        if patch.scans is not None and patch.scans.scans:
+            yield from _check_crossings(patch, patch.scans, upper, lower)
+
+
+def _check_crossings(
+    patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
+) -> Iterator[Finding]:
+    """Crossings apart from the wires that are at fault as a whole."""
+    whole = max(1, int(scans.complete.sum()))  # a scan with holes says nothing of what was in them
+    rest = np.ones(scans.n_open.shape, dtype=np.bool_)
+    rest[sorted(upper), :] = False
+    rest[:, sorted(lower)] = False
+    for what, counts, advice in (
+        ("open", scans.n_open, "a broken electrode or wire; values there are left out"),
+        ("shorted", scans.n_short, "the rubber is squeezed through, or moisture"),
+        ("out of range", scans.n_over, "no baseline, an old one, or pressed beyond the range: tare at rest"),
+    ):
+        always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
+        if always.any():
+            yield Finding(
+                "wires",
+                patch.name,
+                f"{int(always.sum())} crossings {what}",
+                Sure.CERTAIN,
+                f"in all {scans.scans} scans: {_places(always)}",
+                advice,
+            )
+        if sometimes.any():
+            yield Finding(
+                "wires",
+                patch.name,
+                f"{int(sometimes.sum())} crossings now and then {what}",
+                Sure.LIKELY if what == "open" else Sure.POSSIBLE,
+                f"in up to {int(counts[sometimes].max())} of {scans.scans} scans: {_places(sometimes)}",
+                "a loose contact: move the cable and watch" if what == "open" else advice,
+            )
+
+
+def check_noise(bus: BusFacts) -> Iterator[Finding]:
+    """Noise against what the hand file tells, steps, and values that stand still."""
+    for patch, scans, quiet in _judged(bus):
+        yield from _check_frozen(patch, scans)
+        factor = quiet.noise / quiet.told
+        judged = np.isfinite(factor) & ~quiet.moves & ~quiet.steps
+        noisy = judged & (factor > NOISY)
+        if noisy.any():
+            yield _noise_finding(patch, scans, quiet, factor, judged, noisy)
+        if quiet.steps.any() and quiet.steps.mean() <= max(_FEW, 1.0 / min(quiet.steps.shape)):
+            row, column = (int(i) for i in np.argwhere(quiet.steps)[0])
+            yield Finding(
+                "wires",
+                patch.name,
+                f"{int(quiet.steps.sum())} crossings jumped and stayed",
+                Sure.POSSIBLE,
+                f"{_places(quiet.steps)}; at {row}/{column} by {quiet.step_by[row, column]:.2%} of R0, "
+                f"scan {int(quiet.step_at[row, column]) + 1}",
+                "a loose contact, unless somebody touched the skin there just then",
+            )
+
+
+def _noise_finding(
+    patch: PatchFacts, scans: ScanFacts, quiet: Quiet, factor: Float, judged: Mask, noisy: Mask
+) -> Finding:
+    worst = float(np.max(factor[noisy]))
+    figures = (
+        f"{float(np.median(quiet.noise[noisy])):.1e} of R0 in the median, {worst:.0f} times what is told at "
+        f"worst, over {scans.scans} scans"
+    )
+    if noisy.sum() > 0.5 * judged.sum():
+        return Finding(
+            "wires",
+            patch.name,
+            "the whole patch is noisier than the hand file says",
+            Sure.LIKELY,
+            f"{int(noisy.sum())} of {int(judged.sum())} crossings; {figures}",
+            "supply and shield of the patch; is relative_noise in the hand file the converter's?",
+        )
+    rows = [r for r in range(len(noisy)) if judged[r].any() and noisy[r].sum() > 0.7 * judged[r].sum()]
+    columns = [c for c in range(noisy.shape[1]) if judged[:, c].any() and noisy[:, c].all()]
+    if rows or columns:
+        names = [f"upper wire {r}" for r in rows] + [f"lower wire {c}" for c in columns]
+        shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
+        return Finding(
+            "wires", patch.name, f"noise on {shown}", Sure.LIKELY, figures, "a bad contact of that wire"
+        )
+    return Finding(
+        "wires",
+        patch.name,
+        f"noise at {int(noisy.sum())} crossings",
+        Sure.POSSIBLE,
+        f"{_places(noisy)}; {figures}",
+        "a bad contact at the electrodes, or a light touch",
+    )
+
+
+def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
+    device = scans.device_us[scans.device_us >= 0]
+    if len(device) >= LEAST_SCANS and len(np.unique(device)) == 1:
+        yield Finding(
+            "wires",
+            patch.name,
+            "the node sends the same scan again and again",
+            Sure.CERTAIN,
+            f"its clock stands still over {len(device)} scans",
+            "reset the node; its sampling has stopped",
+        )
+    known = np.isfinite(scans.ratio).all(axis=0)
+    still = known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
+    if scans.told_noise > scans.step and known.any() and still.sum() > _MANY * known.sum():
+        yield Finding(
+            "wires",
+            patch.name,
+            "the values are frozen",
+            Sure.LIKELY,
+            f"{int(still.sum())} of {int(known.sum())} crossings without any change in {scans.scans} scans, "
+            f"though a noise of {scans.told_noise:.0e} is told and a code is {scans.step:.0e}",
+            "the converter has stopped: power the patch off and on",
+        )
+
+
+def check_baseline(bus: BusFacts) -> Iterator[Finding]:
+    """A baseline that is missing, or no longer that of the skin at rest."""
+    for patch in bus.patches:
+        own = patch.info.patch if patch.info is not None else None
+        if own is not None and own.baseline_missing:
+            yield Finding(
+                "baseline",
+                patch.name,
+                f"{own.baseline_missing} crossings have no baseline",
+                Sure.CERTAIN,
+                "R0 is 0 (0x2301)",
+                f"leave the skin alone and tare: skinnode od {patch.node_id} 2021:4 --write 0x65726174",
+            )
+    for patch, scans, quiet in _judged(bus):
+        at_rest = np.isfinite(quiet.level) & ~quiet.moves & ~quiet.steps
+        if at_rest.sum() < 0.5 * at_rest.size:
+            continue  # somebody touches the skin
+        off = quiet.level[at_rest] - 1.0
+        share = float(np.mean(np.abs(off) > _DRIFT))
+        one_way = max(float(np.mean(off > 0)), float(np.mean(off < 0)))
+        figures = f"R/R0 − 1 is {np.median(off):+.2%} in the median over {scans.scans} scans, {share:.0%} of "
+        figures += f"{off.size} crossings off by more than {_DRIFT:.1%}"
+        if share > _MANY and one_way > 0.9:
+            yield Finding(
+                "baseline",
+                patch.name,
+                "the baseline is no longer that of the skin at rest",
+                Sure.LIKELY,
+                figures,
+                "temperature or age: tare with nothing touching the skin",
+            )
+        elif share > 0.02:
+            yield Finding(
+                "baseline",
+                patch.name,
+                "a part of the skin is not at its baseline",
+                Sure.POSSIBLE,
+                figures,
+                "something presses there; if nothing does, tare",
+            )
+
+
+def _listed(wires: tuple[int, ...]) -> str:
+    return ", ".join(map(str, wires[:12])) + (" …" if len(wires) > 12 else "")
+
+
+def _places(mask: Mask) -> str:
+    """Crossings as upper/lower wire."""
+    places = [f"{row}/{column}" for row, column in np.argwhere(mask)[:6]]
+    return ", ".join(places) + (" …" if mask.sum() > 6 else "")

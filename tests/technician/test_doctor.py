@@ -1,0 +1,187 @@
+"""The doctor at work on simulated hands: what was broken is what it finds, and a hand that runs goes on."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinnode.host import Host
+from skinnode.model.config import load_hand
+from skinnode.transport import CanPort
+from skinnode.wire import indices as od
+from skinnode.wire.profile import PatchProfile, eds_text
+from vcan_sim.fleet import Fleet
+
+from .conftest import run
+
+HandFile = Callable[..., Path]
+On = Callable[[Any], Any]
+
+
+def examine(file: Path, *options: str) -> tuple[int, dict[str, tuple[str, str]]]:
+    """Exit status; findings as where: what to how sure and evidence. Those of timing and losses are the test
+    machine's own: they are tested on facts made up."""
+    done = run(["doctor", file, "--json", *options])
+    told = json.loads(done.stdout)["findings"]
+    found = [f for f in told if f["area"] not in ("timing", "losses") and "8110" not in f["evidence"]]
+    found = [f for f in found if "overrun" not in f["evidence"]]
+    status = done.status if found else 0
+    return status, {f"{f['where']}: {f['what']}": (f["sure"], f["evidence"]) for f in found}
+
+
+def test_a_healthy_hand(hand_file: HandFile, on: On) -> None:
+    file = hand_file()
+    on(Fleet(load_hand(file)))
+    assert examine(file) == (0, {})
+    assert examine(file, "--active") == (0, {})
+
+
+def test_a_running_hand_is_judged_and_not_disturbed(hand_file: HandFile, on: On) -> None:
+    file = hand_file()
+    hand = load_hand(file)
+    on(Fleet(hand))
+    host = on(Host.from_config(hand))
+    listener = on(CanPort(hand.buses[0]))
+    assert examine(file) == (0, {})
+    done = run(["doctor", file, "--json"])
+    assert min(p["scans"] for p in json.loads(done.stdout)["buses"][0]["patches"].values()) >= 50
+    written = []
+    while (frame := listener.recv(0.0)) is not None:
+        download = frame.can_id & 0x780 == 0x600 and frame.data[:1] and frame.data[0] & 0xE0 in (0x20, 0x00)
+        if download or frame.can_id == od.NMT_COB_ID:
+            written.append((hex(frame.can_id), frame.data.hex()))
+    assert written == []
+    assert {host.health(patch.name).condition for patch in hand.patches} == {"operational"}
+    assert {host.health(patch.name).rejoins for patch in hand.patches} == {0}
+
+
+def _cut_wire(ohm: np.ndarray, t_ns: int) -> np.ndarray:
+    ohm[2, :] = np.inf
+    return ohm
+
+
+def _short_crossing(ohm: np.ndarray, t_ns: int) -> np.ndarray:
+    ohm[1, 3] = 0.0
+    return ohm
+
+
+def _noisy_wire(ohm: np.ndarray, t_ns: int) -> np.ndarray:
+    ohm[:, 4] *= 1.0 + 3e-3 * np.random.default_rng(t_ns).standard_normal(len(ohm))
+    return ohm
+
+
+def _warm(ohm: np.ndarray, t_ns: int) -> np.ndarray:
+    return 0.98 * ohm
+
+
+@pytest.mark.parametrize(
+    ("fault", "what", "sure"),
+    [
+        (_cut_wire, "thumb: upper wires open: 2", "certain"),
+        (_short_crossing, "thumb: 1 crossings shorted", "certain"),
+        (_noisy_wire, "thumb: noise on lower wire 4", "likely"),
+        (_warm, "thumb: the baseline is no longer that of the skin at rest", "likely"),
+    ],
+)
+def test_faults_of_the_skin(hand_file: HandFile, on: On, fault: Any, what: str, sure: str) -> None:
+    file = hand_file()
+    hand = load_hand(file)
+    fleet = on(Fleet(hand))
+    on(Host.from_config(hand))
+    fleet.patches["thumb"].fault = fault
+    status, found = examine(file)
+    assert status == 1
+    assert found[what][0] == sure
+    assert not [key for key in found if key.startswith("index")]
+
+
+def test_another_layout_serial_and_eds(hand_file: HandFile, on: On, tmp_path: Path) -> None:
+    right = hand_file()
+    text = right.read_text()
+    on(Fleet(load_hand(right)))
+    eds, wrong = tmp_path / "other.eds", tmp_path / "wrong.toml"
+    eds.write_text(eds_text(PatchProfile(5, 12, 4, 4)))
+    text = text.replace('layout = { preset = "staggered"', 'layout = { preset = "aligned"', 1)
+    wrong.write_text(text.replace("node_id = 5\n", 'node_id = 5\nserial = 99\neds = "other.eds"\n'))
+    status, found = examine(wrong)
+    assert status == 1
+    assert found.keys() == {
+        "thumb: another patch than the hand file says",
+        "thumb: the EDS of the hand file is of another patch",
+        "thumb: its electrodes are elsewhere than the hand file says",
+    }
+
+
+def test_a_node_that_is_gone_and_a_bus_without_any(hand_file: HandFile, on: On) -> None:
+    file = hand_file()
+    hand = load_hand(file)
+    assert examine(file)[1].keys() == {"can0: no node of the hand answers"}
+    on(Fleet(hand.model_copy(update={"patches": hand.patches[1:]})))
+    assert examine(file)[1].keys() == {"thumb: the node is not there"}
+
+
+def test_two_nodes_with_one_node_id(hand_file: HandFile, on: On) -> None:
+    file = hand_file()
+    hand = load_hand(file)
+    on(Fleet(hand))
+    on(Fleet(hand.model_copy(update={"patches": hand.patches[:1]})))
+    assert "thumb: two nodes have its node-ID" in examine(file)[1]
+
+
+def test_an_interface_that_does_not_open(hand_file: HandFile) -> None:
+    file = hand_file()
+    file.write_text(file.read_text().replace('"virtual"', '"socketcan"'))
+    status, found = examine(file)
+    assert status == 1
+    assert found.keys() == {"can0: the interface does not work"}
+
+
+def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
+    file = hand_file()
+    hand = load_hand(file)
+    on(Fleet(hand))
+    bus = hand.buses[0]
+    assert run(["od", "5", "1800:3", "--write", "100"], bus).status == 2  # only while it is off (CiA 301)
+    assert run(["od", "5", "1800:1", "--write", "0x80000185"], bus).status == 0
+    assert run(["od", "5", "1800:3", "--write", "100"], bus).status == 0
+    status, found = examine(file)
+    assert status == 1
+    assert found["thumb: the chunk PDO (TPDO1) is not where it belongs"][1] == "off, wanted 0x185"
+    assert "160 ms, the period is 50 ms" in found["thumb: a scan takes longer than a SYNC period"][1]
+
+
+class _Page(html.parser.HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.outside: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.outside += [value for name, value in attrs if name in ("src", "href") and value]
+
+
+def test_the_report_needs_nothing_else(hand_file: HandFile, on: On, tmp_path: Path) -> None:
+    file, report = hand_file(), tmp_path / "report.html"
+    fleet = on(Fleet(load_hand(file)))
+    fleet.patches["index"].fault = _noisy_wire
+    done = run(["doctor", file, "--active", "--html", report])
+    assert done.status == 1
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    page = _Page()
+    page.feed(report.read_text())
+    assert page.tags.count("svg") == 4  # maps and timeline of each patch
+    assert not [address for address in page.outside if not address.startswith(("#", "data:"))]
+    assert "index: noise on lower wire 4" in report.read_text()
+
+
+def test_a_report_that_cannot_be_written_is_known_first(hand_file: HandFile, tmp_path: Path) -> None:
+    done = run(["doctor", hand_file(), "--html", tmp_path / "no" / "report.html"])
+    assert done.status == 2
+    assert "--html" in done.stderr

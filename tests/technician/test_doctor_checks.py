@@ -1,0 +1,173 @@
+"""Each check on facts made up: a healthy hand has no finding, each fault has its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinnode.doctor.checks import diagnose
+from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
+from skinnode.model.config import PatchConfig
+from skinnode.node.lss import LssAddress
+from skinnode.technician.heard import Emergency
+
+from .healthy import NOISE, STEP, bus_of, node, quiet_ratio, scans_of, stats
+
+WELL = PatchFacts(
+    "thumb", 5, PatchConfig(name="thumb", node_id=5), found=node(), scans=scans_of(quiet_ratio())
+)
+
+
+def one(bus: BusFacts) -> Finding:
+    """The only finding."""
+    (finding,) = diagnose(bus)
+    return finding
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_healthy_hand_has_no_finding(seed: int) -> None:
+    assert diagnose(bus_of(replace(WELL, scans=scans_of(quiet_ratio(seed))))) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "sure"),
+    [
+        ({"failure": "can0: does not open"}, "the interface does not work", Sure.CERTAIN),
+        ({"link_state": "BUS-OFF"}, "the controller is BUS-OFF", Sure.CERTAIN),
+        ({"link_bitrate_bps": 500_000}, "another bit rate", Sure.CERTAIN),
+        ({"error_frames": 3}, "error frames", Sure.CERTAIN),
+        ({"load": 0.85}, "loaded above", Sure.CERTAIN),
+        ({"outages": 1}, "the interface failed", Sure.CERTAIN),
+        ({"foreign": {0x3F0: 100}}, "nothing in the hand explains", Sure.POSSIBLE),
+        ({"unconfigured": (LssAddress(0, 1, 2, 7),)}, "without a node-ID", Sure.CERTAIN),
+        ({"strangers": (node(9),)}, "node 9 is not in the hand", Sure.CERTAIN),
+        ({"dropped": 12}, "this machine dropped frames", Sure.CERTAIN),
+        ({"sync_s": np.empty(0)}, "nobody sends SYNC", Sure.CERTAIN),
+        ({"sync_s": 0.1 * np.arange(50)}, "another period", Sure.CERTAIN),
+        ({"sync_s": np.delete(0.08 * np.arange(60), [20, 21])}, "SYNCs are missing", Sure.CERTAIN),
+        (
+            {"sync_s": 0.08 * np.arange(60) + 0.012 * (-1.0) ** np.arange(60) * (np.arange(60) % 3 == 0)},
+            "SYNC is irregular",
+            Sure.LIKELY,
+        ),
+    ],
+)
+def test_bus(changes: dict[str, Any], what: str, sure: Sure) -> None:
+    finding = one(bus_of(WELL, **changes))
+    assert what in finding.what
+    assert finding.sure is sure
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"found": node(state="stopped", answers=False)}, "is stopped and does not answer"),
+        ({"found": node(duplicate="one question got 2 answers")}, "two nodes have its node-ID"),
+        ({"found": node(product_code=1)}, "another device has its node-ID"),
+        ({"found": node(boot_ups=3)}, "restarts by itself"),
+        ({"boot_ups": 2}, "restarts by itself"),
+        ({"wanted": PatchConfig(name="thumb", node_id=5, serial=8)}, "another patch than the hand file says"),
+        ({"emergencies": (Emergency(0, 0x5000, 0x81, b"\0\1\1\0\0"),)}, "emergency messages"),
+    ],
+)
+def test_nodes(changes: dict[str, Any], what: str) -> None:
+    other = PatchFacts("index", 6, found=node(6))
+    finding = one(bus_of(replace(WELL, **changes), other))
+    assert what in finding.what
+    assert finding.where == "thumb"
+
+
+def test_a_node_that_is_missing_is_told_from_a_bus_that_is_silent() -> None:
+    other = PatchFacts("index", 6, found=node(6))
+    gone = PatchFacts("thumb", 5)
+    assert one(bus_of(gone, other)).what == "the node is not there"
+    assert one(bus_of(gone, PatchFacts("index", 6))).what == "no node of the hand answers"
+
+
+def skin(ratio: np.ndarray, **changes: Any) -> Finding:
+    return one(bus_of(replace(WELL, scans=scans_of(ratio, **changes))))
+
+
+def test_noise_of_a_crossing_of_a_wire_and_of_the_patch() -> None:
+    rough = np.random.default_rng(2).standard_normal((50, 4, 12)) * 20 * NOISE
+    ratio = quiet_ratio()
+    ratio[:, 2, 7] += rough[:, 2, 7]
+    finding = skin(ratio)
+    assert "noise at 1 crossings" in finding.what
+    assert finding.evidence.startswith("2/7;")
+    assert finding.sure is Sure.POSSIBLE
+    ratio[:, 2] += rough[:, 2]
+    assert skin(ratio).what == "noise on upper wire 2"
+    assert skin(ratio).sure is Sure.LIKELY
+    assert "the whole patch is noisier" in skin(ratio + rough).what
+
+
+def test_a_press_is_no_noise_no_step_and_no_drift() -> None:
+    ratio = quiet_ratio()
+    press = 0.5 * (1 - np.cos(np.linspace(0, 2 * np.pi, 50)))
+    ratio[:, 1:3, 3:9] -= 0.05 * press[:, None, None]
+    assert diagnose(bus_of(replace(WELL, scans=scans_of(ratio)))) == []
+
+
+def test_a_jump_that_stays() -> None:
+    ratio = quiet_ratio()
+    ratio[25:, 1, 4] += 0.03
+    finding = skin(ratio)
+    assert "1 crossings jumped" in finding.what
+    assert "1/4 by 3.0" in finding.evidence
+    assert finding.sure is Sure.POSSIBLE
+
+
+def test_frozen_values_and_a_frozen_node() -> None:
+    frozen = np.broadcast_to(quiet_ratio()[:1], (50, 4, 12))
+    assert skin(frozen).what == "the values are frozen"
+    # Of a converter quieter than a code, values that stand still say nothing.
+    assert diagnose(bus_of(replace(WELL, scans=scans_of(frozen, told_noise=3e-6)))) == []
+    finding = skin(quiet_ratio(), device_us=np.full(50, 4711))
+    assert "the same scan again" in finding.what
+    assert finding.sure is Sure.CERTAIN
+
+
+def test_drift_of_the_baseline() -> None:
+    finding = skin(1.012 * quiet_ratio())
+    assert "no longer that of the skin at rest" in finding.what
+    assert "+1.20 %" in finding.evidence.replace("%", " %")
+    part = quiet_ratio()
+    part[:, 0, :4] *= 0.97
+    assert skin(part).what == "a part of the skin is not at its baseline"
+    assert skin(part).sure is Sure.POSSIBLE
+
+
+def test_crossings_open_always_and_now_and_then() -> None:
+    ratio, n_open = quiet_ratio(), np.zeros((4, 12), dtype=np.int64)
+    ratio[:, 3, 5], n_open[3, 5] = np.nan, 50
+    finding = skin(ratio, n_open=n_open)
+    assert (finding.what, finding.sure) == ("1 crossings open", Sure.CERTAIN)
+    n_open[3, 5] = 4
+    finding = skin(ratio, n_open=n_open)
+    assert (finding.what, finding.sure) == ("1 crossings now and then open", Sure.LIKELY)
+
+
+@pytest.mark.parametrize(
+    ("counts", "what"),
+    [
+        ({"scans_torn": 2, "chunks_lost": 5}, "scans with holes"),
+        ({"scans_missed": 3}, "whole scans are missing"),
+        ({"conflicts": 4}, "two different chunks with one number"),
+        ({"bad_length": 1}, "frames that are no chunks"),
+    ],
+)
+def test_losses(counts: dict[str, int], what: str) -> None:
+    assert skin(quiet_ratio(), stats=stats(**counts)).what.startswith(what)
+
+
+def test_scans_that_run_into_the_next() -> None:
+    assert "end when the next has begun" in skin(quiet_ratio(), latency_s=np.full(50, 0.079)).what
+
+
+def test_few_scans_are_not_judged() -> None:
+    ratio = quiet_ratio()[:10] * 1.05 + 100 * STEP
+    assert diagnose(bus_of(replace(WELL, scans=scans_of(ratio)))) == []

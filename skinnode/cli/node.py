@@ -103,6 +103,7 @@ def node(
             serial=serial,
             memory=None if store is None else FileMemory(store),
             pacing=EXACT if strict_timing else THRIFTY,
+            set_bit_rate=port.set_bitrate,
         )
         with short_pauses(), NodeRunner(port, [board]) as runner:
             where = f"{interface} {channel}{', CAN FD' if fd else ''}"

@@ -22,7 +22,7 @@ import can
 
 from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
-from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader
+from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
 from skinnode.wire.timing import fd_length
 
 if TYPE_CHECKING:
@@ -246,6 +246,21 @@ class CanPort:
         self._bus = self._open()
         self._reader = self._socket_reader() if self.config.interface == _SOCKETCAN else None
         self._away = False
+
+    def set_bitrate(self, bitrate_bps: int) -> None:
+        """Change the bit rate and open the interface anew. On socketcan it is the kernel's: ``ip link`` sets
+        it, which takes the right to (CAP_NET_ADMIN). Raises BusError; the interface is then opened again as
+        it was. A thread that receives must have ended before."""
+        before = self.config
+        self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})
+        try:
+            if self.config.interface == _SOCKETCAN:
+                set_link_bitrate(self.config)
+        except BusError:
+            self.config = before
+            raise
+        finally:
+            self.reopen()
 
     def close(self) -> None:
         """Close the interface. Closing twice is fine; a thread that receives must have ended before."""

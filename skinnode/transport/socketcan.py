@@ -10,10 +10,15 @@ from __future__ import annotations
 import select
 import socket
 import struct
+import subprocess
 import time
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
+
+if TYPE_CHECKING:
+    from skinnode.model.config import BusConfig
 
 _SO_RXQ_OVFL: Final = 40
 _SO_TIMESTAMPNS: Final = 35
@@ -34,6 +39,9 @@ _OLDEST_NS: Final = 10_000_000_000
 
 _NEWEST_NS: Final = 100_000_000
 """Frames may come in after a batch was begun, but not by more than that."""
+
+_IP_S: Final = 5.0
+"""Longest an ``ip link`` may take."""
 
 BATCH_FRAMES: Final = 256
 """Most frames of one call: 30 ms of a full bus at 1 Mbit/s, after which the reader looks up."""
@@ -104,6 +112,31 @@ class SocketReader:
             elif kind == _SO_RXQ_OVFL:
                 (self.dropped,) = _DROPS.unpack(data)
         return t_ns
+
+
+def set_link_bitrate(config: BusConfig) -> None:
+    """Let the kernel take the interface of ``config`` down, set its bit rate and take it up again. Raises
+    BusError with what ``ip`` says."""
+    rates = ["bitrate", str(config.bitrate_bps)]
+    if config.fd:
+        rates += ["dbitrate", str(config.data_bitrate_bps), "fd", "on"]
+    try:
+        _ip_link(config, "down")
+        try:
+            _ip_link(config, "type", "can", *rates)
+        finally:
+            _ip_link(config, "up")
+    except (OSError, subprocess.SubprocessError) as error:
+        said = getattr(error, "stderr", "") or str(error)
+        raise BusError(
+            f"{config.name}: interface 'socketcan', channel {config.channel!r}: does not take "
+            f"{config.bitrate_bps} bit/s ({' '.join(said.split())})"
+        ) from error
+
+
+def _ip_link(config: BusConfig, *arguments: str) -> None:
+    command = ["ip", "link", "set", config.channel, *arguments]
+    subprocess.run(command, check=True, capture_output=True, text=True, timeout=_IP_S)
 
 
 class HardwareDelay:

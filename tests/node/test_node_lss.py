@@ -387,3 +387,28 @@ def test_commissioning_with_python_can_alone(bus: BusConfig, layout: PatchLayout
             send(0x080, "", 0)
             frames = [receive() for _ in range(5)]
             assert [can_id for can_id, _ in frames] == [0x1AA] * 4 + [0x2AA]
+
+
+def test_canopen_library_changes_the_bit_rate_of_an_interface(
+    bus: BusConfig, network: canopen.Network, layout: PatchLayout
+) -> None:
+    """The node's own interface is opened anew at the new bit rate, also after a power cycle."""
+    memory = VolatileMemory()
+
+    def node(port: CanPort) -> PatchNode:
+        source = _Flat(layout)
+        return PatchNode(4, layout, source, send=port.send, memory=memory, set_bit_rate=port.set_bitrate)
+
+    with CanPort(bus) as port, NodeRunner(port, [node(port)]):
+        eventually(lambda: 4 in network.scanner.nodes)
+        network.lss.send_switch_state_global(network.lss.CONFIGURATION_STATE)
+        network.lss.configure_bit_timing(4)  # 125 kbit/s
+        network.lss.store_configuration()
+        assert port.config.bitrate_bps == 1_000_000
+        network.lss.activate_bit_timing(10)
+        eventually(lambda: port.config.bitrate_bps == 125_000)
+        remote = network.add_node(4, canopen.ObjectDictionary())
+        time.sleep(0.1)  # it keeps silent, and hears nothing, for another delay of 10 ms
+        assert remote.sdo.upload(0x1000, 0) == bytes(4)
+    with CanPort(bus) as port, NodeRunner(port, [node(port)]):
+        eventually(lambda: port.config.bitrate_bps == 125_000)

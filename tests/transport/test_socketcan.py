@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame
 from skinnode.transport import port as port_module
@@ -63,6 +64,19 @@ def test_a_step_of_the_wall_clock_dates_no_frame_into_the_future(monkeypatch) ->
             frame = theirs.recv(1.0)
             assert frame is not None
             assert before_ns <= frame.t_ns <= time.monotonic_ns()
+
+
+@pytest.mark.vcan
+def test_a_link_without_a_bit_rate_says_so_and_is_up_again() -> None:
+    with CanPort(VCAN) as ours, CanPort(VCAN) as theirs:
+        with pytest.raises(BusError, match=r"channel 'vcan0': does not take 250000 bit/s \(.+\)$"):
+            ours.set_bitrate(250_000)
+        assert ours.config.bitrate_bps == 1_000_000
+        theirs.reopen()  # its socket heard that the link went down
+        ours.send(1, b"here")
+        frame = theirs.recv(1.0)
+        assert frame is not None
+        assert frame.data == b"here"
 
 
 def test_hardware_stamps_keep_a_frames_time_however_late_the_kernel_was() -> None:

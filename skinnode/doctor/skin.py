@@ -117,6 +117,17 @@ def _check_crossings(
         ("out of range", scans.n_over, "no baseline, an old one, or pressed beyond the range: tare at rest"),
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
+        for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
+            if wires.any():  # the node was asked before it scanned
+                yield Finding(
+                    "wires",
+                    patch.name,
+                    f"{side} wires {what}: {_listed(tuple(int(i) for i in np.flatnonzero(wires)))}",
+                    Sure.CERTAIN,
+                    f"every crossing, in all {scans.scans} scans",
+                    "connector and solder joint of these wires" if what == "open" else advice,
+                )
+        always &= ~(always.all(axis=1, keepdims=True) | always.all(axis=0, keepdims=True))
         if always.any():
             yield Finding(
                 "wires",
@@ -176,9 +187,10 @@ def _noise_finding(
             f"{int(noisy.sum())} of {int(judged.sum())} crossings; {figures}",
             "supply and shield of the patch; is relative_noise in the hand file the converter's?",
         )
-    rows = [r for r in range(len(noisy)) if judged[r].any() and noisy[r].sum() > 0.7 * judged[r].sum()]
-    columns = [c for c in range(noisy.shape[1]) if judged[:, c].any() and noisy[:, c].all()]
-    if rows or columns:
+    share = 0.7  # of the crossings of a wire: a few may be quiet by chance or be spoilt otherwise
+    rows = np.flatnonzero(noisy.sum(axis=1) > share * np.maximum(1, judged.sum(axis=1)))
+    columns = np.flatnonzero(noisy.sum(axis=0) > share * np.maximum(1, judged.sum(axis=0)))
+    if rows.size or columns.size:
         names = [f"upper wire {r}" for r in rows] + [f"lower wire {c}" for c in columns]
         shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
         return Finding(

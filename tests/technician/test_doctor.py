@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from skinnode.host import Host
-from skinnode.model.config import load_hand
+from skinnode.model.config import BusConfig, load_hand
+from skinnode.technician.line import Line
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 from skinnode.wire.profile import PatchProfile, eds_text
 from vcan_sim.fleet import Fleet
 
-from .conftest import run
+from .conftest import LAYOUT, Rest, run
 
 HandFile = Callable[..., Path]
 On = Callable[[Any], Any]
@@ -185,3 +186,16 @@ def test_a_report_that_cannot_be_written_is_known_first(hand_file: HandFile, tmp
     done = run(["doctor", hand_file(), "--html", tmp_path / "no" / "report.html"])
     assert done.status == 2
     assert "--html" in done.stderr
+
+
+def test_on_every_interface_without_a_hand(any_bus: BusConfig, powered: Callable[..., Any]) -> None:
+    skin = Rest(LAYOUT)
+    powered(any_bus, 5, source=skin)
+    skin.change = lambda ohm: 0.98 * ohm
+    done = run(["doctor", "--active", "--json"], any_bus)
+    assert done.status == 1
+    found = {f"{f['where']}: {f['what']}": f["sure"] for f in done.json["findings"]}
+    assert found["node 5: the baseline is no longer that of the skin at rest"] == "likely"
+    assert done.json["buses"][0]["patches"]["node 5"]["scans"] >= 50
+    with Line(any_bus) as line:  # as it was before
+        assert str(line.state(5, 0, guarding=True)) == "pre-operational"

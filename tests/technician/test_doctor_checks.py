@@ -146,7 +146,12 @@ def test_crossings_open_always_and_now_and_then() -> None:
     ratio[:, 3, 5], n_open[3, 5] = np.nan, 50
     finding = skin(ratio, n_open=n_open)
     assert (finding.what, finding.sure) == ("1 crossings open", Sure.CERTAIN)
-    n_open[3, 5] = 4
+    ratio[:, 1], n_open[1] = np.nan, 50
+    assert [f.what for f in diagnose(bus_of(replace(WELL, scans=scans_of(ratio, n_open=n_open))))] == [
+        "upper wires open: 1",
+        "1 crossings open",
+    ]
+    n_open[1], n_open[3, 5] = 0, 4
     finding = skin(ratio, n_open=n_open)
     assert (finding.what, finding.sure) == ("1 crossings now and then open", Sure.LIKELY)
 

@@ -1,0 +1,260 @@
+"""Frames from a candump log or a BLF file, whatever state it is in.
+
+A file that was cut off, or has garbage in it, yields every frame that is whole; what is not is counted and
+named by line or offset (:class:`Damage`). Nothing in a file raises. A byte that was changed into another of
+the same kind shows in BLF, whose containers have checksums, and not in a candump log, which has none.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import can
+
+from skinnode.errors import ConfigError
+from skinnode.transport.frame import Frame
+from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
+
+DAMAGES_KEPT: Final = 100
+"""Damages that are described; more are only counted."""
+
+_FD_LENGTHS: Final = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A piece of a file that could not be read."""
+
+    line: int | None
+    """Counted from 1; None in BLF, which has no lines."""
+    offset: int
+    """Bytes from the beginning of the file."""
+    what: str
+
+    def __str__(self) -> str:
+        where = f"offset {self.offset}" if self.line is None else f"line {self.line} (offset {self.offset})"
+        return f"{where}: {self.what}"
+
+
+class FrameLogReader:
+    """A log, read once from the beginning by iterating. Raises ConfigError for a file that cannot be opened
+    or whose name says that it is neither kind."""
+
+    def __init__(self, path: Path) -> None:
+        if path.suffix not in SUFFIXES:
+            raise ConfigError("recording", str(path), "a file ending in .log or .blf")
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise ConfigError("recording", str(path), f"a file that can be read ({error.strerror})") from None
+        self.path = path
+        self.damages: list[Damage] = []
+        """The first of them."""
+        self.damaged = 0
+        """All of them, up to where iteration is."""
+
+    def __iter__(self) -> Iterator[LoggedFrame]:
+        with self._file:
+            yield from self._blf() if self.path.suffix == ".blf" else self._candump()
+
+    def close(self) -> None:
+        """Read no further."""
+        self._file.close()
+
+    def _complain(self, line: int | None, offset: int, what: str) -> None:
+        self.damaged += 1
+        if len(self.damages) < DAMAGES_KEPT:
+            self.damages.append(Damage(line, offset, what))
+
+    # --- candump
+
+    def _candump(self) -> Iterator[LoggedFrame]:
+        number = offset = 0
+        while line := self._file.readline(_LONGEST_LINE):
+            number += 1
+            logged = _candump_frame(line)
+            if logged is not None:
+                yield logged
+            elif line.strip():
+                cut = not line.endswith(b"\n") and len(line) < _LONGEST_LINE
+                self._complain(number, offset, f"{'cut off' if cut else 'no frame'}: {_shown(line)}")
+            offset += len(line)
+
+    # --- BLF
+
+    def _blf(self) -> Iterator[LoggedFrame]:
+        size = self._file.seek(0, io.SEEK_END)
+        if size == 0:
+            return
+        with mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            header = data[:_FILE_HEADER_BYTES]
+            if header[:4] != b"LOGG" or len(header) < _FILE_HEADER_BYTES:
+                self._complain(None, 0, f"no BLF file header: {_shown(header[:16])}")
+                header = _BLANK_HEADER
+            tail, at = b"", _find_container(data, 0)
+            if header is not _BLANK_HEADER and at not in (_FILE_HEADER_BYTES, size):
+                self._complain(None, _FILE_HEADER_BYTES, f"no container for {at - _FILE_HEADER_BYTES} bytes")
+            while at < size:
+                end, objects = self._container(data, at)
+                if objects is None:
+                    tail = b""
+                else:
+                    whole, tail = self._whole_objects(tail + objects, at)
+                    yield from self._frames(header, whole, at)
+                following = _find_container(data, end)
+                if following > end + _PADDING_BYTES and not (following == size and objects is None):
+                    self._complain(None, end, f"no container for {following - end} bytes")
+                    tail = b""
+                at = following
+            if tail:
+                self._complain(None, size, f"cut off: a frame of which {len(tail)} bytes are there")
+
+    def _container(self, data: mmap.mmap, at: int) -> tuple[int, bytes | None]:
+        """Where the container at ``at`` ends, and what is in it, as far as it is there; None if it is
+        damaged."""
+        _, _, _, size, _ = _OBJECT.unpack_from(data, at)
+        end = at + size
+        body = data[at + _CONTAINER_HEAD_BYTES : end]
+        method = struct.unpack_from("<H", data, at + _OBJECT.size)[0] if len(body) else _DEFLATE
+        cut = end > len(data)
+        if method == _STORED:
+            if cut:
+                self._complain(None, at, "cut off: a container without its end")
+            return min(end, len(data)), body
+        if method != _DEFLATE:
+            self._complain(None, at, f"a container packed by unknown method {method}")
+            return min(end, len(data)), None
+        inflater = zlib.decompressobj()
+        try:
+            objects = inflater.decompress(body, _MOST_INFLATED)
+        except zlib.error as error:
+            self._complain(None, at, f"a container that does not unpack ({error})")
+            return at + _OBJECT.size, None  # its length may be wrong too
+        if not inflater.eof:
+            self._complain(None, at, "cut off: a container without its end")
+        return min(end, len(data)), objects
+
+    def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
+        """The objects in ``data`` that are whole, and the beginning of one that goes on in the next
+        container. What is between objects and is none is left out."""
+        pieces: list[bytes] = []
+        begin = at = 0  # of the objects that follow one another; of the next
+        while True:
+            start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
+            if start < 0 and len(data) - at <= _PADDING_BYTES:
+                return b"".join([*pieces, data[begin:at]]), b""
+            if start < 0:
+                self._complain(None, container, f"no frame at byte {at} of the container")
+                start = data.find(b"LOBJ", at)
+                pieces.append(data[begin:at])
+                if start < 0:
+                    return b"".join(pieces), b""
+                begin = start
+            cut = start + _OBJECT.size > len(data)
+            length = len(data) if cut else _OBJECT.unpack_from(data, start)[3]
+            if start + length > len(data) and (cut or length <= _MOST_OBJECT):
+                return b"".join([*pieces, data[begin:at]]), data[start:]
+            if not _OBJECT.size <= length <= _MOST_OBJECT:
+                self._complain(None, container, f"no frame at byte {start} of the container")
+                pieces.append(data[begin:start])
+                begin = at = start + 4
+            else:
+                at = start + length
+
+    def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
+        """The frames among ``objects``, by python-can, which gets a small file with nothing else in it."""
+        head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
+        file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
+        try:
+            for message in can.BLFReader(file):
+                yield _blf_frame(message)
+        except Exception as error:  # python-can lets through what its parsing raises
+            self._complain(None, container, f"objects that cannot be read ({type(error).__name__}: {error})")
+
+
+# --- candump
+
+_LONGEST_LINE: Final = 4096
+_LINE: Final = re.compile(
+    rb"\((\d{1,11})\.(\d{6})\) (\S{1,64}) ([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})#"
+    rb"(?:(R)[0-9A-Fa-f]?|(?:#([0-9A-Fa-f]))?((?:[0-9A-Fa-f]{2}){0,64}))( [RT])?(\r?\n)?"
+)
+_EXTENDED_BITS: Final = 0x1FFF_FFFF
+_ERROR_BIT: Final = 0x2000_0000
+
+
+def _candump_frame(line: bytes) -> LoggedFrame | None:
+    """The frame on a line as ``candump -L`` and python-can write it; None if it is none, or may be cut."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return None
+    seconds, micros, channel, word, remote, fd, digits, direction, end = match.groups()
+    if end is None and direction is None:
+        return None
+    can_id = int(word, 16)
+    data = b"" if digits is None else bytes.fromhex(digits.decode())
+    if (fd is None and len(data) > 8) or len(data) not in _FD_LENGTHS or (len(word) == 3 and can_id > 0x7FF):
+        return None
+    error = len(word) == 8 and bool(can_id & _ERROR_BIT)
+    frame = Frame(
+        can_id & _EXTENDED_BITS,
+        data,
+        int(seconds) * 1_000_000_000 + int(micros) * 1000,
+        remote is not None,
+        error,
+        len(word) == 8 and not error,
+        fd is not None,
+    )
+    return LoggedFrame(frame, channel.decode("ascii", "replace"), direction == b" T")
+
+
+def _shown(data: bytes) -> str:
+    text = data[:40].decode("ascii", "backslashreplace").rstrip()
+    shown = "".join(c if c.isprintable() else "?" for c in text)
+    return repr(shown + ("…" if len(data) > 40 else ""))
+
+
+# --- BLF: sizes as in python-can's can/io/blf.py
+
+_OBJECT: Final = struct.Struct("<4sHHLL")  # "LOBJ", header bytes, version, bytes, type
+_CONTAINER_HEAD_BYTES: Final = _OBJECT.size + 16
+_FILE_HEADER_BYTES: Final = 144
+_BLANK_HEADER: Final = b"LOGG" + struct.pack("<L", _FILE_HEADER_BYTES) + bytes(_FILE_HEADER_BYTES - 8)
+_LOG_CONTAINER: Final = 10
+_STORED, _DEFLATE = 0, 2
+_PADDING_BYTES: Final = 4
+_MOST_CONTAINER: Final = 1 << 24
+_MOST_INFLATED: Final = 1 << 26
+_MOST_OBJECT: Final = 1 << 16
+
+
+def _find_container(data: mmap.mmap, at: int) -> int:
+    """Where the next container begins; the end of the file if there is none."""
+    while (at := data.find(b"LOBJ", at)) >= 0:
+        if at + _OBJECT.size <= len(data):
+            _, _, _, size, kind = _OBJECT.unpack_from(data, at)
+            if kind == _LOG_CONTAINER and _CONTAINER_HEAD_BYTES <= size <= _MOST_CONTAINER:
+                return at
+        at += 4
+    return len(data)
+
+
+def _blf_frame(message: can.Message) -> LoggedFrame:
+    frame = Frame(
+        message.arbitration_id,
+        b"" if message.is_remote_frame else bytes(message.data),
+        round(message.timestamp * 1e6) * 1000,
+        message.is_remote_frame,
+        message.is_error_frame,
+        message.is_extended_id and not message.is_error_frame,
+        message.is_fd,
+    )
+    return LoggedFrame(frame, str(message.channel), not message.is_rx)

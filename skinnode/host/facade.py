@@ -15,21 +15,22 @@ from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
 from skinnode.host.bringup import check_eds, load_baseline
 from skinnode.host.dealer import BusStats
-from skinnode.host.health import NodeMonitor, PatchHealth
+from skinnode.host.health import PatchHealth
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.pipeline import Lane, LaneStats, check_solvable
 from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
+from skinnode.host.reception import receive_bus, receive_patch
 from skinnode.host.rivals import Rivals, RivalStats
 from skinnode.host.start import bring_up_all, go_on_unless, start_all
 from skinnode.host.station import Station
 from skinnode.host.supervisor import NodeStats, Supervisor
 from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
+from skinnode.host.tap import HostTap, tap_lane, tap_link
 from skinnode.host.workers import Workers
 from skinnode.model.config import HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.wire import indices as od
-from skinnode.wire.assembler import ScanAssembler
 from skinnode.wire.profile import PatchProfile
 
 _log = logging.getLogger(__name__)
@@ -106,11 +107,17 @@ class Host:
         channel: str | None = None,
         boot_deadline_s: float = bringup.BOOT_DEADLINE_S,
         cancelled: Callable[[], bool] = _never,
+        tap: HostTap | None = None,
     ) -> Iterator[Host]:
         """:meth:`from_config` of a hand file. Raises ConfigError for a file that cannot be used."""
         hand = load_hand(path)
         running = cls.from_config(
-            hand, interface=interface, channel=channel, boot_deadline_s=boot_deadline_s, cancelled=cancelled
+            hand,
+            interface=interface,
+            channel=channel,
+            boot_deadline_s=boot_deadline_s,
+            cancelled=cancelled,
+            tap=tap,
         )
         with running as host:
             yield host
@@ -125,6 +132,7 @@ class Host:
         channel: str | None = None,
         boot_deadline_s: float = bringup.BOOT_DEADLINE_S,
         cancelled: Callable[[], bool] = _never,
+        tap: HostTap | None = None,
     ) -> Iterator[Host]:
         """Bring a hand up; shut it down at the end of the ``with`` block.
 
@@ -134,6 +142,7 @@ class Host:
             channel: channel to use in place of the file's; only for a hand of one bus.
             boot_deadline_s: how long a node may take to answer for the first time.
             cancelled: asked during bring-up; when it says True, bring-up ends with BringUpCancelled.
+            tap: writes down what passes, bring-up included: a :class:`skinnode.record.Recorder`.
 
         Raises ConfigError for options, EDS or baseline files that contradict the hand, and for a layout that
         cannot be solved; BusError for an interface that does not open or a bus on which no node answers;
@@ -163,6 +172,11 @@ class Host:
             }
             workers = stack.enter_context(_workers(hand))
             stations = [_station(patch, hand, buses[patch.bus], workers, publisher) for patch in hand.patches]
+            if tap is not None:
+                for bus in buses.values():
+                    tap_link(tap, bus.link)
+                for station in stations:
+                    station.lane.tap = tap
             for bus in buses.values():  # everybody knows by now what to do with what comes
                 bus.link.run()
             for patch in hand.patches:
@@ -218,6 +232,18 @@ class Host:
         station = self._stations[patch]
         return station.monitor.health(time.monotonic_ns(), station.heartbeat_s, self.hand.sync.period_s)
 
+    def tap(self, tap: HostTap) -> None:
+        """Let ``tap`` write down what passes, from now until the host closes."""
+        for bus in self._buses.values():
+            stations = [station for station in self._stations.values() if station.link is bus.link]
+
+            def begin(link: BusLink = bus.link, stations: Sequence[Station] = tuple(stations)) -> None:
+                tap_link(tap, link)
+                for station in stations:
+                    tap_lane(tap, station.lane)
+
+            bus.link.call(begin)
+
     def stats(self) -> HostStats:
         """All counters."""
         buses = self._buses
@@ -246,34 +272,14 @@ def _workers(hand: HandConfig) -> Workers:
 def _station(
     patch: PatchConfig, hand: HandConfig, bus: _Bus, workers: Workers, publisher: Publisher
 ) -> Station:
-    """A patch with a lane that gets its frames from the bus, and withholds what a node may be sending that an
-    earlier host left operational."""
-    monitor = NodeMonitor(patch.name, patch.node_id, bus.link.reject)
-    assembler = ScanAssembler(
-        PatchProfile.from_config(patch, bus.link.config),
-        counter_overflow=bus.ticks.counter_overflow,
-        period_ns=hand.sync.period_ms * 1_000_000,
-        node_id=patch.node_id,
-        on_reject=bus.link.reject,
-    )
-    lane = Lane(patch.name, assembler, workers, publisher, bus.ticks.find, monitor.on_scan)
-    return Station(patch, hand, bus.link, lane, monitor, bus.lss)
+    reception = receive_patch(patch, hand, bus.link, bus.ticks, workers, publisher)
+    return Station(patch, hand, bus.link, reception, bus.lss)
 
 
 def _serve_bus(hand: HandConfig, link: BusLink, ticks: Ticks) -> _Bus:
-    """Who else is listened to on a bus: its SYNC, if it is another's, rivals, LSS slaves."""
-    rivals, follower, lss = Rivals(link.config), SyncFollower(ticks), LssMaster(link.send)
-    for cob_id, handler in rivals.handlers([p.node_id for p in hand.patches_on(link.config.name)]).items():
-        link.handle(cob_id, handler)
-    if link.config.role == "guest":
-        link.handle(od.SYNC_COB_ID, follower.on_sync)
-        link.handle(od.NMT_COB_ID, _ignore)
+    heard, lss = receive_bus(hand, link, ticks), LssMaster(link.send)
     link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)
-    return _Bus(link, ticks, rivals, follower, lss)
-
-
-def _ignore(data: bytes, t_ns: int) -> None:
-    """Frames of the robot's own master to its nodes."""
+    return _Bus(link, ticks, heard.rivals, heard.follower, lss)
 
 
 def _let_scans_end(lanes: Sequence[Lane], ticks: Ticks, period_s: float, publisher: Publisher) -> None:

@@ -7,10 +7,11 @@ makes sure that at most one worker is in it.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -20,7 +21,7 @@ from skinnode.errors import ConfigError, SkinError
 from skinnode.host.bringup import NodeFacts
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
-from skinnode.host.workers import Workers
+from skinnode.host.workers import Inline, Workers
 from skinnode.model.config import PatchConfig, SolverConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
@@ -108,6 +109,9 @@ class LaneTap(Protocol):
     def polled(self, patch: str, t_ns: int) -> None:
         """:meth:`Lane.poll` ended a scan."""
 
+    def overtaken(self, patch: str, scan: int) -> None:
+        """A scan, of this number, was overtaken by a newer one before a worker was free."""
+
 
 class Lane:
     """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
@@ -117,7 +121,7 @@ class Lane:
         self,
         patch: str,
         assembler: ScanAssembler,
-        workers: Workers,
+        workers: Workers | Inline,
         publisher: Publisher,
         tick: Callable[[int], Tick | None],
         on_scan: Callable[[int], None],
@@ -126,9 +130,10 @@ class Lane:
         self._solver: Solver | None = None  # None: withhold
         self._assembler, self._workers, self._publisher = assembler, workers, publisher
         self._tick, self._on_scan = tick, on_scan
-        self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque(maxlen=1)
+        self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
         self.tap: LaneTap | None = None
+        self._left_out: Set[int] = frozenset()
         self.withholdings = 0
         """How often scans began to be withheld."""
         self.doubtful = False
@@ -188,6 +193,11 @@ class Lane:
         if self.tap is not None:
             self.tap.resumed(self._patch, solver, anew=anew)
 
+    def tell_tap(self) -> None:
+        """Tell a tap that has come late whether scans are let through."""
+        if self.tap is not None and self._solver is not None:
+            self.tap.resumed(self._patch, self._solver, anew=False)
+
     def close(self) -> None:
         """Take no scan that is still in the box. Called when the mainline has ended."""
         self._box.clear()
@@ -212,8 +222,18 @@ class Lane:
             t_receive_ns=scan.t_last_ns,
         )
         self._offered, self._newest = self._offered + 1, stamp.scan
-        self._box.append((scan, stamp, solver))  # a deque of one: pushes out a scan that nobody took
+        if stamp.scan in self._left_out:
+            return
+        with contextlib.suppress(IndexError):
+            _, older, _ = self._box.popleft()
+            if self.tap is not None:
+                self.tap.overtaken(self._patch, older.scan)
+        self._box.append((scan, stamp, solver))
         self._call_worker()
+
+    def leave_out(self, scans: Set[int]) -> None:
+        """Skip the scans of these numbers, as those that were overtaken when a recording was made."""
+        self._left_out = scans
 
     def settled(self, scan: int) -> bool:
         """Whether ``scan`` or a newer one has come, or none is let through, and nothing is left to solve."""

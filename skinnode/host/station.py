@@ -9,10 +9,11 @@ from typing import Final
 from skinnode.errors import BusError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.bringup import Bringer, NodeFacts
-from skinnode.host.health import BOOT_UP, STOPPED, NodeMonitor
+from skinnode.host.health import STOPPED
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
-from skinnode.host.pipeline import Lane, Solver
+from skinnode.host.pipeline import Solver
+from skinnode.host.reception import PatchReception
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.wire import indices as od
 from skinnode.wire.profile import PatchProfile
@@ -30,11 +31,11 @@ class Station:
         patch: PatchConfig,
         hand: HandConfig,
         link: BusLink,
-        lane: Lane,
-        monitor: NodeMonitor,
+        reception: PatchReception,
         lss: LssMaster,
     ) -> None:
-        self.patch, self.link, self.lane, self.monitor = patch, link, lane, monitor
+        self.patch, self.link = patch, link
+        self.lane, self.monitor = reception.lane, reception.monitor
         self.bus = hand.bus(patch.bus)
         self.is_guest = self.bus.role == "guest"
         self.is_silent = self.is_guest and self.bus.guest_sends == "nothing"
@@ -47,18 +48,8 @@ class Station:
         self._hand, self._lss = hand, lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = link.remote_od(patch.node_id, self._on_answer)
-        link.handle(od.heartbeat_cob_id(patch.node_id), self._on_heartbeat)
-        link.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency)
-        link.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
-        link.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
-        link.poll_with(lane.poll)
 
     # --- mainline
-
-    def _on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        self.monitor.on_heartbeat(data, t_ns)
-        if len(data) == 1 and data[0] & 0x7F == BOOT_UP:
-            self.lane.withhold()  # what it sends from here on is not as it was configured
 
     def _on_answer(self, t_ns: int) -> None:
         self.t_answer_ns = t_ns

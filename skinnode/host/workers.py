@@ -48,3 +48,10 @@ class Workers:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             job()
+
+
+class Inline:
+    """In place of :class:`Workers`: each job is done when it is handed in, by the thread that does so."""
+
+    def submit(self, job: Job) -> None:
+        job()

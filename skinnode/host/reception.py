@@ -1,0 +1,83 @@
+"""Who on the host gets which frames of a bus. The same for frames that come off the bus and for recorded
+ones: nothing here sends, waits or has a thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from skinnode.host.dealer import Dealer
+from skinnode.host.health import BOOT_UP, NodeMonitor
+from skinnode.host.pipeline import Lane
+from skinnode.host.publish import Publisher
+from skinnode.host.rivals import Rivals
+from skinnode.host.sync import SyncFollower, Ticks
+from skinnode.host.workers import Inline, Workers
+from skinnode.model.config import HandConfig, PatchConfig
+from skinnode.wire import indices as od
+from skinnode.wire.assembler import ScanAssembler
+from skinnode.wire.profile import PatchProfile
+
+
+@dataclass(frozen=True, slots=True)
+class PatchReception:
+    """A patch on the receiving side."""
+
+    lane: Lane
+    monitor: NodeMonitor
+
+
+@dataclass(frozen=True, slots=True)
+class BusReception:
+    """Who else is listened to on a bus: other masters, and the SYNC of one."""
+
+    rivals: Rivals
+    follower: SyncFollower
+
+
+def receive_bus(hand: HandConfig, dealer: Dealer, ticks: Ticks) -> BusReception:
+    """From now on other masters are heard."""
+    config = dealer.config
+    rivals, follower = Rivals(config), SyncFollower(ticks)
+    for cob_id, handler in rivals.handlers([patch.node_id for patch in hand.patches_on(config.name)]).items():
+        dealer.handle(cob_id, handler)
+    if config.role == "guest":
+        dealer.handle(od.SYNC_COB_ID, follower.on_sync)
+        dealer.handle(od.NMT_COB_ID, _ignore)
+    return BusReception(rivals, follower)
+
+
+def receive_patch(
+    patch: PatchConfig,
+    hand: HandConfig,
+    dealer: Dealer,
+    ticks: Ticks,
+    workers: Workers | Inline,
+    publisher: Publisher,
+) -> PatchReception:
+    """From now on frames of the patch go to its monitor and its lane, which withholds scans until it is told
+    how to decode them: a node that an earlier host left operational may be sending already."""
+    monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject)
+    assembler = ScanAssembler(
+        PatchProfile.from_config(patch, dealer.config),
+        counter_overflow=ticks.counter_overflow,
+        period_ns=hand.sync.period_ms * 1_000_000,
+        node_id=patch.node_id,
+        on_reject=dealer.reject,
+    )
+    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, monitor.on_scan)
+
+    def on_heartbeat(data: bytes, t_ns: int) -> None:
+        monitor.on_heartbeat(data, t_ns)
+        if len(data) == 1 and data[0] & 0x7F == BOOT_UP:
+            lane.withhold()  # what it sends from here on is not as it was configured
+
+    dealer.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat)
+    dealer.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency)
+    dealer.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
+    dealer.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
+    dealer.poll_with(lane.poll)
+    return PatchReception(lane, monitor)
+
+
+def _ignore(data: bytes, t_ns: int) -> None:
+    """Frames of the robot's own master to its nodes."""

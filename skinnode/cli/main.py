@@ -12,7 +12,22 @@ from typing import Annotated
 
 import typer
 
-from skinnode.cli import bench, conformance, demo, doctor, eds, host, info, lss, nmt, node, od, scan
+from skinnode.cli import (
+    bench,
+    conformance,
+    demo,
+    doctor,
+    eds,
+    host,
+    info,
+    lss,
+    nmt,
+    node,
+    od,
+    record,
+    replay,
+    scan,
+)
 from skinnode.errors import SkinError
 
 app = typer.Typer(
@@ -32,6 +47,8 @@ app.command(name="od")(od.od)
 app.command(name="nmt")(nmt.nmt)
 app.add_typer(lss.app, name="lss")
 app.command(name="doctor")(doctor.doctor)
+app.command(name="record")(record.record)
+app.command(name="replay")(replay.replay)
 app.command(name="conformance")(conformance.conformance)
 app.add_typer(bench.app, name="bench")
 

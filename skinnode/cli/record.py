@@ -1,0 +1,135 @@
+"""``skinnode record hand.toml -o FOLDER``: run a hand and write down every frame."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from skinnode.model.config import HandConfig
+    from skinnode.record import Recorder
+
+
+def record(
+    hand: Annotated[Path, typer.Argument(help="The hand to record.", metavar="HAND.toml")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="An existing folder, in which the file is named after hand, date and time; or a new file "
+            "ending in .log or .blf. Nothing is written over.",
+            metavar="FOLDER|FILE",
+        ),
+    ],
+    kind: Annotated[
+        Literal["log", "blf"],
+        typer.Option("--format", help="In a folder: candump's text, or Vector's BLF.", metavar="log|blf"),
+    ] = "log",
+    listen: Annotated[
+        bool, typer.Option("--listen", help="Send nothing, solve nothing: only write down what is heard.")
+    ] = False,
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
+) -> None:
+    """Run a hand's patches as `skinnode host` does and record every frame, received and sent.
+
+    Play it with `skinnode replay`; candump's tools and python-can read it too. Killed at any moment, it reads
+    up to the last second. What --listen writes has no baselines, so no fields can be made of it: it is for
+    candump's tools. Exit status 1 if frames could not be written, 2 if it could not run.
+    """
+    from skinnode.model.config import load_hand
+    from skinnode.record import Recorder
+    from skinnode.signals import until_told
+
+    plan = load_hand(hand).on(interface, channel)
+    with until_told() as told, Recorder(plan, output, kind) as recorder:
+        _say(as_json, file=str(recorder.path))
+        (_listen if listen else _run)(plan, recorder, told, seconds, as_json)
+    stats = recorder.stats()
+    _say(as_json, frames=stats.frames, dropped=stats.dropped, failure=stats.failure)
+    if stats.dropped or stats.failure:
+        raise typer.Exit(1)
+
+
+def _run(
+    plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
+) -> None:
+    from skinnode.host import BringUpCancelled, Host
+    from skinnode.host.pipeline import check_solvable
+
+    for patch in plan.patches:
+        check_solvable(patch, plan.solver)
+    try:
+        with Host.from_config(plan, cancelled=told.is_set, tap=recorder) as running:
+            _say(as_json, note=f"{len(plan.patches)} patches operational; Ctrl-C ends")
+            with running.fields(capacity=1) as fields:
+                _follow(recorder, told, seconds, as_json, lambda: fields.get(0.0))
+    except BringUpCancelled:
+        return
+
+
+def _listen(
+    plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
+) -> None:
+    from skinnode.errors import SkinError
+    from skinnode.host.link import BusLink
+    from skinnode.host.tap import tap_link
+
+    failures: list[SkinError] = []
+    with ExitStack() as stack:
+        for bus in plan.buses:
+            link = BusLink(bus, {}, failures.append)
+            stack.callback(link.close)
+            tap_link(recorder, link)
+            link.run()
+        _say(as_json, note="listening; Ctrl-C ends")
+        _follow(recorder, told, seconds, as_json)
+    if failures:
+        raise failures[0]
+
+
+def _follow(
+    recorder: Recorder,
+    told: threading.Event,
+    seconds: float | None,
+    as_json: bool,
+    check: Callable[[], object] = lambda: None,
+) -> None:
+    """A line a second until told to end or time is up; ``check`` raises what ends it early."""
+    start_s = time.monotonic()
+    end_s = float("inf") if seconds is None else start_s + seconds
+    due_s = start_s + 1.0
+    while not told.wait(max(0.0, min(due_s, end_s) - time.monotonic())):
+        now_s = time.monotonic()
+        check()
+        stats = recorder.stats()
+        _say(as_json, elapsed_s=round(now_s - start_s, 1), frames=stats.frames, dropped=stats.dropped)
+        if now_s >= end_s:
+            return
+        due_s += 1.0
+
+
+def _say(as_json: bool, **facts: object) -> None:
+    shown = {key: value for key, value in facts.items() if value is not None}
+    if as_json:
+        print(json.dumps(shown), flush=True)
+    elif "note" in shown:
+        print(shown["note"], flush=True)
+    else:
+        print("  ".join(f"{key} {value}" for key, value in shown.items()), flush=True)

@@ -1,0 +1,106 @@
+"""``skinnode replay RECORDING``: the fields of a recording, by the code that would have made them live."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from skinnode.model.frames import FieldFrame
+    from skinnode.record import Replay
+
+
+def replay(
+    recording: Annotated[
+        Path, typer.Argument(help="The .log or .blf; its .jsonl lies beside it.", metavar="RECORDING")
+    ],
+    speed: Annotated[float, typer.Option(help="1: as it was recorded; 2: twice as fast.", metavar="X")] = 1.0,
+    fast: Annotated[bool, typer.Option("--fast", help="As fast as the scans are solved.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="A JSON object a field, and one with the counters at the end.")
+    ] = False,
+) -> None:
+    """Decode and solve a recording of `skinnode record`, with the same results as live, bit by bit.
+
+    Exit status 1 if the recording is damaged or lacks frames, or a scan was torn; 2 if it cannot be read at
+    all.
+    """
+    from skinnode.record import replay as play
+    from skinnode.signals import until_told
+
+    run = play(recording, speed=None if fast else speed)
+    deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
+    with until_told() as told:
+        for field in run:
+            assert field.stamp is not None  # the host stamps every field
+            if as_json:
+                print(json.dumps(field_table(field)), flush=not fast)
+            depth_m = float(-field.displacement_m[..., 2].min())
+            deepest_m[field.stamp.patch] = max(deepest_m[field.stamp.patch], depth_m)
+            if told.is_set():
+                run.stop()
+    faults = _faults(run)
+    if as_json:
+        print(json.dumps({"patches": _patches(run, deepest_m), "faults": faults}))
+    else:
+        for name, facts in _patches(run, deepest_m).items():
+            print(name + "  " + "  ".join(f"{key} {value}" for key, value in facts.items()))
+        for fault in faults:
+            print(f"fault: {fault}")
+    if faults:
+        raise typer.Exit(1)
+
+
+def field_table(field: FieldFrame) -> dict[str, Any]:
+    """A field as JSON; numbers survive bit by bit."""
+    stamp = field.stamp
+    assert stamp is not None
+    return {
+        "patch": stamp.patch,
+        "scan": stamp.scan,
+        "t_sync_ns": stamp.t_sync_ns,
+        "t_receive_ns": stamp.t_receive_ns,
+        "trusted": field.trusted,
+        "method": field.method,
+        "displacement_m": field.displacement_m.tolist(),
+        # JSON has no infinity: where nothing is known there is no deviation
+        "displacement_std_m": [
+            [[v if v < float("inf") else None for v in electrode] for electrode in wire]
+            for wire in field.displacement_std_m.tolist()
+        ],
+    }
+
+
+def _patches(run: Replay, deepest_m: dict[str, float]) -> dict[str, dict[str, Any]]:
+    return {
+        name: {
+            "solved": lane.solved,
+            "skipped": lane.skipped,
+            "withheld": lane.withheld,
+            "untrusted": lane.untrusted,
+            "torn": lane.assembler.scans_torn,
+            "missed": lane.assembler.scans_missed,
+            "deepest_um": round(1e6 * deepest_m[name], 1),
+        }
+        for name, lane in run.patch_stats().items()
+    }
+
+
+def _faults(run: Replay) -> list[str]:
+    found = [f"{run.log.path.name} {damage}" for damage in run.log.damages]
+    if run.log.damaged > len(found):
+        found.append(f"{run.log.damaged - len(found)} more places like these")
+    found += run.complaints
+    if run.dropped:
+        found.append(f"{run.dropped} frames were not recorded: the disk was too slow")
+    if run.strange:
+        found.append(f"{run.strange} frames on channels that no bus of the hand has")
+    for name, lane in run.patch_stats().items():
+        if lane.assembler.scans_torn:
+            found.append(f"{name}: {lane.assembler.scans_torn} scans torn")
+        if not lane.offered:
+            found.append(f"{name}: no scan that could be decoded")
+    return found

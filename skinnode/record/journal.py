@@ -1,0 +1,142 @@
+"""What a replay needs beside the frames, as JSON, one object a line, in a file beside the log.
+
+The first line says which hand it is and how its clock ran (:class:`Header`). Each further line is something
+that decided what the host made of the frames: ``bus`` and ``at`` say after how many received frames of which
+bus it happened, ``t_ns`` when (monotonic clock of the host).
+
+=============  ==============================================================================
+``event``      means
+=============  ==============================================================================
+``resumed``    scans of ``patch`` go through, decoded with ``facts`` (baseline, scale, serial number, and the
+               layout where it is not that of the hand); ``anew``: what was assembled before is forgotten;
+               without ``facts``: with the same solver as before
+``withheld``   scans of ``patch`` do not go through any more
+``polled``     a scan that lacked something was ended by the clock
+``overtaken``  ``scan`` of ``patch`` was skipped for a newer one
+``dropped``    ``frames`` that were not written, because the disk was too slow
+``ended``      the recording was ended; without it, its process was killed or the disk full
+=============  ==============================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.errors import ConfigError
+from skinnode.host.bringup import NodeFacts
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig, parse_hand
+from skinnode.model.layout import PatchLayout
+from skinnode.wire.codec import CodeScale
+from skinnode.wire.profile import PatchProfile
+
+FORMAT: Final = "skinnode recording 1"
+SUFFIX: Final = ".jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The first line of a journal."""
+
+    hand: HandConfig
+    started: str
+    """Local date and time, ISO 8601."""
+    wall_minus_mono_ns: int
+    """To be taken off the times in the log to have those of the host's monotonic clock."""
+
+    def line(self) -> str:
+        table = _without_paths(self.hand.model_dump(exclude_defaults=True))
+        times = {"started": self.started, "wall_minus_mono_ns": self.wall_minus_mono_ns}
+        return json.dumps({"format": FORMAT, **times, "hand": table})
+
+
+def _without_paths(value: Any) -> Any:
+    """Files are named by a hand for bring-up; a replay has what was in them."""
+    if isinstance(value, Mapping):
+        kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
+        return {key: _without_paths(item) for key, item in kept.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_paths(item) for item in value]
+    return value
+
+
+def facts_table(facts: NodeFacts) -> dict[str, Any]:
+    """NodeFacts as JSON; numbers survive bit by bit."""
+    layout, planned = facts.layout, facts.config.layout.build()
+    same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
+    own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}
+    own["resistivity_ohm_per_m"] = layout.resistivity_ohm_per_m
+    return {
+        "serial": facts.serial,
+        "heartbeat_s": facts.heartbeat_s,
+        "lo": facts.scale.lo,
+        "hi": facts.scale.hi,
+        "baseline_ohm": facts.baseline_ohm.tolist(),
+        "layout": None if same and own["resistivity_ohm_per_m"] == planned.resistivity_ohm_per_m else own,
+    }
+
+
+def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> NodeFacts:
+    """The other way. Raises KeyError, TypeError or ValueError for a table that is none."""
+    profile = PatchProfile.from_config(patch, bus)
+    baseline = np.array(table["baseline_ohm"], dtype=np.float64)
+    if baseline.shape != (profile.rows, profile.columns):
+        raise ValueError(
+            f"baseline_ohm: got shape {baseline.shape}, must be ({profile.rows}, {profile.columns})"
+        )
+    own = table["layout"]
+    if own is None:
+        layout = patch.layout.build()
+    else:
+        layout = PatchLayout(
+            np.array(own["upper_m"], dtype=np.float64),
+            np.array(own["lower_m"], dtype=np.float64),
+            own["resistivity_ohm_per_m"],
+            own["name"],
+        )
+    scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
+    return NodeFacts(patch, layout, profile, scale, baseline, table["serial"], table["heartbeat_s"])
+
+
+def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
+    """Header, events, and a complaint for each line that cannot be read. Raises ConfigError where there is no
+    journal, or its first line is not that of one."""
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except OSError as error:
+        allowed = f"a journal beside the log that can be read ({error.strerror})"
+        raise ConfigError("recording", str(path), allowed) from None
+    try:
+        first = json.loads(lines[0])
+        if first["format"] != FORMAT:
+            raise ConfigError("format", first["format"], repr(FORMAT), where=str(path))
+        header = Header(
+            parse_hand(first["hand"], where=str(path)),
+            str(first["started"]),
+            int(first["wall_minus_mono_ns"]),
+        )
+    except ConfigError:
+        raise
+    except (ValueError, KeyError, TypeError, RecursionError):
+        shown = lines[0][:40].decode("ascii", "replace")
+        raise ConfigError("line 1", shown, "the header of a recording's journal", where=str(path)) from None
+    events: list[dict[str, Any]] = []
+    complaints: list[str] = []
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
+            continue
+        try:
+            event = json.loads(line)
+            if not (isinstance(event["bus"], str) and isinstance(event["event"], str)):
+                raise ValueError
+            event["at"], event["t_ns"] = int(event["at"]), int(event["t_ns"])
+            events.append(event)
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            what = "cut off" if number == len(lines) else "no event"
+            complaints.append(f"{path.name} line {number}: {what}")
+    return header, events, complaints

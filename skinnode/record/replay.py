@@ -1,0 +1,246 @@
+"""Makes fields of a recording again, by the code that made them live: dealer, assembler, decoder, lane,
+solver, publisher. Nothing here has a thread: each scan is solved when its last frame is dealt out.
+
+**Same as live.** For the scans that were solved live the numbers are the same bits, where the recording began
+before the host did, is whole, the build and processor are the same and no deadline cut a solve short. Times
+are of the recording host's clock, to 1 µs, as log files have them. Where frames are missing or damaged,
+events of the journal are placed by time instead of by count, and the clock that ends incomplete scans is
+that of the frames.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from skinnode.errors import ConfigError
+from skinnode.host.dealer import BusStats, Dealer
+from skinnode.host.health import PatchHealth
+from skinnode.host.pipeline import LaneStats, Solver
+from skinnode.host.publish import Publisher
+from skinnode.host.reception import PatchReception, receive_bus, receive_patch
+from skinnode.host.sync import SyncFollower, Ticks
+from skinnode.host.workers import Inline
+from skinnode.model.config import BusConfig
+from skinnode.model.frames import FieldFrame
+from skinnode.record.journal import SUFFIX, facts_of, read_journal
+from skinnode.record.recorder import channels
+from skinnode.transport.frame_log_reader import FrameLogReader
+from skinnode.wire.indices import SYNC_COB_ID
+
+LONGEST_SILENCE_S: Final = 60.0
+"""A longer one is played as one of this length: it may be a damaged time."""
+
+_ROUNDING_NS: Final = 2_000
+"""A time in a log may be this much too early or late."""
+
+_SLICE_S: Final = 0.1
+"""How long :meth:`Replay.stop` may go unnoticed."""
+
+
+def replay(path: Path | str, *, speed: float | None = None) -> Replay:
+    """The fields of a recording, as an iterable::
+
+        for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
+            ...
+
+    ``speed``: 1 at the pace of the recording, 2 twice as fast; None as fast as they are solved. No scan is
+    skipped that was solved live, whatever the speed. Raises ConfigError for a recording that cannot be read
+    at all, and for a speed that is not positive.
+    """
+    return Replay(Path(path), speed)
+
+
+class Replay:
+    """See :func:`replay`. Iterate once; the counters then say what there was."""
+
+    def __init__(self, path: Path, speed: float | None) -> None:
+        if speed is not None and not 0 < speed < float("inf"):
+            raise ConfigError("speed", speed, "a positive number")
+        header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
+        """What of the journal could not be read, a line each."""
+        self.hand, self.started = header.hand, header.started
+        self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
+        self.log = FrameLogReader(path)
+        """The log; its ``damaged`` and ``damages`` say what of it could not be read."""
+        self.ended = any(event["event"] == "ended" for event in events)
+        """Whether the recording was ended rather than killed."""
+        self.dropped = sum(int(e.get("frames", 0)) for e in events if e["event"] == "dropped")
+        """Frames that the recorder could not write."""
+        self._now_ns = 0
+        self._stopped = False
+        self._publisher = Publisher(tuple(patch.name for patch in self.hand.patches))
+        self._buses = {
+            bus.name: _Bus(bus, self, [event for event in events if event["bus"] == bus.name])
+            for bus in self.hand.buses
+        }
+        names = channels(self.hand)
+        by_number = path.suffix == ".blf"
+        self._by_channel = {
+            str(number) if by_number else names[bus.name]: self._buses[bus.name]
+            for number, bus in enumerate(self.hand.buses)
+        }
+        self.strange = 0
+        """Frames of a channel that is no bus of the hand."""
+
+    def __iter__(self) -> Iterator[FieldFrame]:
+        fields = self._publisher.subscribe(64, None, None)
+        pace = _Pace(self._speed, self._wait)
+        for frame, channel, sent in self.log:
+            frame = frame._replace(t_ns=frame.t_ns - self._offset_ns)
+            pace.wait_for(frame.t_ns)
+            if self._stopped:
+                break
+            self._now_ns = frame.t_ns
+            bus = self._by_channel.get(channel)
+            if bus is None:
+                self.strange += 1
+                continue
+            bus.take(frame, sent=sent, whole=not self.log.damaged)
+            while (field := fields.get(0.0)) is not None:
+                yield field
+        self.log.close()
+        for bus in self._buses.values():
+            bus.finish()
+        while (field := fields.get(0.0)) is not None:
+            yield field
+
+    def stop(self) -> None:
+        """End the iteration soon; from any thread."""
+        self._stopped = True
+
+    def health(self, patch: str) -> PatchHealth:
+        """How a patch was where the replay is. Raises KeyError for no such patch."""
+        heard = self._buses[self.hand.patch(patch).bus].patches[patch]
+        return heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
+
+    def bus_stats(self) -> dict[str, BusStats]:
+        """Counters by bus."""
+        return {name: bus.stats() for name, bus in self._buses.items()}
+
+    def patch_stats(self) -> dict[str, LaneStats]:
+        """Counters by patch."""
+        return {patch.name: self._lane_stats(patch.name) for patch in self.hand.patches}
+
+    def _lane_stats(self, patch: str) -> LaneStats:
+        return self._buses[self.hand.patch(patch).bus].patches[patch].lane.stats()
+
+    def _wait(self, seconds: float) -> None:
+        end_s = time.monotonic() + seconds
+        while not self._stopped and (left_s := end_s - time.monotonic()) > 0:
+            time.sleep(min(left_s, _SLICE_S))
+
+    def clock(self) -> int:
+        """The time in the recording, ns of its host's monotonic clock."""
+        return self._now_ns
+
+    @property
+    def publisher(self) -> Publisher:
+        return self._publisher
+
+
+class _Pace:
+    """Waits until a frame is due."""
+
+    def __init__(self, speed: float | None, wait: Callable[[float], None]) -> None:
+        self._speed, self._wait = speed, wait
+        self._last_ns: int | None = None
+        self._due_s = time.monotonic()
+
+    def wait_for(self, t_ns: int) -> None:
+        if self._speed is None:
+            return
+        gap_s = 0.0 if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
+        self._last_ns = t_ns
+        self._due_s += max(-1.0, min(gap_s, LONGEST_SILENCE_S)) / self._speed
+        ahead_s = self._due_s - time.monotonic()
+        if ahead_s > 0:
+            self._wait(ahead_s)
+
+
+class _PollerlessDealer(Dealer):
+    """Lanes are polled where the journal says so, not after each batch: there are no batches any more."""
+
+    def poll_with(self, poller: Callable[[int], None]) -> None:
+        pass
+
+
+class _Bus:
+    """A bus of the recording, with its patches."""
+
+    def __init__(self, config: BusConfig, replay: Replay, events: list[dict[str, Any]]) -> None:
+        self._config, self._replay = config, replay
+        hand = replay.hand
+        self._ticks = Ticks(hand.sync.counter_overflow)
+        self._dealer = _PollerlessDealer(config, {}, 0)
+        receive_bus(hand, self._dealer, self._ticks)
+        self._own_syncs = SyncFollower(self._ticks)
+        self.patches: dict[str, PatchReception] = {
+            patch.name: receive_patch(patch, hand, self._dealer, self._ticks, Inline(), replay.publisher)
+            for patch in hand.patches_on(config.name)
+        }
+        for name, heard in self.patches.items():
+            skipped = [e.get("scan") for e in events if e["event"] == "overtaken" and e.get("patch") == name]
+            heard.lane.leave_out(frozenset(scan for scan in skipped if isinstance(scan, int)))
+        self._events = deque(events)
+        self._solvers: dict[str, Solver] = {}
+        self._received = self._sent = 0
+
+    def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
+        """The next frame of the log. ``whole``: no frame before it was damaged."""
+        if sent:
+            self._sent += 1
+            self._dealer.count_sent(frame.can_id, frame.data)
+            if frame.can_id == SYNC_COB_ID and not frame.extended:
+                self._own_syncs.on_sync(frame.data, frame.t_ns)
+            return
+        while self._events and self._is_due(self._events[0], frame.t_ns, whole=whole):
+            self._happen(self._events.popleft())
+        self._received += 1
+        self._dealer.deal((frame,))
+        if not whole:
+            for heard in self.patches.values():
+                heard.lane.poll(frame.t_ns)
+        self._dealer.poll(frame.t_ns)
+
+    def finish(self) -> None:
+        """What happened after the last frame."""
+        while self._events:
+            self._happen(self._events.popleft())
+
+    def stats(self) -> BusStats:
+        return self._dealer.count(sent=self._sent)
+
+    def _is_due(self, event: dict[str, Any], t_ns: int, *, whole: bool) -> bool:
+        if whole:
+            return bool(event["at"] <= self._received)
+        return bool(event["t_ns"] <= t_ns)
+
+    def _happen(self, event: dict[str, Any]) -> None:
+        heard = self.patches.get(str(event.get("patch")))
+        if heard is None:
+            return
+        lane = heard.lane
+        match event["event"]:
+            case "withheld":
+                lane.withhold()
+            case "polled":
+                lane.poll(event["t_ns"] + _ROUNDING_NS)
+            case "resumed":
+                solver = self._solver(event)
+                if solver is not None:
+                    lane.resume(solver, lane.withholdings, anew=bool(event.get("anew")))
+
+    def _solver(self, event: dict[str, Any]) -> Solver | None:
+        name, replay = event["patch"], self._replay
+        if "facts" in event:
+            try:
+                facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
+            except (KeyError, TypeError, ValueError) as error:
+                replay.complaints.append(f"facts of {name}: {error}")
+                return None
+            self._solvers[name] = Solver(facts, replay.hand.solver, replay.clock)
+        return self._solvers.get(name)

@@ -1,0 +1,194 @@
+"""A live run and its replay give the same bits; recordings that were killed or damaged are read."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from skinnode.errors import ConfigError
+from skinnode.host import Host
+from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.frames import FieldFrame
+from skinnode.record import Recorder, replay
+from skinnode.transport.frame import Frame
+from skinnode.transport.frame_log import FrameLog, LoggedFrame
+from skinnode.transport.frame_log_reader import FrameLogReader
+from vcan_sim.fleet import Fleet
+
+SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
+T_NS = 1_790_000_000_000_000_000
+
+
+def a_hand() -> HandConfig:
+    bus = {"name": "can0", "interface": "virtual", "channel": uuid.uuid4().hex[:8]}
+    patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL} for i in range(2)]
+    return parse_hand({"buses": [bus], "patches": patches, "sync": {"period_ms": 25}})
+
+
+def key(field: FieldFrame) -> tuple[str, int]:
+    assert field.stamp is not None
+    return field.stamp.patch, field.stamp.scan
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf"])
+def test_a_replay_gives_the_bits_of_the_live_run(tmp_path: Path, suffix: str) -> None:
+    hand, path = a_hand(), tmp_path / f"run{suffix}"
+    live: dict[tuple[str, int], FieldFrame] = {}
+    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+        fields = host.fields(capacity=1000)
+        end_s = time.monotonic() + 2.0
+        while time.monotonic() < end_s:
+            field = fields.get(0.1)
+            if field is not None:
+                live[key(field)] = field
+    assert len(live) > 40
+    assert recorder.stats().failure is None
+    assert recorder.stats().dropped == 0
+    run = replay(path)
+    again = {key(field): field for field in run}
+    assert (run.log.damaged, run.complaints, run.ended) == (0, [], True)
+    assert set(again) >= set(live)
+    for which, field in live.items():
+        other = again[which]
+        assert other.displacement_m.tobytes() == field.displacement_m.tobytes(), which
+        assert other.displacement_std_m.tobytes() == field.displacement_std_m.tobytes(), which
+        assert other.residual.tobytes() == field.residual.tobytes()
+        assert (other.status, other.method, other.noise_factor) == (
+            field.status,
+            field.method,
+            field.noise_factor,
+        )
+        assert field.stamp is not None
+        assert other.stamp is not None
+        assert (other.stamp.counter, other.stamp.device_time_us) == (
+            field.stamp.counter,
+            field.stamp.device_time_us,
+        )
+        assert abs(other.stamp.t_receive_ns - field.stamp.t_receive_ns) <= 2000
+    with pytest.raises(ConfigError, match="exists"):
+        Recorder(hand, path)
+
+
+def test_python_can_reads_what_was_written(tmp_path: Path) -> None:
+    frames = [
+        Frame(0x185, bytes(range(8)), T_NS),
+        Frame(0x80, b"\x07", T_NS + 1_000_000),
+        Frame(0x1ABCDE01, b"\x01", T_NS + 2_000_000, extended=True),
+        Frame(0x705, b"", T_NS + 3_000_000, remote=True),
+        Frame(0x186, bytes(64), T_NS + 4_000_000, fd=True),
+    ]
+    readers = {".log": can.CanutilsLogReader, ".blf": can.BLFReader}
+    for suffix, reader in readers.items():
+        path = tmp_path / f"x{suffix}"
+        log = FrameLog(path, ("can0",))
+        for number, frame in enumerate(frames):
+            log.write(LoggedFrame(frame, "can0", number % 2 == 1))
+            log.flush(to_disk=False)
+        log.close()
+        messages = list(reader(path))
+        assert [bytes(m.data) for m in messages] == [f.data for f in frames]
+        assert [m.arbitration_id for m in messages] == [f.can_id for f in frames]
+        assert [m.is_fd for m in messages] == [f.fd for f in frames]
+        assert [not m.is_rx for m in messages] == [False, True, False, True, False]
+        times_s = [f.t_ns * 1e-9 for f in frames]
+        np.testing.assert_allclose([m.timestamp for m in messages], times_s, rtol=0, atol=2e-6)
+        ours = FrameLogReader(path)
+        assert [(g.frame._replace(t_ns=0), g.sent) for g in ours] == [
+            (f._replace(t_ns=0), number % 2 == 1) for number, f in enumerate(frames)
+        ]
+        assert ours.damaged == 0
+
+
+CHILD = """
+import sys, time
+from skinnode.transport.frame import Frame
+from skinnode.model.config import parse_hand
+from skinnode.record import Recorder
+hand = parse_hand({"buses": [{}], "patches": [{"name": "p", "node_id": 5}]})
+recorder = Recorder(hand, sys.argv[1])
+print("go", flush=True)
+for number in range(1_000_000):
+    recorder.received("can0", [Frame(0x185, number.to_bytes(8, "little"), time.monotonic_ns())])
+    if number % 4 == 0:
+        print(number, time.monotonic_ns(), flush=True)
+    time.sleep(0.0005)
+"""
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf"])
+def test_killed_at_any_moment_it_reads_up_to_the_last_second(tmp_path: Path, suffix: str) -> None:
+    for attempt in range(5):
+        path = tmp_path / f"run{attempt}{suffix}"
+        with subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True
+        ) as child:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "go\n"
+            time.sleep(random.uniform(0.0, 1.5))
+            child.send_signal(signal.SIGKILL)
+            killed_ns = time.monotonic_ns()
+            told = [line.split() for line in child.stdout.read().splitlines()]
+        run = replay(path)
+        assert not run.ended
+        assert list(run) == []
+        numbers = [int.from_bytes(g.frame.data, "little") for g in FrameLogReader(path)]
+        assert numbers == list(range(len(numbers)))
+        whole = [line for line in told if len(line) == 2]
+        due = [int(n) for n, t_ns in whole[:-1] if int(t_ns) < killed_ns - 1_000_000_000]
+        assert len(numbers) > max(due, default=-1)
+
+
+def written(path: Path, frames: int) -> bytes:
+    log = FrameLog(path, ("can0",))
+    for number in range(frames):
+        log.write(
+            LoggedFrame(Frame(0x185, number.to_bytes(8, "little"), T_NS + number * 1000), "can0", False)
+        )
+        if number % 50 == 49:
+            log.flush(to_disk=False)
+    log.close()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf"])
+def test_garbage_costs_what_it_covers_and_is_counted(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"x{suffix}"
+    whole = written(path, 500)
+    middle = len(whole) // 2
+    for garbage in (b"\xff" * 100, os.urandom(64), b"LOBJ" * 25):
+        path.write_bytes(whole[:middle] + garbage + whole[middle + len(garbage) :])
+        reader = FrameLogReader(path)
+        numbers = {int.from_bytes(g.frame.data, "little") for g in reader}
+        assert reader.damaged > 0
+        assert str(reader.damages[0]).startswith("line" if suffix == ".log" else "offset")
+        assert len(numbers & set(range(500))) >= 390  # two containers of 50 frames at most
+        assert {0, 499} <= numbers
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf"])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_is_in_a_file_nothing_is_raised(tmp_path: Path, suffix: str, data: st.DataObject) -> None:
+    path = tmp_path / f"{uuid.uuid4().hex}{suffix}"
+    content = bytearray(written(path, 120))
+    for _ in range(data.draw(st.integers(1, 5))):
+        at = data.draw(st.integers(0, len(content)))
+        length = data.draw(st.integers(0, 40))
+        content[at : at + length] = data.draw(st.binary(max_size=40))
+    content = content[: data.draw(st.integers(0, len(content)))]
+    path.write_bytes(content)
+    reader = FrameLogReader(path)
+    for logged in reader:
+        assert len(logged.frame.data) <= 64

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
     from skinnode.model.layout import PatchLayout
     from skinnode.model.status import Status
+    from skinnode.record import Recorder, replay
     from skinnode.solve.homotopy import PathResult, solve_path
     from skinnode.solve.posterior import Posterior
     from skinnode.solve.schedule import Adaptive, Periodic, Uniform
@@ -38,6 +39,8 @@ _HOME = {
     "Adaptive": "skinnode.solve.schedule",
     "Periodic": "skinnode.solve.schedule",
     "Uniform": "skinnode.solve.schedule",
+    "Recorder": "skinnode.record",
+    "replay": "skinnode.record",
     "PathResult": "skinnode.solve.homotopy",
     "solve_path": "skinnode.solve.homotopy",
     "Posterior": "skinnode.solve.posterior",
@@ -54,6 +57,7 @@ __all__ = [
     "PathResult",
     "Periodic",
     "Posterior",
+    "Recorder",
     "ResistanceFrame",
     "Rubber",
     "ScanStamp",
@@ -63,6 +67,7 @@ __all__ = [
     "Uniform",
     "__version__",
     "jacobian",
+    "replay",
     "resistance_ohm",
     "solve_path",
     "solve_system",

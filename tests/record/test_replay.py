@@ -192,3 +192,34 @@ def test_whatever_is_in_a_file_nothing_is_raised(tmp_path: Path, suffix: str, da
     reader = FrameLogReader(path)
     for logged in reader:
         assert len(logged.frame.data) <= 64
+
+
+FULL = """
+import resource, sys, time
+from skinnode.transport.frame import Frame
+from skinnode.model.config import parse_hand
+from skinnode.record import Recorder
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+hand = parse_hand({"buses": [{}], "patches": [{"name": "p", "node_id": 5}]})
+with Recorder(hand, sys.argv[1]) as recorder:
+    for number in range(20_000):
+        recorder.received("can0", [Frame(0x185, number.to_bytes(8, "little"), time.monotonic_ns())])
+stats = recorder.stats()
+assert stats.failure is not None and "disk" in stats.failure, stats
+"""
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf"])
+def test_a_full_disk_is_one_line_and_nobody_is_held_up(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"run{suffix}"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", FULL, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert "recording ended, the disk does not take it" in done.stderr
+    assert list(replay(path)) == []

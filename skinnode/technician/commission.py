@@ -44,7 +44,9 @@ def only_unconfigured(line: Line) -> LssAddress:
     found, more = find_unconfigured(line)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
-        got = f"{len(found)} nodes without a node-ID" + (f" (serials {serials})" if found else "")
+        got = f"{len(found)}{' and more' if more else ''} nodes without a node-ID" + (
+            f" (serials {serials})" if found else ""
+        )
         raise ConfigError("--serial", None, f"needed, for there are {got}")
     return found[0]
 

@@ -6,7 +6,9 @@ One dialogue at a time on a bus. A slave that does not agree is silent, so every
 
 from __future__ import annotations
 
+import contextlib
 import queue
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -23,6 +25,9 @@ who agrees in the end."""
 
 _TRIES: Final = 2
 """Questions of which silence means that nobody is there; a busy machine may miss one."""
+
+_SETTLE: Final = 0.2
+"""Share of the waiting time that the answers of several slaves to one question may lie apart."""
 
 _RESET_SCAN: Final = 0x80
 _PARTS: Final = 4
@@ -82,7 +87,10 @@ class LssMaster:
 
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
-        return self._ask(LssCommand.FASTSCAN, data, LssCommand.IDENTIFIED, answer_s)
+        answer = self._ask(LssCommand.FASTSCAN, data, LssCommand.IDENTIFIED, answer_s)
+        if answer is not None:  # others may agree a little later: not to the next question
+            time.sleep(answer_s * _SETTLE)
+        return answer
 
     # --- one node
 
@@ -138,11 +146,13 @@ class LssMaster:
         while not self._answers.empty():  # of a question before, answered too late or by many
             self._answers.get()
         self._request(command, data)
-        try:
-            answer = self._answers.get(timeout=answer_s)
-        except queue.Empty:
-            return None
-        return answer if answer[0] == (wanted or command) else None
+        end_s = time.monotonic() + answer_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            with contextlib.suppress(queue.Empty):
+                answer = self._answers.get(timeout=left_s)
+                if answer[0] == (wanted or command):  # others belong to the question before
+                    return answer
+        return None
 
     def _request(self, command: int, data: bytes) -> None:
         self._send(od.LSS_REQUEST_COB_ID, (bytes((command,)) + data).ljust(8, b"\0"))

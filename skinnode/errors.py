@@ -19,11 +19,24 @@ counters, never exceptions. Arguments of the wrong shape are plain ``ValueError`
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 
 class SkinError(Exception):
     """Root of all errors of this project. ``str(error)`` is one line fit for a technician."""
+
+
+class Shown(str):
+    """A text that an error shows without quotes."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+NOTHING: Final = Shown("nothing")
+"""What was got where a key is missing."""
 
 
 class ConfigError(SkinError, ValueError):
@@ -44,7 +57,13 @@ class ProfileError(ConfigError):
 
 
 class BusLoadError(ConfigError):
-    """A plan that needs more of the bus than it may use."""
+    """A plan that needs more of a bus than it may use: ``needed`` and ``available``, shares of the bus."""
+
+    def __init__(
+        self, key: str, got: object, allowed: str, *, needed: float, available: float, where: str = ""
+    ) -> None:
+        self.needed, self.available = needed, available
+        super().__init__(key, got, allowed, where=where)
 
 
 class BusError(SkinError):

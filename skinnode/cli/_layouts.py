@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from skinnode.model.layout import PatchLayout
 
 OPTION = "--layout"
-HELP = "aligned, symmetric or staggered; FILE.toml with the keys of [patches.layout]; or MODULE:NAME."
+HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as layout.file of a hand; or MODULE:NAME."
 
 
 def import_from_here() -> None:
@@ -31,10 +31,10 @@ def find_layout(text: str) -> PatchLayout:
 
     if text in PRESETS:
         return PatchLayout.preset(text)
-    if text.endswith(".toml"):
+    if text.endswith((".toml", ".npz")):
         return load_layout(text)
     if ":" not in text:
-        raise ConfigError(OPTION, text, f"{', '.join(PRESETS)}, FILE.toml or MODULE:NAME")
+        raise ConfigError(OPTION, text, f"{', '.join(PRESETS)}, FILE.toml, FILE.npz or MODULE:NAME")
     found = load(text, OPTION)
     try:
         layout = found if isinstance(found, PatchLayout) else found()

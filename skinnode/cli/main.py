@@ -18,6 +18,7 @@ from skinnode.cli import (
     demo,
     doctor,
     eds,
+    hand,
     host,
     info,
     lss,
@@ -39,6 +40,7 @@ app = typer.Typer(
 )
 app.command(name="demo")(demo.demo)
 app.command(name="host")(host.host)
+app.add_typer(hand.app, name="hand")
 app.command(name="node")(node.node)
 app.command(name="eds")(eds.eds)
 app.command(name="scan")(scan.scan)

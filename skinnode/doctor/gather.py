@@ -15,7 +15,7 @@ import numpy as np
 from skinnode.doctor.capture import Capture
 from skinnode.doctor.facts import BusFacts, PatchFacts
 from skinnode.errors import BusError, NodeError, ProfileError
-from skinnode.host.bringup import check_eds, inhibit_time_100us
+from skinnode.host.bringup import check_eds
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.technician.heard import Heard
 from skinnode.technician.info import NodeInfo, read_info
@@ -24,6 +24,7 @@ from skinnode.technician.sheet import read_profile
 from skinnode.technician.survey import survey
 from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
+from skinnode.wire.plan import inhibit_time_100us
 from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50

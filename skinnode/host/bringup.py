@@ -22,6 +22,7 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.coordinates import unpack_coordinates
+from skinnode.wire.plan import inhibit_time_100us
 from skinnode.wire.profile import PatchProfile
 
 BOOT_DEADLINE_S: Final = 3.0
@@ -29,9 +30,6 @@ BOOT_DEADLINE_S: Final = 3.0
 
 HEARTBEATS_WATCHED: Final = 3
 """Heartbeats of the host that a node may miss before it falls silent, where the host sends one."""
-
-SCAN_SHARE: Final = 0.8
-"""Part of the SYNC period in which a node paces its scan; the rest is slack for SDO, EMCY and late frames."""
 
 _NMT_START: Final = 0x01
 _NMT_PRE_OPERATIONAL: Final = 0x80
@@ -328,11 +326,6 @@ def start(send: Callable[[int, bytes], None], node_id: int) -> None:
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
     """NMT: go pre-operational; the node falls silent but for its heartbeat and SDO."""
     send(od.NMT_COB_ID, bytes([_NMT_PRE_OPERATIONAL, node_id]))
-
-
-def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Pace at which ``frames`` frames take SCAN_SHARE of the period, in units of 0x1800:3."""
-    return int(period_ms * 10 * SCAN_SHARE / frames)
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:

@@ -19,7 +19,7 @@ from skinnode.host.health import PatchHealth
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.pipeline import Lane, LaneStats, check_solvable
-from skinnode.host.publish import CAPACITY_FIELDS, Publisher, Subscription
+from skinnode.host.publish import Publisher, Subscription
 from skinnode.host.reception import receive_bus, receive_patch
 from skinnode.host.rivals import Rivals, RivalStats
 from skinnode.host.start import bring_up_all, go_on_unless, start_all
@@ -31,6 +31,7 @@ from skinnode.host.workers import Workers
 from skinnode.model.config import HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.wire import indices as od
+from skinnode.wire.plan import check_plan
 from skinnode.wire.profile import PatchProfile
 
 _log = logging.getLogger(__name__)
@@ -145,12 +146,14 @@ class Host:
             tap: writes down what passes, bring-up included: a :class:`skinnode.record.Recorder`.
 
         Raises ConfigError for options, EDS or baseline files that contradict the hand, and for a layout that
-        cannot be solved; BusError for an interface that does not open or a bus on which no node answers;
-        NodeTimeout for a node that does not answer, both unless ``bring_up.missing`` is ``wait``; NodeError
-        for one that is not what the hand says or does not keep its configuration. After that the host
-        survives whatever comes: see :meth:`health` and :meth:`stats`.
+        cannot be solved; BusLoadError for a plan that does not fit its bus; BusError for an interface that
+        does not open or a bus on which no node answers; NodeTimeout for a node that does not answer, both
+        unless ``bring_up.missing`` is ``wait``; NodeError for one that is not what the hand says or does not
+        keep its configuration. After that the host survives whatever comes: see :meth:`health` and
+        :meth:`stats`.
         """
         hand = hand.on(interface, channel)
+        check_plan(hand)
         for patch in hand.patches:
             profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
             if patch.eds is not None:
@@ -214,14 +217,15 @@ class Host:
             yield cls(hand, buses, stations, sync, supervisor, publisher)
 
     def fields(
-        self, *, timeout_s: float | None = None, capacity: int = CAPACITY_FIELDS, patch: str | None = None
+        self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
     ) -> Subscription:
         """Fields as they are solved, of all patches or of one, from now until the host closes.
 
         With ``timeout_s`` the loop raises TimeoutError when no field came for that long. ``capacity`` is how
-        many fields the loop may lag behind before it loses the oldest.
+        many fields the loop may lag behind before it loses the oldest, as in the hand file unless given.
         """
-        return self._publisher.subscribe(capacity, timeout_s, patch)
+        kept = self.hand.stream.capacity_fields if capacity is None else capacity
+        return self._publisher.subscribe(kept, timeout_s, patch)
 
     def latest(self, patch: str) -> FieldFrame | None:
         """The newest field of a patch, None before the first. Never waits. Raises ValueError for no patch."""

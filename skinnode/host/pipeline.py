@@ -40,14 +40,21 @@ class Solver:
     ) -> None:
         self.facts = facts
         self._clock = clock
+        calibration = facts.config.calibration
         self._tracker = Tracker(
             facts.layout,
             method=config.method,
             operator=config.operator,
             relative_noise=facts.config.relative_noise,
             baseline_ohm=facts.baseline_ohm,
-            stiffness_n_per_m=config.stiffness_n_per_m,
+            stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
+            rubber=calibration.rubber,
+            deadline_us=config.deadline_us,
+            estimate_noise=config.estimate_noise,
+            drift=config.drift,
+            normal_only=config.normal_only,
         )
+        self._gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
         self._quantisation_ohm = facts.scale.relative_std * facts.baseline_ohm
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
@@ -55,6 +62,8 @@ class Solver:
         resistance_ohm, valid = decode(scan.codes, self.facts.baseline_ohm, self.facts.scale)
         valid &= scan.valid
         resistance_ohm[~valid] = np.nan
+        if self._gain is not None:
+            resistance_ohm *= self._gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, frame: ResistanceFrame) -> FieldFrame:

@@ -13,9 +13,6 @@ from typing import Final, Self
 from skinnode.errors import SkinError
 from skinnode.model.frames import FieldFrame
 
-CAPACITY_FIELDS: Final = 64
-"""Fields a subscriber may lag behind: more than a second of four patches at 12.5 scans a second."""
-
 
 @dataclass(frozen=True, slots=True)
 class _Failure:

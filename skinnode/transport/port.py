@@ -104,7 +104,7 @@ class CanPort:
 
     def _open(self) -> can.BusABC:
         config = self.config
-        options: dict[str, Any] = {"bitrate": config.bitrate_bps}
+        options: dict[str, Any] = {**config.options, "bitrate": config.bitrate_bps}
         if config.interface == _VIRTUAL:
             options["rx_queue_size"] = VIRTUAL_QUEUE_FRAMES
         if config.interface == _MULTICAST or config.fd:

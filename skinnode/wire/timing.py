@@ -134,6 +134,38 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
     return _FD_NOMINAL_BITS + stuff[0], data_bits + stuff[1]
 
 
+@functools.cache
+def fd_worst_case_bits(length: int) -> tuple[int, int]:
+    """Most bits at the nominal and at the data bit rate of a CAN FD frame with ``length`` bytes, as in
+    :func:`fd_bits`: found over all data, run by run.
+
+    Raises ValueError for a length that no frame has.
+    """
+    if length not in FD_LENGTHS:
+        raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
+    # From SOF to IDE stand 14 bits, whose first 5 and each 4 more may bring a stuff bit.
+    # FDF, res and BRS alternate, ESI is 0 and the length code is known; the data are what is worst.
+    stuff = {(1 << 2) + 1: 0}  # a run of one recessive bit, BRS
+    code = FD_LENGTHS.index(length)
+    choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
+    choices += [(0, 1)] * (8 * length)
+    for number, bits in enumerate(choices, 1):
+        after: dict[int, int] = {}
+        for run, count in stuff.items():
+            for bit in bits:
+                value, equal = (run - 1) >> 2, (run - 1 & 3) + 1
+                equal = equal + 1 if bit == value else 1
+                stuffed = equal == _RUN
+                state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
+                # A stuff bit due after the last bit is not sent: the first fixed one stands there.
+                total = count + (stuffed and number < len(choices))
+                after[state] = max(after.get(state, 0), total)
+        stuff = after
+    crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
+    data_bits = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1
+    return _FD_NOMINAL_BITS + (14 - 1) // (_RUN - 1), data_bits + max(stuff.values())
+
+
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
     """:func:`exact_bits` of many standard data frames: (n,) identifiers, (n,) lengths, (n, 8) bytes, as (n,).
 

@@ -13,7 +13,6 @@ import pytest
 
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
 from skinnode.host import BringUpCancelled, Host
-from skinnode.host.bringup import inhibit_time_100us
 from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
@@ -347,9 +346,3 @@ def test_eds_that_is_none(hand: HandConfig, tmp_path: Path) -> None:
     assert str(caught.value).startswith(f"{path}: EDS: got ")
     assert "allowed: a file as in CiA 306" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_inhibit_time_leaves_a_fifth_of_the_period() -> None:
-    # 100 chunks and a summary in 64 of 80 ms
-    assert inhibit_time_100us(80, 101) == 6
-    assert 101 * 6 * 0.1 <= 64 < 101 * 7 * 0.1

@@ -215,30 +215,30 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
         (
             "node_id = 12",
             "node_id = 11",
-            "patches[1].node_id: got 11, allowed: one that patches[0] does not use",
+            ":17:1: patches[1].node_id: got 11, allowed: one that patches[0] does not use",
         ),
         (
             "node_id = 12",
             'node_id = 12\neds = "none.eds"',
-            "patches[1].eds: got 'none.eds', "
+            ":18:1: patches[1].eds: got 'none.eds', "
             "allowed: the path of an EDS file; there is no file {folder}/none.eds",
         ),
         (
             "period_ms = 40",
             "periode_ms = 40",
-            "sync.periode_ms: got 40, allowed: no such key (did you mean period_ms?); "
+            ":8:1: sync.periode_ms: got 40, allowed: no such key (did you mean period_ms?); "
             "the keys here are period_ms, counter_overflow",
         ),
         (
             "period_ms = 40",
             "period_ms 40",
-            "line 8, column 11: got 'period_ms 40', "
+            ": line 8, column 11: got 'period_ms 40', "
             "allowed: TOML (Expected '=' after a key in a key/value pair)",
         ),
         (
             "period_ms = 40",
             'period_ms = "40"',
-            "sync.period_ms: got '40', allowed: an integer from 1 to 60000",
+            ":8:1: sync.period_ms: got '40', allowed: an integer from 1 to 60000",
         ),
     ],
 )
@@ -247,7 +247,7 @@ def test_hand_file_that_cannot_be_used(
 ) -> None:
     path = write_hand(tmp_path, "virtual", "none")
     path.write_text(path.read_text().replace(old, new))
-    assert error_of(str(path)) == f"error: {path}: {line.format(folder=tmp_path)}"
+    assert error_of(str(path)) == f"error: {path}{line.format(folder=tmp_path)}"
 
 
 def test_no_such_file(error_of: Callable[..., str], tmp_path: Path) -> None:

@@ -344,7 +344,10 @@ def test_the_command_takes_the_sizes_of_a_layout(tmp_path: Path, monkeypatch: py
         (["--node-id=4"], "--node-id: got 4, allowed: nothing without --dcf"),
         (["--bitrate=500000"], "--bitrate: got 500000, allowed: nothing without --dcf"),
         (["--layout=aligned", "--lower-wires=4"], "--lower-wires: got 4, allowed: nothing beside --layout"),
-        (["--layout=wavy"], "--layout: got 'wavy', allowed: aligned, symmetric, staggered, FILE.toml or"),
+        (
+            ["--layout=wavy"],
+            "--layout: got 'wavy', allowed: aligned, symmetric, staggered, FILE.toml, FILE.npz or",
+        ),
         (["--layout=no.toml"], "layout file: got 'no.toml', allowed: a file that can be read"),
         (["--layout=json:dumps"], "--layout: got 'json:dumps', allowed: a function that returns a layout"),
         (["--layout=os:getcwd"], "--layout: got 'os:getcwd', allowed: a PatchLayout, or a function"),
@@ -365,10 +368,10 @@ def test_the_command_refuses_in_one_line(
 def test_a_layout_file_is_read_strictly(tmp_path: Path) -> None:
     file = tmp_path / "patch.toml"
     for text, says in (
-        ("pitch = 1", "pitch: got 1, allowed: no such key (did you mean pitch_m?)"),
-        ("upper_wires = 0", "upper_wires: got 0, allowed: an integer from 1 to 254"),
-        ("upper_wires = = 3", "line 1, column 15: got 'upper_wires = = 3', allowed: TOML"),
+        ("pitch = 1", ":1:1: pitch: got 1, allowed: no such key (did you mean pitch_m?)"),
+        ("upper_wires = 0", ":1:1: upper_wires: got 0, allowed: an integer from 1 to 254"),
+        ("upper_wires = = 3", ": line 1, column 15: got 'upper_wires = = 3', allowed: TOML"),
     ):
         file.write_text(text)
         error = command("--layout", str(file)).exception
-        assert str(error).startswith(f"{file}: {says}")
+        assert str(error).startswith(f"{file}{says}")

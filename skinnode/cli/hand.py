@@ -1,0 +1,222 @@
+"""``skinnode hand``: a hand file before there is a hand: checked, described for editors, begun."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from skinnode.model.config import HandConfig
+    from skinnode.wire.plan import BusPlan
+
+app = typer.Typer(
+    help="Check a hand file and the load of its buses; its JSON Schema; begin one.", no_args_is_help=True
+)
+
+
+@app.command()
+def check(
+    hand: Annotated[Path, typer.Argument(help="The hand to check.", metavar="HAND.toml")],
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
+) -> None:
+    """Validate a hand file and work out what it needs of its buses.
+
+    For each bus: the load of the plan with every frame at its longest and with random data, the worst-case
+    time from SYNC to the end of each patch's summary, and that against the SYNC period. Nothing is opened.
+    Exit status 1 if a bus needs more than its max_load, 2 if the file cannot be used.
+    """
+    from skinnode.errors import BusLoadError
+    from skinnode.model.config import load_hand
+    from skinnode.wire.plan import plan_of, require_room
+
+    config = load_hand(hand)
+    plans, refused = plan_of(config), []
+    for plan in plans:
+        try:
+            require_room(config, plan)
+        except BusLoadError as error:
+            refused.append(str(error))
+    if as_json:
+        report = {"hand": config.name, "buses": [_facts(plan) for plan in plans], "refused": refused}
+        typer.echo(json.dumps(report, indent=2))
+    else:
+        _print(config, plans)
+    for line in refused:
+        typer.echo(f"error: {line}", err=True)
+    if refused:
+        raise typer.Exit(1)
+
+
+def _facts(plan: BusPlan) -> dict[str, Any]:
+    return {
+        "bus": plan.bus.name,
+        "role": plan.bus.role,
+        "sync_period_s": plan.period_s,
+        "frames_per_s": plan.frames_per_s,
+        "load": plan.load,
+        "typical_load": plan.typical_load,
+        "max_load": plan.bus.max_load,
+        "shortest_period_ms": plan.shortest_period_ms,
+        "scans": [
+            {
+                "patch": scan.patch,
+                "node_id": scan.node_id,
+                "chunks": scan.chunks,
+                "paced_s": scan.paced_s,
+                "sync_to_summary_s": scan.worst_s,
+            }
+            for scan in plan.scans
+        ],
+        "frames": [
+            {
+                "name": frame.name,
+                "can_id": frame.can_id,
+                "length": frame.length,
+                "frames_per_s": frame.frames_per_s,
+                "load": frame.load,
+                "typical_load": frame.typical_load,
+            }
+            for frame in plan.frames
+        ],
+    }
+
+
+def _print(config: HandConfig, plans: tuple[BusPlan, ...]) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=True)
+    where = "1 bus" if len(plans) == 1 else f"{len(plans)} buses"
+    patches = "1 patch" if len(config.patches) == 1 else f"{len(config.patches)} patches"
+    console.print(
+        f"{config.name}: {patches} on {where}, a scan every {config.sync.period_ms} ms", markup=False
+    )
+    for plan in plans:
+        console.print()
+        console.print(_headline(plan), markup=False)
+        console.print(_scan_table(plan))
+        console.print(_frame_table(plan))
+        for line in _remarks(plan):
+            console.print(line, markup=False)
+
+
+def _headline(plan: BusPlan) -> str:
+    bus = plan.bus
+    rate = f"{bus.bitrate_bps / 1e6:g} Mbit/s" + (f" / {bus.data_bitrate_bps / 1e6:g}" if bus.fd else "")
+    return (
+        f"{bus.name} ({bus.interface} {bus.channel}, {rate}, {bus.role}): {plan.frames_per_s:.0f} frames/s, "
+        f"load {plan.load:.1%} at worst, {plan.typical_load:.1%} typical, of {bus.max_load:.0%} allowed"
+    )
+
+
+def _table(*columns: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right", no_wrap=True)
+    return table
+
+
+def _scan_table(plan: BusPlan) -> Table:
+    table = _table("patch", "node", "chunks", "paced ms", "SYNC to summary ms", "of the period")
+    for scan in plan.scans:
+        worst = (
+            ("no bound", "")
+            if scan.worst_s is None
+            else (f"{scan.worst_s * 1e3:.1f}", f"{scan.worst_s / plan.period_s:.0%}")
+        )
+        table.add_row(scan.patch, str(scan.node_id), str(scan.chunks), f"{scan.paced_s * 1e3:.1f}", *worst)
+    return table
+
+
+def _frame_table(plan: BusPlan) -> Table:
+    """One line a kind of frame: those of all patches together."""
+    kinds: dict[str, list[float]] = {}
+    for frame in plan.frames:
+        sums = kinds.setdefault(frame.name.partition(" of ")[0], [0.0, 0.0, 0.0])
+        for i, value in enumerate((frame.frames_per_s, frame.load, frame.typical_load)):
+            sums[i] += value
+    table = _table("frames", "a second", "load at worst", "typical")
+    for kind, (rate, load, typical) in kinds.items():
+        table.add_row(kind, f"{rate:.1f}", f"{load:.2%}", f"{typical:.2%}")
+    return table
+
+
+def _remarks(plan: BusPlan) -> list[str]:
+    late = [s.patch for s in plan.scans if s.worst_s is None or s.worst_s > plan.period_s]
+    if not late:
+        return []
+    return [f"note: at worst a scan of {', '.join(late)} is not over when the next SYNC comes"]
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of a hand file, for editors that complete and check TOML.
+
+    A file whose first line is `#:schema PATH` names it; the schema of this version is
+    skinnode/model/hand.schema.json.
+    """
+    from skinnode.model.config.schema import schema_text
+
+    typer.echo(schema_text(), nl=False)
+
+
+@app.command()
+def new(
+    patches: Annotated[int, typer.Option(min=1, max=127, help="How many patches.", metavar="N")] = 4,
+) -> None:
+    """Print a commented hand file to begin with: one bus, and a SYNC period that it has room for."""
+    from skinnode.model.config import parse_hand
+    from skinnode.wire.plan import plan_of
+
+    (plan,) = plan_of(parse_hand(_table_of(patches, period_ms=60_000)))
+    period_ms = max(10, -(-(plan.shortest_period_ms or 60_000) // 10) * 10)
+    head = _NEW.format(period_ms=period_ms, rate=f"{1e3 / period_ms:.3g}")
+    typer.echo(head + "".join(_NEW_PATCH.format(i=i) for i in range(1, patches + 1)), nl=False)
+
+
+def _table_of(patches: int, period_ms: int) -> dict[str, Any]:
+    return {
+        "buses": [{"name": "can0"}],
+        "sync": {"period_ms": period_ms},
+        "patches": [{"name": f"patch{i}", "node_id": i} for i in range(1, patches + 1)],
+    }
+
+
+_NEW = """\
+#:schema hand.schema.json
+# A hand. Check it:  skinnode hand check hand.toml
+# Play it:           vcan-sim hand.toml, and in another terminal: skinnode host hand.toml
+# Editors complete and check it after:  skinnode hand schema > hand.schema.json
+
+name = "hand"
+
+[[buses]]
+name = "can0"
+interface = "udp_multicast"       # socketcan, pcan, kvaser, ...: any that python-can knows
+channel = "239.74.163.2"          # of socketcan: "can0"
+bitrate_bps = 1_000_000
+role = "master"                   # "guest" where the robot has a CANopen master of its own
+max_load = 0.7                    # share of the bus that this plan may need
+
+[sync]
+period_ms = {period_ms}                    # one SYNC is one scan of every patch: {rate} a second
+
+[stream]
+partial = "pass"                  # a scan with chunks missing: on with a mask, or "withhold"
+"""
+_NEW_PATCH = """
+[[patches]]
+name = "patch{i}"
+node_id = {i}
+# serial = 12345                  # must be this one; found by LSS if it has no node-ID yet
+# link = "palm_link"              # of the robot
+# pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}
+layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
+"""

@@ -1,0 +1,49 @@
+"""What every table of a hand file is: frozen, strict as TOML is typed, and able to say what is allowed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Allowed:
+    """Rides along in the type of a field: what a technician may write there."""
+
+    text: str
+
+
+class Table(BaseModel):
+    """A table of the hand file. The docstring of a key is its description in the JSON Schema."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
+
+
+def one_of(names: Any) -> Allowed:
+    """The values of a Literal, as a technician reads them."""
+    return Allowed(" or ".join(map(str, get_args(names))))
+
+
+def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
+    """``value`` below the folder of the hand file, where that is a file. Raises ValueError."""
+    if value is None:
+        return None
+    path = Path((info.context or {}).get("folder", Path()), value)
+    if not path.is_file():
+        raise ValueError(f"{what}; there is no file {path}")
+    return path
+
+
+Name = Annotated[str, Field(min_length=1, max_length=64), Allowed("a text of 1 to 64 characters")]
+Count = Annotated[int, Field(ge=1, le=254), Allowed("an integer from 1 to 254")]
+NodeId = Annotated[int, Field(ge=1, le=127), Allowed("an integer from 1 to 127")]
+Length = Annotated[
+    float, Field(ge=1e-6, le=1.0, allow_inf_nan=False), Allowed("a number of metres from 1e-6 to 1")
+]
+Ratio = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False), Allowed("a number from 0 to below 1")]
+Stiffness = Annotated[
+    float, Field(ge=1e-3, le=1e12, allow_inf_nan=False), Allowed("a number of N/m from 1e-3 to 1e12")
+]

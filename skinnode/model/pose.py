@@ -1,0 +1,82 @@
+"""Where a patch sits on the hand, and what it feels in the hand's frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float, PatchLayout
+
+UNIT_TOLERANCE: Final = 1e-3
+"""A quaternion that is further from length 1 is a mistake, not rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Position and orientation of a patch's frame (x along its upper wires, z out of the skin) in that of the
+    hand.
+
+    Args:
+        position_m: origin of the patch's frame, metres.
+        quaternion_xyzw: its orientation, real part last.
+
+    Raises ValueError for numbers that are not finite and a quaternion that is not of unit length.
+    """
+
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(part) for part in (*self.position_m, *self.quaternion_xyzw)):
+            raise ValueError(f"pose: got {self.position_m}, {self.quaternion_xyzw}, must be finite")
+        length = math.hypot(*self.quaternion_xyzw)
+        if abs(length - 1) > UNIT_TOLERANCE:
+            raise ValueError(f"quaternion_xyzw: got length {length:.4g}, must be 1")
+
+    @classmethod
+    def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
+        """Roll, pitch and yaw about the fixed axes x, y, z of the hand, in this order, radians (as URDF)."""
+        (sr, sp, sy), (cr, cp, cy) = (
+            tuple(function(angle / 2) for angle in rpy_rad) for function in (math.sin, math.cos)
+        )
+        return cls(
+            position_m,
+            (
+                sr * cp * cy - cr * sp * sy,
+                cr * sp * cy + sr * cp * sy,
+                cr * cp * sy - sr * sp * cy,
+                cr * cp * cy + sr * sp * sy,
+            ),
+        )
+
+    @property
+    def rotation(self) -> Float:
+        """(3, 3) matrix that turns vectors of the patch's frame into the hand's."""
+        x, y, z, w = np.array(self.quaternion_xyzw) / math.hypot(*self.quaternion_xyzw)
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    def vectors(self, of_patch: ArrayLike) -> Float:
+        """(..., 3) displacements, forces or normals of the patch's frame in the hand's."""
+        turned: Float = np.asarray(of_patch, np.float64) @ self.rotation.T
+        return turned
+
+    def points_m(self, of_patch_m: ArrayLike) -> Float:
+        """(..., 3) points of the patch's frame in the hand's, metres."""
+        points: Float = self.vectors(of_patch_m) + np.array(self.position_m)
+        return points
+
+
+def positions_in_hand_m(field: FieldFrame, layout: PatchLayout, pose: Pose) -> Float:
+    """(U, N, 3) where the electrodes of the upper wires are, in the frame of the hand, metres."""
+    return pose.points_m(layout.upper_m + field.displacement_m)

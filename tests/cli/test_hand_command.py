@@ -1,0 +1,135 @@
+"""``skinnode hand``: what an integrator sees before anything is on a bus."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from skinnode.cli.main import app
+from skinnode.errors import ConfigError
+from skinnode.model.config import HandConfig, load_hand, parse_hand
+from skinnode.model.config.schema import SCHEMA_FILE, schema_text
+from skinnode.wire.plan import check_plan
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
+
+
+def command(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["hand", *arguments])
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_every_example_is_a_plan_that_fits(path: Path) -> None:
+    found = command("check", str(path), "--json")
+    assert found.exit_code == 0, found.output
+    report = json.loads(found.stdout)
+    assert report["refused"] == []
+    hand = load_hand(path)
+    assert [bus["bus"] for bus in report["buses"]] == [bus.name for bus in hand.buses]
+    for bus in report["buses"]:
+        assert 0 < bus["typical_load"] < bus["load"] <= bus["max_load"]
+        assert all(
+            scan["paced_s"] < scan["sync_to_summary_s"] < bus["sync_period_s"] for scan in bus["scans"]
+        )
+        assert sum(frame["load"] for frame in bus["frames"]) == pytest.approx(bus["load"])
+
+
+def test_there_is_an_example_of_each_kind() -> None:
+    hands = [load_hand(path) for path in EXAMPLES]
+    assert any(len(hand.buses) == 2 and len(hand.patches) == 16 for hand in hands)
+    assert any(bus.role == "guest" for hand in hands for bus in hand.buses)
+    assert any(bus.fd for hand in hands for bus in hand.buses)
+
+
+def test_tables_for_a_person() -> None:
+    lines = command("check", str(next(path for path in EXAMPLES if path.stem == "hand"))).stdout.splitlines()
+    assert lines[0] == "example hand: 4 patches on 1 bus, a scan every 80 ms"
+    # 404 chunks and summaries of 135 bits and a SYNC of 65 in 80 ms, 4 heartbeats and EMCYs in 250, SDO 1 %
+    assert "load 69.6% at worst" in lines[2]
+    assert "of 70% allowed" in lines[2]
+    assert any(line.split()[:4] == ["palm", "14", "100", "59.4"] for line in lines)
+
+
+def overloaded(folder: Path) -> Path:
+    path = folder / "hand.toml"
+    patches = "".join(f'[[patches]]\nname = "p{i}"\nnode_id = {i}\n' for i in range(1, 6))
+    path.write_text(f'[[buses]]\nname = "can0"\n{patches}')
+    return path
+
+
+def test_too_much_for_a_bus_is_shown_and_refused(tmp_path: Path) -> None:
+    path = overloaded(tmp_path)
+    found = command("check", str(path))
+    assert found.exit_code == 1
+    assert "SYNC to summary" in found.stdout
+    assert found.stderr == (
+        f"error: {path}:1:1: buses[0] (can0): got a plan that needs 86.7% of 1000000 bit/s, "
+        "allowed: at most 70.0% (max_load); sync.period_ms = 100 or fewer patches would do\n"
+    )
+    as_json = command("check", str(path), "--json")
+    assert as_json.exit_code == 1
+    assert json.loads(as_json.stdout)["buses"][0]["shortest_period_ms"] == 100
+
+
+def test_a_scan_that_may_outlast_its_period_is_noted(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(
+        '[sync]\nperiod_ms = 3\n[[buses]]\nname = "can0"\nfd = true\n[[patches]]\nname = "p"\nnode_id = 1\n'
+    )
+    found = command("check", str(path))
+    assert found.exit_code == 0
+    assert "note: at worst a scan of p is not over when the next SYNC comes" in found.stdout
+
+
+def test_a_file_that_cannot_be_used(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text('[[buses]]\nname = "can0"\n[[patches]]\nname = "p"\nnode_id = 1\n  code_bit = 16\n')
+    error = command("check", str(path)).exception
+    assert isinstance(error, ConfigError)
+    assert str(error).startswith(
+        f"{path}:6:3: patches[0].code_bit: got 16, allowed: no such key (did you mean"
+    )
+
+
+@pytest.mark.parametrize("patches", [1, 4, 16, 127])
+def test_a_new_file_is_a_plan_that_fits(patches: int, tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(command("new", "--patches", str(patches)).stdout)
+    hand = load_hand(path)
+    assert len(hand.patches) == patches
+    (plan,) = check_plan(hand)
+    assert patches < 4 or plan.load > 0.6  # no slower than it has to be
+
+
+def test_comments_of_a_new_file_are_keys() -> None:
+    text = command("new", "--patches", "1").stdout
+    said = text.replace("# serial", "serial").replace("# link", "link").replace("# pose", "pose")
+    import tomllib
+
+    hand = parse_hand(tomllib.loads(said))
+    assert (hand.patches[0].serial, hand.patches[0].link) == (12345, "palm_link")
+
+
+def test_schema_is_the_one_that_is_shipped() -> None:
+    printed = command("schema").stdout
+    assert printed == schema_text()
+    assert json.loads(SCHEMA_FILE.read_text(encoding="utf-8")) == json.loads(printed), (
+        "python -m skinnode.model.config.schema writes it again"
+    )
+
+
+def test_every_key_is_described() -> None:
+    tables = json.loads(schema_text())
+    described: dict[str, Any] = {"HandConfig": tables, **tables["$defs"]}
+    bare = [
+        f"{name}.{key}"
+        for name, table in described.items()
+        for key, field in table["properties"].items()
+        if "description" not in field and "$ref" not in field
+    ]
+    assert bare == []
+    assert set(tables["properties"]) == set(HandConfig.model_fields)

@@ -22,7 +22,7 @@ from skinnode.host.bringup import NodeFacts
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
 from skinnode.host.workers import Inline, Workers
-from skinnode.model.config import PatchConfig, SolverConfig
+from skinnode.model.config import Partial, PatchConfig, SolverConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.solve.tracker import Tracker
@@ -90,12 +90,14 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LaneStats:
-    """What became of a patch's scans: those assembled = ``offered`` + ``withheld``, and ``offered`` =
-    ``solved`` + ``skipped`` + at most two in work."""
+    """What became of a patch's scans: those assembled = ``offered`` + ``withheld`` + ``partial``, and
+    ``offered`` = ``solved`` + ``skipped`` + at most two in work."""
 
     offered: int
     withheld: int
     """Came while the patch was being brought up or its baseline being read: nobody could decode them."""
+    partial: int
+    """Had chunks missing and were withheld, as ``stream.partial`` of the hand file wants it."""
     solved: int
     skipped: int
     """Overtaken by a newer scan before a worker was free."""
@@ -134,8 +136,9 @@ class Lane:
         publisher: Publisher,
         tick: Callable[[int], Tick | None],
         on_scan: Callable[[int], None],
+        partial: Partial = "pass",
     ) -> None:
-        self._patch = patch
+        self._patch, self._passes_partial = patch, partial == "pass"
         self._solver: Solver | None = None  # None: withhold
         self._assembler, self._workers, self._publisher = assembler, workers, publisher
         self._tick, self._on_scan = tick, on_scan
@@ -147,7 +150,7 @@ class Lane:
         """How often scans began to be withheld."""
         self.doubtful = False
         """A summary was lost, which may have said that the baseline changed."""
-        self._withheld = 0
+        self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
         self._newest = 0
 
@@ -230,7 +233,11 @@ class Lane:
             t_sync_ns=0 if tick is None else tick.t_ns,
             t_receive_ns=scan.t_last_ns,
         )
-        self._offered, self._newest = self._offered + 1, stamp.scan
+        self._newest = stamp.scan
+        if not (scan.complete or self._passes_partial):
+            self._partial += 1
+            return
+        self._offered += 1
         if stamp.scan in self._left_out:
             return
         with contextlib.suppress(IndexError):
@@ -286,6 +293,7 @@ class Lane:
         return LaneStats(
             offered=offered,
             withheld=self._withheld,
+            partial=self._partial,
             solved=self._solved,
             skipped=max(0, offered - waiting - self._taken),
             untrusted=self._untrusted,

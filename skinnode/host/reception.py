@@ -64,7 +64,7 @@ def receive_patch(
         node_id=patch.node_id,
         on_reject=dealer.reject,
     )
-    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, monitor.on_scan)
+    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, monitor.on_scan, hand.stream.partial)
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)

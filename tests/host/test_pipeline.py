@@ -121,6 +121,31 @@ def test_scan_number_and_time_are_those_of_the_sync(
         assert field.stamp.device_time_us == 1000 * field.stamp.counter
 
 
+def test_scan_with_a_chunk_missing_is_withheld_by_policy(
+    stub: Stub, publisher: Publisher, ticks: Ticks
+) -> None:
+    stub.go.set()
+    fields = publisher.subscribe(10, 10.0, None)
+    assembler = ScanAssembler(PROFILE, counter_overflow=240)
+    with Workers(1, "solve") as workers:
+        lane = Lane("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, "withhold")
+        lane.resume(stub, 0, anew=True)
+        chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
+        for chunk in chunks[1:]:
+            lane.on_chunk(chunk, 0)
+        lane.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
+        feed(lane, 2, 80 * MS)  # ends the torn one
+        lane.poll(80 * MS)
+        field = fields.get(10)
+        assert field is not None
+        assert field.stamp is not None
+        assert field.stamp.counter == 2
+        stats = lane.stats()
+        assert (stats.partial, stats.offered, stats.withheld) == (1, 1, 0)
+        assert stats.assembler.scans_torn == 1
+        lane.close()
+
+
 def test_scan_with_a_chunk_missing_goes_on_with_a_mask(lane: Lane, stub: Stub, publisher: Publisher) -> None:
     stub.go.set()
     chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)

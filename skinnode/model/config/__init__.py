@@ -23,7 +23,7 @@ from skinnode.model.config.patches import (
     PoseConfig,
     load_layout,
 )
-from skinnode.model.config.running import SolverConfig, StreamConfig
+from skinnode.model.config.running import Partial, SolverConfig, StreamConfig
 from skinnode.model.config.simulation import SimulationConfig
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "LayoutConfig",
     "Missing",
     "OtherFrame",
+    "Partial",
     "PatchConfig",
     "PoseConfig",
     "SimulationConfig",

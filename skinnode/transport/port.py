@@ -9,6 +9,7 @@ late.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import socket
@@ -43,6 +44,9 @@ _IPV6_MULTICAST_ALL: Final = 29
 _OLDEST_STAMP_S: Final = 10.0
 """A stamp older than this, or of the future, is not of this machine's wall clock: the time of reading
 counts."""
+
+_LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+"""The kernel tells a socket once that its interface went down; a sender may be the one to hear it."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
@@ -91,6 +95,7 @@ class CanPort:
         self._where = f"{config.name}: interface {config.interface!r}, channel {config.channel!r}"
         self._longest = 64 if config.fd else 8
         self._closed = False
+        self._link_gone: Exception | None = None
         self._counting = threading.Lock()  # sent is counted by several threads; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
         self._dropped_before = 0  # by readers before the present one
@@ -192,6 +197,8 @@ class CanPort:
             if self._closed or self._away or self.config.interface != _VIRTUAL:
                 with self._counting:
                     self._errors += 1
+                    if getattr(error, "error_code", None) in _LINK_GONE:
+                        self._link_gone = error
                 raise BusError(f"{self._where}: 0x{can_id:03X} not sent ({_why(error)})") from error
             undelivered = 1
         with self._counting:
@@ -215,6 +222,9 @@ class CanPort:
             self._errors += 1
             raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
         self._received += len(frames)
+        if not frames and self._link_gone is not None:
+            self._errors += 1
+            raise BusError(f"{self._where}: does not receive ({_why(self._link_gone)})") from self._link_gone
         return frames
 
     def _recv_message(self, timeout_s: float) -> list[Frame]:
@@ -243,6 +253,7 @@ class CanPort:
             self._away = True
             self._dropped_before, self._reader = self.dropped, None
             self._bus.shutdown()
+        self._link_gone = None
         self._bus = self._open()
         self._reader = self._socket_reader() if self.config.interface == _SOCKETCAN else None
         self._away = False

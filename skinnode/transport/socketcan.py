@@ -59,6 +59,7 @@ class SocketReader:
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
         """Frames that the kernel had no room for in the socket's buffer."""
+        self._failure: OSError | None = None
         self.hardware_stamps = False
         """Whether the newest frame bore one."""
         self._delay = HardwareDelay()
@@ -71,6 +72,9 @@ class SocketReader:
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
         """Frames that wait, at most ``most``; waits up to ``timeout_s`` for the first. Raises OSError if the
         interface fails."""
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
         if not self._poll.poll(max(0, round(timeout_s * 1e3))):
             return []
         frames: list[Frame] = []
@@ -94,6 +98,10 @@ class SocketReader:
                     frames.append(Frame(word, raw[8 : 8 + length], t_ns))
         except BlockingIOError:
             pass
+        except OSError as error:
+            if not frames:
+                raise
+            self._failure = error  # the kernel tells once; the frames that came before it come first
         return frames
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int, wall_to_mono_ns: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import socket
+import subprocess
 import time
 
 import pytest
@@ -99,3 +100,18 @@ def test_a_controller_whose_clock_starts_anew_is_followed() -> None:
     assert delay.arrival_ns(60_000 * MS, 1_000 * MS) == 1_000 * MS
     assert delay.arrival_ns(0, 1_010 * MS) == 1_010 * MS
     assert delay.arrival_ns(5 * MS, 1_016 * MS) == pytest.approx(1_015 * MS, abs=2_000)
+
+
+@pytest.mark.vcan
+def test_a_link_that_goes_down_is_told_to_the_reader_though_a_sender_heard_it_first() -> None:
+    with CanPort(VCAN) as ours, CanPort(VCAN) as theirs:
+        theirs.send(1, b"before")
+        subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+        try:
+            with pytest.raises(BusError, match="0x002 not sent"):
+                ours.send(2, b"")
+            assert [frame.data for frame in ours.recv_batch(0.05)] == [b"before"]
+            with pytest.raises(BusError, match="does not receive"):
+                ours.recv_batch(0.05)
+        finally:
+            subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)

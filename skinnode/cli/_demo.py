@@ -286,6 +286,8 @@ def _ended_by_sigterm() -> Iterator[None]:
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
     assert frame.stamp is not None  # the host stamps every field
+    if frame.stamp.device_time_us == 0:  # its summary was lost: nobody knows which truth it is to be held to
+        return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
     watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
 

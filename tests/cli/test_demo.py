@@ -86,8 +86,9 @@ def test_an_error_above_its_uncertainty_is_a_fault(monkeypatch: pytest.MonkeyPat
         source.fault = drift
 
     monkeypatch.setattr(Fleet, "__init__", with_drift)
-    report = _demo.play(demo_hand(1, 1), 1.0, quiet()).report
-    assert any("palm: error" in fault for fault in report.faults)
+    report = _demo.play(demo_hand(1, 1), 2.0, quiet()).report
+    # Where no scan came before it, the solver finds that no deformation explains any of them.
+    assert report.faults[0].startswith(("palm: error", "palm: no scan solved")), report
 
 
 def test_the_view_shows_names_health_and_losses_in_80_columns() -> None:

@@ -29,6 +29,13 @@ class FaultyPort:
         self._port, self._alter, self._hear = port, alter, hear
         self.config = port.config
 
+    @property
+    def sent(self) -> int:
+        return self._port.sent
+
+    def reopen(self) -> None:
+        self._port.reopen()
+
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         altered = self._alter(can_id, data)
         for payload in altered if isinstance(altered, list) else [altered]:

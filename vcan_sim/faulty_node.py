@@ -272,9 +272,10 @@ class FaultyNode(PatchNode):
         self._emit(can_id, data, remote=remote)
         is_pdo = can_id in (self._chunk_id, self._summary_id) and not remote
         self.injected.pdos += is_pdo
-        if self._late and is_pdo and self._counter != self._late[0][0]:
-            late, self._late = self._late, []
-            for _, chunk in late:
+        if self._late and is_pdo:
+            due = [chunk for counter, chunk in self._late if counter != self._counter]
+            self._late = [(counter, chunk) for counter, chunk in self._late if counter == self._counter]
+            for chunk in due:
                 self._pass(self._chunk_id, chunk)
         return True
 

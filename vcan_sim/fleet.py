@@ -34,6 +34,8 @@ class NodeReport:
     """Those of the frames that carried process data: chunks and summaries."""
     scans_sent: int
     """Scans sent to their end."""
+    overruns: int
+    """Scans skipped because two others were still to be sent, as on a machine too busy for its nodes."""
 
 
 class Fleet:
@@ -213,5 +215,5 @@ class _Station:
     def report(self) -> NodeReport:
         node, config = self._node, self._config
         state = NmtState.INITIALISING if node is None else node.nmt_state
-        scans = 0 if node is None else node.scans_sent
-        return NodeReport(config.name, config.node_id, state, self._frames, self._pdos, scans)
+        scans, overruns = (0, 0) if node is None else (node.scans_sent, node.overruns)
+        return NodeReport(config.name, config.node_id, state, self._frames, self._pdos, scans, overruns)

@@ -14,6 +14,7 @@ from typing import Final
 from skinnode.errors import CodecError
 from skinnode.model.config import BusConfig
 from skinnode.transport import Frame
+from skinnode.transport.bus_state import BusState, bus_state
 from skinnode.wire.timing import BusLoad
 
 _log = logging.getLogger(__name__)
@@ -36,7 +37,19 @@ class BusStats:
     foreign: int
     """Data frames of a COB-ID that the hand file does not explain."""
     ignored: int
-    """Remote, error and extended frames; on a bus without ``fd`` also CAN FD frames."""
+    """Remote and extended frames; on a bus without ``fd`` also CAN FD frames."""
+    error_frames: int
+    """What the interface says of errors on the bus, and of its controller's state."""
+    bus_offs: int
+    """Times it said that the controller went off the bus."""
+    foreign_ids: Mapping[int, int]
+    """How many frames of each foreign COB-ID."""
+    read: int
+    """Frames of all kinds read off the interface."""
+    waiting: int
+    """Frames of those that nobody has looked at yet."""
+    kernel_dropped: int
+    """Frames that the kernel had no room for; 0 where the interface does not tell."""
     dropped: int
     """Frames that found the receive queue full."""
     malformed: int
@@ -61,6 +74,9 @@ class Dealer:
         self._listeners: tuple[Callable[[Sequence[Frame]], None], ...] = ()
         self._complained: set[int] = set()
         self._foreign = self._ignored = self._malformed = self._received = 0
+        self._error_frames = self._bus_offs = 0
+        self._foreign_ids: dict[int, int] = {}
+        self._bus_state: BusState | None = None
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._marks: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=_MARKS)
@@ -90,13 +106,17 @@ class Dealer:
                 listener(batch)
         for frame in batch:
             if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
-                self._ignored += 1
+                if frame.error:
+                    self._on_error_frame(frame)
+                else:
+                    self._ignored += 1
                 continue
             self._received += 1
             self._meter.add(frame.can_id, frame.data, fd=frame.fd)
             handler = self._handlers.get(frame.can_id)
             if handler is None:
                 self._foreign += 1
+                self._foreign_ids[frame.can_id] = self._foreign_ids.get(frame.can_id, 0) + 1
                 continue
             handler(frame.data, frame.t_ns)
 
@@ -116,19 +136,42 @@ class Dealer:
             self._complained.add(error.cob_id)
             _log.warning("%s: %s; rejected, as are others like it", self.config.name, error)
 
-    def count(self, *, sent: int = 0, dropped: int = 0, outages: int = 0) -> BusStats:
+    def count(
+        self,
+        *,
+        sent: int = 0,
+        dropped: int = 0,
+        outages: int = 0,
+        read: int | None = None,
+        waiting: int = 0,
+        kernel_dropped: int = 0,
+    ) -> BusStats:
         """All counters; the arguments are those of whoever feeds the dealer. From any thread."""
         return BusStats(
             received=self._received,
             sent=sent,
             foreign=self._foreign,
             ignored=self._ignored,
+            error_frames=self._error_frames,
+            bus_offs=self._bus_offs,
+            foreign_ids=dict(self._foreign_ids),
+            read=self._received + self._ignored + self._error_frames if read is None else read,
+            waiting=waiting,
+            kernel_dropped=kernel_dropped,
             dropped=dropped,
             outages=outages,
             malformed=self._malformed,
             bits=self._marks[-1][1],
             load=self._load,
         )
+
+    def _on_error_frame(self, frame: Frame) -> None:
+        self._error_frames += 1
+        if self.config.interface == "socketcan":  # others put other things into them
+            state, before = bus_state(frame), self._bus_state
+            if state is not None:
+                self._bus_state = state
+                self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
         """Work out the bits so far; the meter has one owner, so nobody else may ask it."""

@@ -15,7 +15,8 @@ from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
 from skinnode.host.bringup import check_eds, load_baseline
 from skinnode.host.dealer import BusStats
-from skinnode.host.health import PatchHealth
+from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthWatch
+from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.pipeline import Lane, LaneStats, check_solvable
@@ -92,8 +93,10 @@ class Host:
         sync: SyncProducer | None,
         supervisor: Supervisor,
         publisher: Publisher,
+        events: Events,
     ) -> None:
         self.hand = hand
+        self._events = events
         self._buses = buses
         self._stations = {station.patch.name: station for station in stations}
         self._sync, self._supervisor, self._publisher = sync, supervisor, publisher
@@ -214,7 +217,11 @@ class Host:
                 stack.callback(_let_scans_end, lanes, ticks, hand.sync.period_s, publisher)
                 senders = [link.send for link in own]
                 sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
-            yield cls(hand, buses, stations, sync, supervisor, publisher)
+            events = Events()
+            host = cls(hand, buses, stations, sync, supervisor, publisher, events)
+            stack.callback(events.end)
+            stack.enter_context(HealthWatch(host._all_health, host._all_bus_health, events))
+            yield host
 
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
@@ -234,7 +241,42 @@ class Host:
     def health(self, patch: str) -> PatchHealth:
         """How a patch is. Raises KeyError for no such patch."""
         station = self._stations[patch]
-        return station.monitor.health(time.monotonic_ns(), station.heartbeat_s, self.hand.sync.period_s)
+        return station.monitor.health(
+            time.monotonic_ns(),
+            station.heartbeat_s,
+            self.hand.sync.period_s,
+            station.lane.stats().assembler.conflicts,
+        )
+
+    def bus_health(self, bus: str) -> BusHealth:
+        """How a bus is. Raises KeyError for no such bus, and for one without patches."""
+        link, rivals = self._buses[bus].link, self._buses[bus].rivals.stats()
+        stats, failure = link.stats(), link.failure
+        return BusHealth(
+            bus=bus,
+            away=None if failure is None else str(failure),
+            load=stats.load,
+            error_frames=stats.error_frames,
+            bus_offs=stats.bus_offs,
+            outages=stats.outages,
+            kernel_dropped=stats.kernel_dropped,
+            dropped=stats.dropped,
+            malformed=stats.malformed,
+            foreign=stats.foreign,
+            foreign_ids=tuple(sorted(stats.foreign_ids)),
+            other_syncs=rivals.syncs,
+            other_masters=rivals.nmt_commands + rivals.sdo_requests + rivals.heartbeats,
+        )
+
+    def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
+        """What happens to the health of patches, wires and buses from now until the host closes."""
+        return self._events.subscribe(capacity)
+
+    def _all_health(self) -> dict[str, PatchHealth]:
+        return {patch: self.health(patch) for patch in self._stations}
+
+    def _all_bus_health(self) -> dict[str, BusHealth]:
+        return {bus: self.bus_health(bus) for bus in self._buses}
 
     def tap(self, tap: HostTap) -> None:
         """Let ``tap`` write down what passes, from now until the host closes."""

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import enum
 import logging
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import CodecError
+from skinnode.host.code_watch import CodeWatch, WireFault
 from skinnode.wire.indices import emcy_cob_id, heartbeat_cob_id
 
 _log = logging.getLogger(__name__)
@@ -32,6 +34,15 @@ SCANS_MISSED: Final = 3
 RESTART_MEMORY_NS: Final = 5_000_000_000
 """How long a boot-up that nobody asked for is remembered as a restart."""
 
+LOOP_RESTARTS: Final = 3
+LOOP_NS: Final = 10_000_000_000
+"""A node that restarted by itself this often within this time does so in a loop."""
+
+BEATS: Final = 12
+BEATS_TOO_OFTEN: Final = 0.7
+"""Two nodes with one node-ID send a heartbeat every half period on average; over a dozen, a single one that
+was held up and makes up for it does not come near."""
+
 
 class Condition(enum.StrEnum):
     """The one word for a patch."""
@@ -44,6 +55,8 @@ class Condition(enum.StrEnum):
     """Operational by its heartbeat, but no scan comes."""
     RESTARTING = "restarting"
     """Booted a moment ago without being asked to."""
+    FROZEN = "frozen"
+    """Scans come, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
     """Its error register is not zero."""
     REFUSED = "refused"
@@ -73,15 +86,55 @@ class PatchHealth:
     """Times the node came back and was brought up again since the host started."""
     refusal: str | None = None
     """Why a node that answers is not taken up: another identity or layout, a configuration not kept."""
+    restarts_in_a_loop: bool = False
+    """It restarted by itself three times within ten seconds, and goes on."""
+    duplicate_id: bool = False
+    """Heartbeats come more often than one node sends them."""
+    conflicts: int = 0
+    """Frames that contradict others of their scan: a node that counts wrongly, or two with one node-ID."""
+    wires: tuple[WireFault, ...] = ()
+    """Wires that are open, shorted, noisy or drifting."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusHealth:
+    """Health of a bus at one instant; counts are since the host started."""
+
+    bus: str
+    away: str | None
+    """Why the interface is away; None while it is there."""
+    load: float
+    """Share of the last second that frames took."""
+    error_frames: int
+    bus_offs: int
+    outages: int
+    kernel_dropped: int
+    dropped: int
+    """Frames that found the host's own queue full."""
+    malformed: int
+    foreign: int
+    """Frames of COB-IDs that the hand file does not explain: those of ``foreign_ids``."""
+    foreign_ids: tuple[int, ...]
+    other_syncs: int
+    """SYNC of another producer, where the host is the master."""
+    other_masters: int
+    """NMT commands, SDO requests to our nodes, or our own heartbeat, from somebody else."""
 
 
 class NodeMonitor:
     """Facts about one node, written by the mainline only."""
 
     def __init__(
-        self, patch: str, node_id: int, on_reject: Callable[[CodecError], None] = lambda error: None
+        self,
+        patch: str,
+        node_id: int,
+        on_reject: Callable[[CodecError], None] = lambda error: None,
+        watch: CodeWatch | None = None,
     ) -> None:
         self.patch, self.node_id = patch, node_id
+        self._watch = watch
+        self._beats: deque[int] = deque(maxlen=BEATS)
+        self._restarts: deque[int] = deque(maxlen=LOOP_RESTARTS)
         self.on_reject = on_reject
         """Told of each heartbeat and EMCY of a length that they do not have."""
         self.nmt_state: int | None = None
@@ -121,7 +174,10 @@ class NodeMonitor:
             self._boot_ups += 1
             if self.running:
                 self._t_restart_ns = t_ns
+                self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
+        else:
+            self._beats.append(t_ns)
         self.nmt_state = state
         self._t_heartbeat_ns = t_ns
 
@@ -144,7 +200,7 @@ class NodeMonitor:
     def on_scan(self, t_ns: int) -> None:
         self._t_scan_ns = t_ns
 
-    def health(self, now_ns: int, heartbeat_s: float, scan_s: float) -> PatchHealth:
+    def health(self, now_ns: int, heartbeat_s: float, scan_s: float, conflicts: int = 0) -> PatchHealth:
         """The conclusion at ``now_ns``, for a node that sends a heartbeat and a scan this often."""
 
         def age_s(t_ns: int | None) -> float | None:
@@ -159,7 +215,9 @@ class NodeMonitor:
             restarted=restart_age_s is not None and restart_age_s < RESTART_MEMORY_NS * 1e-9,
             error_register=self._error_register,
             refused=self.refusal is not None,
+            frozen=self._watch is not None and self._watch.frozen,
         )
+        lately = restart_age_s is not None and restart_age_s < RESTART_MEMORY_NS * 1e-9
         return PatchHealth(
             patch=self.patch,
             node_id=self.node_id,
@@ -173,7 +231,22 @@ class NodeMonitor:
             error_register=self._error_register,
             rejoins=self.rejoins,
             refusal=self.refusal,
+            restarts_in_a_loop=lately and self._in_a_loop(),
+            duplicate_id=self._beats_too_often(now_ns, heartbeat_s),
+            conflicts=conflicts,
+            wires=() if self._watch is None else self._watch.wires,
         )
+
+    def _in_a_loop(self) -> bool:
+        restarts = list(self._restarts)
+        return len(restarts) == LOOP_RESTARTS and restarts[-1] - restarts[0] < LOOP_NS
+
+    def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
+        """Two nodes send twice as many heartbeats as one."""
+        beats, period_ns = list(self._beats), heartbeat_s * 1e9
+        if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
+            return False
+        return beats[-1] - beats[0] < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns
 
 
 def judge(
@@ -184,6 +257,7 @@ def judge(
     restarted: bool,
     error_register: int,
     refused: bool = False,
+    frozen: bool = False,
 ) -> Condition:
     """The worst that the facts say. Ages are in periods, None for never."""
     if refused:
@@ -200,4 +274,6 @@ def judge(
         return Condition.FAULTY
     if late_scans is None or late_scans > SCANS_MISSED:
         return Condition.STALE
+    if frozen:
+        return Condition.FROZEN
     return Condition.OPERATIONAL

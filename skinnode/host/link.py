@@ -101,6 +101,9 @@ class BusLink(Dealer):
             sent=self._port.sent,
             dropped=self._dropped_before + self._receiver.dropped,
             outages=self._outages,
+            read=self._port.received,
+            waiting=self._receiver.queued,
+            kernel_dropped=self._port.dropped,
         )
 
     def stop(self) -> None:

@@ -93,6 +93,8 @@ class LaneStats:
     """What became of a patch's scans: those assembled = ``offered`` + ``withheld`` + ``partial``, and
     ``offered`` = ``solved`` + ``skipped`` + at most two in work."""
 
+    frames: int
+    """Chunks and summaries handed to the lane, whatever became of them."""
     offered: int
     withheld: int
     """Came while the patch was being brought up or its baseline being read: nobody could decode them."""
@@ -135,7 +137,7 @@ class Lane:
         workers: Workers | Inline,
         publisher: Publisher,
         tick: Callable[[int], Tick | None],
-        on_scan: Callable[[int], None],
+        on_scan: Callable[[Scan], None],
         partial: Partial = "pass",
     ) -> None:
         self._patch, self._passes_partial = patch, partial == "pass"
@@ -150,7 +152,7 @@ class Lane:
         """How often scans began to be withheld."""
         self.doubtful = False
         """A summary was lost, which may have said that the baseline changed."""
-        self._withheld = self._partial = 0
+        self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
         self._newest = 0
 
@@ -158,12 +160,14 @@ class Lane:
 
     def on_chunk(self, data: bytes, t_ns: int) -> None:
         """TPDO1."""
+        self._frames += 1
         scan = self._assembler.on_chunk(data, t_ns)
         if scan is not None:
             self._offer(scan)
 
     def on_summary(self, data: bytes, t_ns: int) -> None:
         """TPDO2."""
+        self._frames += 1
         scan = self._assembler.on_summary(data, t_ns)
         if scan is not None:
             self._offer(scan)
@@ -215,7 +219,7 @@ class Lane:
         self._box.clear()
 
     def _offer(self, scan: Scan) -> None:
-        self._on_scan(scan.t_last_ns)
+        self._on_scan(scan)
         if scan.flags & SummaryFlag.BASELINE_CHANGED:  # this scan is the first with the new one
             self.withhold()
         elif scan.device_time_us is None:
@@ -291,6 +295,7 @@ class Lane:
         """Counters. Read in this order, no scan counts as skipped that may still be solved."""
         offered, waiting = self._offered, len(self._box)
         return LaneStats(
+            frames=self._frames,
             offered=offered,
             withheld=self._withheld,
             partial=self._partial,

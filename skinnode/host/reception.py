@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from skinnode.host.code_watch import CodeWatch
 from skinnode.host.dealer import Dealer
 from skinnode.host.health import BOOT_UP, NodeMonitor
 from skinnode.host.pipeline import Lane
@@ -14,7 +15,8 @@ from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline, Workers
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.wire import indices as od
-from skinnode.wire.assembler import ScanAssembler
+from skinnode.wire.assembler import Scan, ScanAssembler
+from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile
 
 
@@ -56,7 +58,13 @@ def receive_patch(
 ) -> PatchReception:
     """From now on frames of the patch go to its monitor and its lane, which withholds scans until it is told
     how to decode them: a node that an earlier host left operational may be sending already."""
-    monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject)
+    watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
+    monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject, watch)
+
+    def on_scan(scan: Scan) -> None:
+        monitor.on_scan(scan.t_last_ns)
+        watch.on_scan(scan)
+
     assembler = ScanAssembler(
         PatchProfile.from_config(patch, dealer.config),
         counter_overflow=ticks.counter_overflow,
@@ -64,7 +72,7 @@ def receive_patch(
         node_id=patch.node_id,
         on_reject=dealer.reject,
     )
-    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, monitor.on_scan, hand.stream.partial)
+    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial)
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)

@@ -32,7 +32,7 @@ interface = "{interface}"
 channel = "{channel}"
 
 [sync]
-period_ms = 40
+period_ms = 200
 
 [[patches]]
 name = "thumb"
@@ -143,6 +143,19 @@ def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -
         assert (status, errors) == (0, "")
 
 
+def test_host_that_is_killed_is_followed_by_another(shared: tuple[Path, BusConfig]) -> None:
+    """The nodes go on without it; the next one takes them up."""
+    path, bus = shared
+    with process([*SIMULATOR, str(path)]):
+        with process([*HOST, str(path)]) as killed:
+            assert killed.says("thumb operational")
+            killed.end(signal.SIGKILL)
+        assert heartbeats(bus) == {11: 5, 12: 5}
+        with process([*HOST, str(path), "--json"]) as host:
+            assert eventually(lambda: sum('"elapsed_s"' in line for line in host.lines) >= 2, PATIENCE_S)
+            assert host.end(signal.SIGINT) == (0, "")
+
+
 def test_interrupted_while_it_waits_for_nodes(shared: tuple[Path, BusConfig]) -> None:
     path, bus = shared
     with CanPort(bus) as listener, process([*HOST, str(path)]) as host:
@@ -224,21 +237,21 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
             "allowed: the path of an EDS file; there is no file {folder}/none.eds",
         ),
         (
-            "period_ms = 40",
-            "periode_ms = 40",
-            ":8:1: sync.periode_ms: got 40, allowed: no such key (did you mean period_ms?); "
+            "period_ms = 200",
+            "periode_ms = 200",
+            ":8:1: sync.periode_ms: got 200, allowed: no such key (did you mean period_ms?); "
             "the keys here are period_ms, counter_overflow",
         ),
         (
-            "period_ms = 40",
-            "period_ms 40",
-            ": line 8, column 11: got 'period_ms 40', "
+            "period_ms = 200",
+            "period_ms 200",
+            ": line 8, column 11: got 'period_ms 200', "
             "allowed: TOML (Expected '=' after a key in a key/value pair)",
         ),
         (
-            "period_ms = 40",
-            'period_ms = "40"',
-            ":8:1: sync.period_ms: got '40', allowed: an integer from 1 to 60000",
+            "period_ms = 200",
+            'period_ms = "200"',
+            ":8:1: sync.period_ms: got '200', allowed: an integer from 1 to 60000",
         ),
     ],
 )

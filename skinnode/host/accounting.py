@@ -1,0 +1,74 @@
+"""The sums that must agree, bus by bus and patch by patch: what came in is what went on, or is counted as
+lost. Of a host that runs, numbers are read one after the other, so ask when it has closed or stands still."""
+
+from __future__ import annotations
+
+from skinnode.host.dealer import BusStats
+from skinnode.host.facade import HostStats
+from skinnode.host.pipeline import LaneStats
+from skinnode.wire.assembler import AssemblerStats
+
+
+def discrepancies(stats: HostStats) -> list[str]:
+    """What does not add up, a line each; empty where all sums agree.
+
+    ===========  ==========================================================================================
+    of a bus     frames read = received + ignored + error frames + dropped + waiting
+    of a bus     received = foreign + handled, the PDOs of its patches among the handled
+    of a bus     malformed = those of wrong length of its patches, and of SDO, heartbeat and EMCY
+    of a patch   frames = accepted + duplicates + conflicts + late + of wrong length, index, counter
+    of a patch   scans assembled, complete or torn = offered + withheld + partial
+    of a patch   offered = solved + skipped
+    ===========  ==========================================================================================
+    """
+    found: list[str] = []
+    for name, bus in stats.buses.items():
+        found += [f"{name}: {text}" for text in _of_bus(bus)]
+    for name, lane in stats.patches.items():
+        found += [f"{name}: {text}" for text in _of_lane(lane)]
+    handled = sum(bus.received - bus.foreign for bus in stats.buses.values())
+    pdos = sum(lane.frames for lane in stats.patches.values())
+    if pdos > handled:
+        found.append(f"got {pdos} PDOs, must be at most the {handled} frames that were handled")
+    rejected = sum(lane.assembler.bad_length for lane in stats.patches.values())
+    malformed = sum(bus.malformed for bus in stats.buses.values())
+    if rejected > malformed:
+        found.append(f"got {rejected} PDOs of wrong length, must be at most the {malformed} malformed frames")
+    return found
+
+
+def frames_counted(assembler: AssemblerStats) -> int:
+    """Chunks and summaries of which the assembler says what became of them."""
+    return (
+        assembler.chunks_accepted
+        + assembler.summaries_accepted
+        + assembler.duplicates
+        + assembler.conflicts
+        + assembler.late
+        + assembler.bad_length
+        + assembler.bad_index
+        + assembler.bad_counter
+    )
+
+
+def _of_bus(bus: BusStats) -> list[str]:
+    told = bus.received + bus.ignored + bus.error_frames + bus.dropped + bus.waiting
+    return _unless_equal("frames read", bus.read, "those told of", told)
+
+
+def _of_lane(lane: LaneStats) -> list[str]:
+    assembler = lane.assembler
+    return [
+        *_unless_equal("frames", lane.frames, "those told of", frames_counted(assembler)),
+        *_unless_equal(
+            "scans offered or withheld",
+            lane.offered + lane.withheld + lane.partial,
+            "those assembled",
+            assembler.scans_complete + assembler.scans_torn,
+        ),
+        *_unless_equal("scans offered", lane.offered, "those solved or skipped", lane.solved + lane.skipped),
+    ]
+
+
+def _unless_equal(what: str, got: int, other: str, must: int) -> list[str]:
+    return [] if got == must else [f"{what}: got {got}, must be the {must} of {other}"]

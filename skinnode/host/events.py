@@ -1,0 +1,202 @@
+"""What happens to the health of a hand, as it happens: events for who subscribes, and lines in the log."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.host.health import BusHealth, Condition, PatchHealth
+
+_log = logging.getLogger(__name__)
+
+CAPACITY_EVENTS: Final = 1024
+"""Events that a subscriber may lag behind before it loses the oldest."""
+
+_LOOK_S: Final = 0.05
+"""How often the watch looks: what is over sooner shows in counters alone."""
+
+_QUIET_NS: Final = 1_000_000_000
+"""A counter that keeps growing is told of this often."""
+
+
+@dataclass(frozen=True, slots=True)
+class HealthEvent:
+    """Something changed. ``subject`` is the name of a patch or of a bus, ``what`` the new condition, or the
+    counter of :class:`PatchHealth` or :class:`BusHealth` that grew."""
+
+    t_ns: int
+    """Monotonic."""
+    subject: str
+    what: str
+    text: str
+    """For people, without the subject."""
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.text}"
+
+
+class EventSubscription:
+    """The events of a running host from now on. A full queue loses its oldest; ``dropped`` counts. Iterate
+    over it until the host closes, or ask with :meth:`get`."""
+
+    def __init__(self, capacity: int) -> None:
+        self._queue: queue.SimpleQueue[HealthEvent | None] = queue.SimpleQueue()
+        self._capacity = capacity
+        self.dropped = 0
+
+    def get(self, timeout_s: float | None = None) -> HealthEvent | None:
+        """The next event, or None after ``timeout_s``, or None at once when the host has closed."""
+        try:
+            event = self._queue.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        if event is None:
+            self._queue.put(None)  # the next one to ask hears it too
+        return event
+
+    def __iter__(self) -> Iterator[HealthEvent]:
+        while (event := self.get()) is not None:
+            yield event
+
+    def _offer(self, event: HealthEvent | None) -> None:
+        while self._queue.qsize() >= self._capacity:
+            try:
+                self._queue.get_nowait()
+            except queue.Empty:  # the reader was faster
+                break
+            self.dropped += 1
+        self._queue.put(event)
+
+
+class Events:
+    """All subscriptions to events. One thread tells, any thread subscribes."""
+
+    def __init__(self) -> None:
+        self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
+        self._lock = threading.Lock()  # a set changes size while it is iterated over
+        self._ended = False
+
+    def subscribe(self, capacity: int) -> EventSubscription:
+        """Raises ValueError for a capacity below 1."""
+        if capacity < 1:
+            raise ValueError(f"capacity: got {capacity}, must be at least 1")
+        subscription = EventSubscription(capacity)
+        with self._lock:
+            self._subscriptions.add(subscription)
+            if self._ended:
+                subscription._offer(None)
+        return subscription
+
+    def tell(self, event: HealthEvent) -> None:
+        """To all, and to the log."""
+        _log.info("%s", event)
+        self._offer(event)
+
+    def end(self) -> None:
+        """The host has closed."""
+        self._ended = True
+        self._offer(None)
+
+    def _offer(self, event: HealthEvent | None) -> None:
+        with self._lock:
+            for subscription in list(self._subscriptions):
+                subscription._offer(event)
+
+
+_PATCH_COUNTERS: Final = ("boot_ups", "emergencies", "rejoins", "conflicts")
+_BUS_COUNTERS: Final = (
+    "bus_offs",
+    "error_frames",
+    "foreign",
+    "kernel_dropped",
+    "dropped",
+    "malformed",
+    "outages",
+    "other_syncs",
+    "other_masters",
+)
+
+
+class HealthWatch:
+    """Looks at the health of all patches and buses, on a thread of its own from construction to
+    :meth:`close`, and tells what changed."""
+
+    def __init__(
+        self,
+        patches: Callable[[], Mapping[str, PatchHealth]],
+        buses: Callable[[], Mapping[str, BusHealth]],
+        events: Events,
+    ) -> None:
+        self._patches, self._buses, self._events = patches, buses, events
+        self._patch_before, self._bus_before = dict(patches()), dict(buses())
+        self._told: dict[tuple[str, str], tuple[int, int]] = {}  # when, and how many
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End and join the thread, after a last look."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        while not self._stop.wait(_LOOK_S):
+            self._look()
+        self._look()
+
+    def _look(self) -> None:
+        for name, health in self._patches().items():
+            before, self._patch_before[name] = self._patch_before[name], health
+            self._compare_patch(name, before, health)
+        for name, bus in self._buses().items():
+            bus_before, self._bus_before[name] = self._bus_before[name], bus
+            if bus.away != bus_before.away:
+                self._tell(name, "away" if bus.away else "back", bus.away or "the bus is back")
+            self._compare_counters(name, bus_before, bus, _BUS_COUNTERS)
+
+    def _compare_patch(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
+        if now.condition is not before.condition:
+            why = f" ({now.refusal})" if now.condition is Condition.REFUSED else ""
+            self._tell(name, now.condition.value, f"{before.condition}, now {now.condition}{why}")
+        if now.restarts_in_a_loop and not before.restarts_in_a_loop:
+            self._tell(name, "restarts in a loop", "restarts in a loop: supply, or watchdog?")
+        if now.duplicate_id and not before.duplicate_id:
+            self._tell(name, "duplicate node-ID", f"two nodes have node-ID {now.node_id}")
+        for fault in sorted({*now.wires} - {*before.wires}):
+            self._tell(name, fault.state.value, f"{fault.side} wire {fault.number} is {fault.state}")
+        for fault in sorted({*before.wires} - {*now.wires}):
+            self._tell(name, "well", f"{fault.side} wire {fault.number} is not {fault.state} any more")
+        self._compare_counters(name, before, now, _PATCH_COUNTERS)
+
+    def _compare_counters(self, name: str, before: object, now: object, counters: tuple[str, ...]) -> None:
+        for counter in counters:
+            then, count = getattr(before, counter), getattr(now, counter)
+            when_ns, told = self._told.get((name, counter), (0, then))
+            t_ns = time.monotonic_ns()
+            if count > told and t_ns - when_ns > _QUIET_NS:
+                self._told[name, counter] = t_ns, count
+                words = counter.replace("_", " ")
+                detail = ""
+                if isinstance(now, BusHealth) and counter == "foreign":
+                    detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
+                elif isinstance(now, PatchHealth) and counter == "emergencies":
+                    detail = f", last 0x{now.last_emergency or 0:04X}"
+                self._tell(name, counter, f"{count - told} {words}{detail}")
+
+    def _tell(self, subject: str, what: str, text: str) -> None:
+        self._events.tell(HealthEvent(time.monotonic_ns(), subject, what, text))

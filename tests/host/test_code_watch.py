@@ -1,0 +1,131 @@
+"""Frozen converters and bad wires from codes alone, and no false alarm at rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skinnode.host.code_watch import CodeWatch, WireFault, WireState
+from skinnode.model.layout import Float
+from skinnode.wire.assembler import Scan
+from skinnode.wire.codec import CodeScale, SummaryFlag, encode
+
+SHAPE = (4, 12)
+NOISE = 3e-6
+REST = np.full(SHAPE, 1000.0)
+
+
+def scan_of(codes: np.ndarray, scale: CodeScale, flags: int = 0) -> Scan:
+    return Scan(
+        codes=codes,
+        valid=codes <= scale.steps,
+        counter=1,
+        scan=1,
+        complete=True,
+        chunks_expected=1,
+        chunks_received=1,
+        device_time_us=0,
+        flags=flags,
+        t_first_ns=0,
+        t_last_ns=0,
+    )
+
+
+class Patch:
+    """A patch at rest with a converter of ``noise``, watched by a host that believes in NOISE."""
+
+    def __init__(self, noise: float = NOISE, bits: int = 16) -> None:
+        self.scale = CodeScale(bits)
+        self.watch = CodeWatch(self.scale, NOISE)
+        self._random = np.random.default_rng(7)
+        self._noise = noise
+
+    def read(self, ohm: Float = REST) -> np.ndarray:
+        noisy = ohm * (1.0 + self._noise * self._random.standard_normal(SHAPE))
+        return encode(noisy, REST, self.scale)
+
+    def see(self, codes: np.ndarray, flags: int = 0) -> None:
+        self.watch.on_scan(scan_of(codes, self.scale, flags))
+
+
+@pytest.mark.parametrize("bits", [16, 24])
+def test_frozen_after_noise_was_seen(bits: int) -> None:
+    patch = Patch(bits=bits)
+    for _ in range(200):
+        patch.see(patch.read())
+        assert not patch.watch.frozen
+    stuck = patch.read()
+    for _ in range(300):
+        patch.see(stuck)
+    assert patch.watch.frozen
+    patch.see(patch.read(REST * 1.01))
+    assert not patch.watch.frozen
+
+
+@pytest.mark.parametrize("noise", [0.0, 3e-7, 2e-6, 3e-6, 1e-5])
+def test_no_false_alarm_at_rest_of_quiet_and_noisy_converters(noise: float) -> None:
+    """Quiet ones keep their codes for thousands of scans, also after a touch that rubber creeps back from."""
+    patch = Patch(noise)
+    for k in range(3000):
+        touch = 1.0 - 0.05 * np.exp(-(k - 500) / 40.0) * (k >= 500)
+        patch.see(patch.read(REST * touch))
+        assert not patch.watch.frozen
+
+
+def test_scans_of_changed_chunks_alone_say_nothing() -> None:
+    patch = Patch()
+    for _ in range(200):
+        patch.see(patch.read())
+    same = patch.read()
+    for _ in range(500):
+        patch.see(same, SummaryFlag.CHANGED_ONLY)
+    assert not patch.watch.frozen
+
+
+@pytest.mark.parametrize(("ohm", "state"), [(np.inf, WireState.OPEN), (0.0, WireState.SHORT)])
+def test_broken_wires_are_named_at_once_and_until_they_are_well(ohm: float, state: WireState) -> None:
+    patch = Patch()
+    broken = REST.copy()
+    broken[2], broken[:, 7] = ohm, ohm
+    patch.see(patch.read())
+    patch.see(encode(broken, REST, patch.scale))
+    assert patch.watch.wires == (WireFault("lower", 7, state), WireFault("upper", 2, state))
+    patch.see(patch.read())
+    assert patch.watch.wires == ()
+
+
+def test_one_open_crossing_is_no_open_wire() -> None:
+    patch = Patch()
+    broken = REST.copy()
+    broken[2, 3] = np.inf
+    for _ in range(3):
+        patch.see(encode(broken, REST, patch.scale))
+    assert patch.watch.wires == ()
+
+
+def test_noisy_wire() -> None:
+    patch = Patch()
+    random = np.random.default_rng(3)
+    for _ in range(100):
+        ohm = REST.copy()
+        ohm[:, 5] *= 1.0 + 1e-3 * random.standard_normal()
+        patch.see(patch.read(ohm))
+    assert patch.watch.wires == (WireFault("lower", 5, WireState.NOISY),)
+
+
+def test_drifting_wire_and_a_hand_that_warms_up() -> None:
+    patch = Patch()
+    for k in range(200):
+        ohm = REST * (1.0 + 1e-4 * k)  # all of it: no wire's fault
+        ohm[1] *= 1.0 + 5e-5 * k
+        patch.see(patch.read(ohm))
+    assert patch.watch.wires == (WireFault("upper", 1, WireState.DRIFTING),)
+
+
+def test_a_touch_is_neither_noise_nor_drift() -> None:
+    patch = Patch()
+    dent = np.exp(-((np.arange(4)[:, None] - 1.5) ** 2) - (np.arange(12)[None, :] - 6) ** 2 / 9.0)
+    for k in range(400):
+        depth = 0.05 * np.sin(k / 8.0) ** 2 if k < 200 else 0.04  # moved, then held
+        patch.see(patch.read(REST * (1.0 - depth * dent)))
+        assert patch.watch.wires == ()

@@ -1,0 +1,207 @@
+"""Frames that go astray between a node and its host: counted on both sides alike, and never a mixed scan.
+
+Every reading of the simulated patches has its own resistance, the same for all wire pairs, so a scan that
+holds values of two readings shows itself whatever else went wrong.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from skinnode.host import Condition, Host
+from skinnode.host.accounting import discrepancies
+from skinnode.host.facade import HostStats
+from skinnode.host.pipeline import LaneStats
+from skinnode.model.config import HandConfig
+from vcan_sim.faults import NO_FAULTS, Faults, Injected
+from vcan_sim.fleet import Fleet
+
+from .conftest import eventually
+from .tagged import Tags
+
+SCANS = 40
+"""How many scans suffer; the pace is one in 25 ms."""
+
+
+class Hand:
+    """A hand that runs, with tagged scans."""
+
+    def __init__(self, fleet: Fleet, host: Host, tags: Tags) -> None:
+        self.fleet, self.host, self.tags = fleet, host, tags
+
+    def lane(self, patch: str = "p0") -> LaneStats:
+        return self.host.stats().patches[patch]
+
+    def scans(self, more: int, patch: str = "p0") -> None:
+        """Wait until this many more scans were taken by the node and let through by the host."""
+        taken, offered = self.tags.taken(patch), self.lane(patch).offered
+        assert eventually(
+            lambda: self.tags.taken(patch) >= taken + more and self.lane(patch).offered > offered
+        )
+
+    def suffer(self, faults: Faults, scans: int = SCANS) -> Injected:
+        """Let p0 suffer, and be well again for long enough that everything has been counted."""
+        self.scans(5)
+        self.fleet.inject(faults, "p0")
+        self.scans(scans)
+        self.fleet.inject(NO_FAULTS, "p0")
+        self.scans(8)
+        return self.fleet.injected("p0")
+
+
+@pytest.fixture
+def running(make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[Hand]:
+    hand = make_hand()
+    tags = Tags(monkeypatch)
+    with Fleet(hand, wire_up=tags.wire_up) as fleet:
+        with Host.from_config(hand) as host:
+            running = Hand(fleet, host, tags)
+            running.scans(3)
+            yield running
+            assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
+        assert_sums(host.stats(), fleet, tags)
+
+
+def assert_sums(stats: HostStats, fleet: Fleet, tags: Tags) -> None:
+    """At the end: what was sent is what was received, what was received is what was published, and nothing
+    that was published is mixed."""
+    assert discrepancies(stats) == []
+    for name, lane in stats.patches.items():
+        assert lane.frames == fleet.injected(name).pdos
+    assert stats.patches["p1"].assembler.scans_torn == 0  # the neighbour suffers nothing
+    assert stats.patches["p1"].assembler.scans_missed == overruns(fleet, "p1")
+    assert tags.mixed == []
+    assert tags.seen > 0
+
+
+def overruns(fleet: Fleet, patch: str) -> int:
+    """Scans that a node skipped by itself, because this machine was too busy for it."""
+    return next(report.overruns for report in fleet.report() if report.patch == patch)
+
+
+def test_lost_chunks(running: Hand) -> None:
+    injected = running.suffer(Faults(lost=0.05))
+    counted = running.lane().assembler
+    assert injected.lost > 10
+    assert counted.chunks_lost == injected.lost
+    assert counted.scans_torn == injected.scans_spoilt
+    assert counted.duplicates == counted.late == counted.conflicts == 0
+    assert counted.scans_missed == overruns(running.fleet, "p0")
+
+
+def test_duplicated_chunks(running: Hand) -> None:
+    injected = running.suffer(Faults(duplicated=0.05))
+    counted = running.lane().assembler
+    assert injected.duplicated > 10
+    assert counted.duplicates == injected.duplicated
+    assert counted.scans_torn == counted.chunks_lost == counted.conflicts == 0
+
+
+def test_reordered_chunks(running: Hand) -> None:
+    injected = running.suffer(Faults(reordered=0.1))
+    counted = running.lane().assembler
+    assert injected.reordered > 20
+    assert counted.scans_torn == counted.chunks_lost == counted.late == counted.duplicates == 0
+
+
+def test_late_chunks(running: Hand) -> None:
+    injected = running.suffer(Faults(late=0.05))
+    counted = running.lane().assembler
+    assert injected.late > 10
+    assert counted.late == counted.chunks_lost == injected.late
+    assert counted.scans_torn == injected.scans_spoilt
+
+
+def test_short_and_remote_frames(running: Hand) -> None:
+    injected = running.suffer(Faults(short=0.03, remote=0.03))
+    counted, bus = running.lane().assembler, running.host.stats().buses["can0"]
+    assert injected.short > 5
+    assert injected.remote > 5
+    assert counted.bad_length == bus.malformed == injected.short
+    assert bus.ignored == injected.remote
+    assert counted.chunks_lost == injected.short + injected.remote
+    assert counted.scans_torn == injected.scans_spoilt
+
+
+def test_heartbeats_that_are_too_long(running: Hand) -> None:
+    running.fleet.inject(Faults(long=1.0), "p0")
+    assert eventually(lambda: running.fleet.injected("p0").long == 2)  # three would make it lost
+    running.fleet.inject(NO_FAULTS)
+    running.scans(5)
+    long = running.fleet.injected("p0").long
+    assert running.host.stats().buses["can0"].malformed == long
+    assert [error.cob_id for error in running.host.stats().malformed] == [0x705]
+
+
+def test_counters_of_scans_long_past_or_impossible(running: Hand) -> None:
+    injected = running.suffer(Faults(miscounted=0.03, miscounted_by=-10))
+    counted = running.lane().assembler
+    assert injected.miscounted > 5
+    assert counted.late + counted.bad_counter == counted.chunks_lost == injected.miscounted
+    assert counted.scans_torn == injected.scans_spoilt
+
+
+def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Hand) -> None:
+    """One of a scan to come stops the stream for three periods: nobody can know which counter is right."""
+    injected = running.suffer(Faults(miscounted=0.01))
+    assert injected.miscounted > 2
+    complete = running.lane().assembler.scans_complete
+    running.scans(5)
+    assert running.lane().assembler.scans_complete >= complete + 4
+
+
+def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
+    injected = running.suffer(Faults(torn=0.2))
+    counted = running.lane().assembler
+    assert injected.torn > 2
+    assert counted.scans_mixed == injected.torn
+    assert counted.scans_missed == injected.torn + overruns(running.fleet, "p0")
+    assert counted.conflicts == injected.torn_chunks
+    assert counted.scans_torn == counted.chunks_lost == counted.late == 0
+
+
+def test_lost_summaries(running: Hand) -> None:
+    injected = running.suffer(Faults(summary_lost=0.2))
+    counted = running.lane().assembler
+    assert injected.summary_lost > 2
+    assert counted.summaries_lost == injected.summary_lost
+    assert counted.scans_torn == counted.chunks_lost == 0
+
+
+def test_lost_syncs(running: Hand) -> None:
+    injected = running.suffer(Faults(sync_lost=0.2))
+    counted = running.lane().assembler
+    assert injected.sync_lost > 2
+    assert counted.scans_missed == injected.sync_lost + overruns(running.fleet, "p0")
+    assert counted.scans_torn == counted.chunks_lost == 0
+
+
+def test_everything_at_once(running: Hand) -> None:
+    injected = running.suffer(
+        Faults(
+            lost=0.02,
+            duplicated=0.02,
+            reordered=0.02,
+            late=0.02,
+            short=0.02,
+            remote=0.02,
+            torn=0.05,
+            summary_lost=0.05,
+            sync_lost=0.05,
+        ),
+        2 * SCANS,
+    )
+    counted = running.lane().assembler
+    assert counted.bad_length == injected.short
+    assert counted.scans_mixed <= injected.torn
+
+
+def test_threads_do_not_pile_up(running: Hand) -> None:
+    before = threading.active_count()
+    running.suffer(Faults(lost=0.2, sync_lost=0.2))
+    assert threading.active_count() == before
+    assert np.isfinite(running.host.stats().buses["can0"].load)

@@ -88,7 +88,8 @@ class FaultyNode(PatchNode):
         if self.faults.deaf or self._unplugged:
             self.injected.unheard += 1
             return
-        if can_id == od.SYNC_COB_ID and self._draw(self.faults.sync_lost):
+        second_half_to_come = self._fate == "torn"  # soon, or nobody takes it for the same scan
+        if can_id == od.SYNC_COB_ID and not second_half_to_come and self._draw(self.faults.sync_lost):
             self.injected.sync_lost += self.nmt_state is NmtState.OPERATIONAL
             return
         super().on_frame(can_id, data, t_ns, remote)
@@ -219,11 +220,12 @@ class FaultyNode(PatchNode):
             case "late":
                 self._late.append((data[_CHUNK_COUNTER_BYTE], data))
             case "short":
-                self._pass(chunk_id, data[:-1])
+                self._pass(chunk_id, data[:-1], spoilt=True)
             case "remote":
                 self._pass(chunk_id, b"", remote=True)
             case "miscounted":
-                self._pass(chunk_id, _with_byte(data, _CHUNK_COUNTER_BYTE, self._another(self._counter)))
+                wrong = _with_byte(data, _CHUNK_COUNTER_BYTE, self._another(self._counter))
+                self._pass(chunk_id, wrong, spoilt=True)
         setattr(injected, fault, getattr(injected, fault) + 1)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
             self._spoilt = True
@@ -264,15 +266,16 @@ class FaultyNode(PatchNode):
             return _with_byte(data, 4, data[4] ^ 0xFF)
         return data
 
-    def _pass(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """On the bus with it, and whatever waited for it; whether it was let out."""
+    def _pass(self, can_id: int, data: bytes, *, remote: bool = False, spoilt: bool = False) -> bool:
+        """On the bus with it; unless it is ``spoilt``, so that nobody takes it for one of its scan, also with
+        whatever waited for the next scan. Whether it was let out."""
         if self.faults.silent or self._unplugged or self._to_reset:
             self.injected.silenced += 1
             return False
         self._emit(can_id, data, remote=remote)
         is_pdo = can_id in (self._chunk_id, self._summary_id) and not remote
         self.injected.pdos += is_pdo
-        if self._late and is_pdo:
+        if self._late and is_pdo and not spoilt:
             due = [chunk for counter, chunk in self._late if counter != self._counter]
             self._late = [(counter, chunk) for counter, chunk in self._late if counter == self._counter]
             for chunk in due:

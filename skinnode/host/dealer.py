@@ -91,10 +91,6 @@ class Dealer:
         on the mainline."""
         self._listeners = (*self._listeners, listener)
 
-    def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """From now on ``listener`` gets no more. On the mainline."""
-        self._listeners = tuple(each for each in self._listeners if each is not listener)
-
     def poll_with(self, poller: Callable[[int], None]) -> None:
         """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
         self._pollers = (*self._pollers, poller)

@@ -27,7 +27,7 @@ from skinnode.host.start import bring_up_all, go_on_unless, start_all
 from skinnode.host.station import Station
 from skinnode.host.supervisor import NodeStats, Supervisor
 from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
-from skinnode.host.tap import HostTap, tap_bus, tap_link
+from skinnode.host.tap import HostTap, tap_lane, tap_link
 from skinnode.host.workers import Workers
 from skinnode.model.config import HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
@@ -278,29 +278,17 @@ class Host:
     def _all_bus_health(self) -> dict[str, BusHealth]:
         return {bus: self.bus_health(bus) for bus in self._buses}
 
-    def tap(self, tap: HostTap) -> Callable[[], None]:
-        """Let ``tap`` write down what passes, from now until what is returned is called or the host closes.
-        One at a time."""
-        ends = []
+    def tap(self, tap: HostTap) -> None:
+        """Let ``tap`` write down what passes, from now until the host closes."""
         for bus in self._buses.values():
-            lanes = [station.lane for station in self._stations.values() if station.link is bus.link]
-            ends.append(tap_bus(tap, bus.link, lanes))
+            stations = [station for station in self._stations.values() if station.link is bus.link]
 
-        def untap() -> None:
-            for end in ends:
-                end()
+            def begin(link: BusLink = bus.link, stations: Sequence[Station] = tuple(stations)) -> None:
+                tap_link(tap, link)
+                for station in stations:
+                    tap_lane(tap, station.lane)
 
-        return untap
-
-    def tare(self, patch: str) -> None:
-        """Have a patch take what it feels now for being untouched, by RPDO1, which nobody answers: the host
-        notices the new baseline and reads it, ``stats().nodes[patch].baselines`` counts. The node forgets it
-        at power-off unless told to store (0x1010).
-
-        Raises KeyError for no such patch, NodeError where it must not be done (the host is a guest there, or
-        the baseline is that of a file) or cannot (the node is not operational), BusError.
-        """
-        self._stations[patch].tare()
+            bus.link.call(begin)
 
     def stats(self) -> HostStats:
         """All counters."""

@@ -92,10 +92,6 @@ class BusLink(Dealer):
         the interface, on the thread that sent it."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
-    def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """From now on ``listener`` gets no more. On the mainline."""
-        self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
-
     def call(self, job: Callable[[], object]) -> None:
         """Have ``job`` done by the mainline, before any frame that is received from now on."""
         self._jobs.append(job)

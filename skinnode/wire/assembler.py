@@ -9,7 +9,9 @@ sooner), so with the usual range of 240 scans a frame may be 237 periods old.
 
 **Two scans under one counter**, from a node that did not count on or from two nodes with one node-ID, show
 in a frame that comes twice with other content. Nobody can tell then whose the rest is: such a scan is thrown
-away whole. Two halves of which no frame overlaps cannot be told from one scan.
+away whole. So is a scan with frames missing whose others lie more than two periods apart: it began with a frame
+that had the counter of a scan to come, and that scan's own frame of the same place comes after the timeout.
+Two halves of which no frame overlaps cannot be told from one scan.
 
 **Order of counters.** Up to half the counter range ahead is newer, the rest is late and dropped. After a
 timeout without an accepted frame whatever comes is believed to be a new stream: a node or the SYNC producer
@@ -88,7 +90,7 @@ class AssemblerStats:
     scans_discarded: int
     """Open at a reset, never published."""
     scans_mixed: int
-    """Thrown away, because frames of two scans had their counter."""
+    """Thrown away, because frames of two scans had their counter, by all that can be seen."""
     chunks_accepted: int
     """*"""
     summaries_accepted: int
@@ -153,7 +155,9 @@ class ScanAssembler:
         self._index_of = chunk_indexer(profile)
         self._steps = (1 << profile.code_bits) - 4
         self._lowest, self._range = (1, counter_overflow) if counter_overflow else (0, 256)
-        self._timeout_ns = period_ns * min(3, max(1, (self._range - 1) // 2))
+        periods = min(3, max(1, (self._range - 1) // 2))
+        self._timeout_ns = period_ns * periods
+        self._longest_ns = period_ns * (2 if periods == 3 else periods)
         self._grace_ns = grace_ns
         self._node_id = node_id
         self._on_reject = on_reject
@@ -366,11 +370,12 @@ class ScanAssembler:
         """Publish the open scan, or throw it away."""
         self._book()
         self._counter = _NONE_OPEN
-        if self._mixed:
+        summary = self._summary
+        whole = summary is not None and self._received >= summary.chunks
+        if self._mixed or (not whole and self._t_last_ns - self._t_first_ns > self._longest_ns):
             self._thrown += 1
             self._held = [None] * self._n
             return None
-        summary = self._summary
         if summary is not None:
             self._changed_only = bool(summary.flags & SummaryFlag.CHANGED_ONLY)
             overrun = bool(summary.flags & SummaryFlag.OVERRUN)

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from skinnode.host.code_watch import CodeWatch, WireFault, WireState
-from skinnode.model.layout import Float
+from skinnode.model.config import SimulationConfig
+from skinnode.model.layout import Float, PatchLayout
 from skinnode.wire.assembler import Scan
 from skinnode.wire.codec import CodeScale, SummaryFlag, encode
+from vcan_sim.scene import Scene
+from vcan_sim.sensor import SimulatedPatch
 
 SHAPE = (4, 12)
 NOISE = 3e-6
@@ -129,3 +132,31 @@ def test_a_touch_is_neither_noise_nor_drift() -> None:
         depth = 0.05 * np.sin(k / 8.0) ** 2 if k < 200 else 0.04  # moved, then held
         patch.see(patch.read(REST * (1.0 - depth * dent)))
         assert patch.watch.wires == ()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 3e-6, 1e-4])
+@pytest.mark.parametrize("radius_m", [None, 0.005, 0.04, 0.3])
+def test_nothing_is_wrong_with_a_patch_that_is_pressed_or_left_alone(
+    noise: float, radius_m: float | None
+) -> None:
+    """Strokes of 4 s and of a minute, light and deep, on few wires and on many."""
+    for layout in (
+        PatchLayout.preset(
+            "staggered", upper_wires=4, lower_wires=12, upper_electrodes=4, lower_electrodes=4
+        ),
+        PatchLayout.preset("aligned"),
+    ):
+        for depth, cycle_s in ((0.1, 4.0), (0.5, 60.0)):
+            strokes = {} if radius_m is None else {"indenter_radius_m": radius_m}
+            scene = Scene(layout, SimulationConfig(depth=depth, cycle_s=cycle_s, **strokes))
+            patch = SimulatedPatch(scene, converter_noise=noise)
+            scale = CodeScale(16)
+            watch = CodeWatch(scale, NOISE)
+            rest_ohm = np.mean([patch.read(0) for _ in range(16)], axis=0)
+            if radius_m is not None:
+                patch.start(0)
+            for k in range(600):
+                codes = encode(patch.read(k * 25_000_000), rest_ohm, scale)
+                watch.on_scan(scan_of(codes, scale))
+                assert not watch.frozen
+                assert watch.wires == ()

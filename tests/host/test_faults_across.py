@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -11,17 +12,23 @@ from skinnode.host import Condition, Host
 from skinnode.host.accounting import discrepancies
 from skinnode.model.config import BusConfig, HandConfig
 from skinnode.transport import CanPort
-from vcan_sim.faults import NO_FAULTS, Faults
+from skinnode.wire.assembler import AssemblerStats
+from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
 
 from .conftest import eventually
 from .tagged import Tags
 
+pytestmark = pytest.mark.real_time
+
+BACK_S = 1.0
+"""How soon the stream must be back after the cause has gone."""
+
 
 @pytest.fixture
-def fleet_and_host(
+def running(
     make_hand: Callable[..., HandConfig], crossing_bus: BusConfig, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[Fleet, Host]]:
+) -> Iterator[Suffers]:
     bus = crossing_bus
     try:
         with CanPort(bus) as port, CanPort(bus) as other:
@@ -36,41 +43,106 @@ def fleet_and_host(
     with Fleet(hand, wire_up=tags.wire_up) as fleet:
         with Host.from_config(hand) as host:
             assert eventually(lambda: host.stats().patches["p0"].solved > 5)
-            yield fleet, host
+            yield Suffers(fleet, host)
         assert discrepancies(host.stats()) == []
         assert host.stats().patches["p0"].frames == fleet.injected("p0").pdos
         assert tags.mixed == []
 
 
-def goes_on(host: Host, within_s: float = 10.0) -> bool:
-    solved = host.stats().patches["p0"].solved
-    return eventually(lambda: host.stats().patches["p0"].solved > solved + 4, within_s)
+class Suffers:
+    """A hand of one patch on such an interface."""
+
+    def __init__(self, fleet: Fleet, host: Host) -> None:
+        self.fleet, self.host = fleet, host
+
+    def until(self, faults: Faults, so_often: Callable[[Injected], bool]) -> None:
+        """Inject until there were enough; the stream is back within a second, and all has been counted."""
+        self.fleet.inject(faults)
+        assert eventually(lambda: so_often(self.injected()))
+        self.fleet.inject(NO_FAULTS)
+        self.is_back()
+        solved = self.host.stats().patches["p0"].solved
+        assert eventually(lambda: self.host.stats().patches["p0"].solved > solved + 4)
+
+    def is_back(self) -> None:
+        """Within a second."""
+        since_ns = time.monotonic_ns()
+
+        def streams() -> bool:
+            field = self.host.latest("p0")
+            return field is not None and field.stamp is not None and field.stamp.t_sync_ns > since_ns
+
+        assert eventually(streams, BACK_S)
+
+    def injected(self) -> Injected:
+        return self.fleet.injected("p0")
+
+    def counted(self) -> AssemblerStats:
+        return self.host.stats().patches["p0"].assembler
+
+    def condition(self) -> Condition:
+        return self.host.health("p0").condition
+
+    def overruns(self) -> int:
+        """Scans that the node skipped by itself, because this machine was too busy for it."""
+        (report,) = self.fleet.report()
+        return report.overruns
 
 
-def test_lost_chunks(fleet_and_host: tuple[Fleet, Host]) -> None:
-    fleet, host = fleet_and_host
-    fleet.inject(Faults(lost=0.05))
-    assert eventually(lambda: fleet.injected("p0").lost > 10)
-    fleet.inject(NO_FAULTS)
-    assert goes_on(host)
-    counted, injected = host.stats().patches["p0"].assembler, fleet.injected("p0")
+def test_lost_chunks(running: Suffers) -> None:
+    running.until(Faults(lost=0.05), lambda injected: injected.lost > 10)
+    counted, injected = running.counted(), running.injected()
     assert counted.chunks_lost == injected.lost
+    assert counted.scans_torn == injected.scans_spoilt
+    assert counted.duplicates == counted.late == counted.conflicts == 0
+
+
+def test_duplicated_and_late_chunks(running: Suffers) -> None:
+    running.until(
+        Faults(duplicated=0.05, late=0.05),
+        lambda injected: injected.duplicated > 10 and injected.late > 10,
+    )
+    counted, injected = running.counted(), running.injected()
+    assert counted.duplicates == injected.duplicated
+    assert counted.late == counted.chunks_lost == injected.late
     assert counted.scans_torn == injected.scans_spoilt
 
 
-def test_reset_in_the_middle_of_a_scan(fleet_and_host: tuple[Fleet, Host]) -> None:
-    fleet, host = fleet_and_host
-    fleet.inject(Faults(reset=1.0))
-    assert eventually(lambda: fleet.injected("p0").reset == 1)
-    fleet.inject(NO_FAULTS)
-    assert eventually(lambda: host.health("p0").condition is Condition.RESTARTING)
-    assert goes_on(host)
+def test_lost_syncs(running: Suffers) -> None:
+    running.until(Faults(sync_lost=0.2), lambda injected: injected.sync_lost > 3)
+    assert running.counted().scans_missed == running.injected().sync_lost + running.overruns()
+    assert running.counted().scans_torn == running.counted().chunks_lost == 0
 
 
-def test_unplugged_and_plugged_in_again(fleet_and_host: tuple[Fleet, Host]) -> None:
-    fleet, host = fleet_and_host
-    fleet.inject(Faults(unplugged=True))
-    assert eventually(lambda: host.health("p0").condition is Condition.LOST)
-    fleet.inject(NO_FAULTS)
-    assert goes_on(host)
-    assert host.health("p0").rejoins == 1
+def test_two_scans_under_one_counter(running: Suffers) -> None:
+    running.until(Faults(torn=0.2), lambda injected: injected.torn > 3)
+    assert running.counted().scans_mixed == running.injected().torn
+    assert running.counted().conflicts == running.injected().torn_chunks
+
+
+def test_reset_in_the_middle_of_a_scan(running: Suffers) -> None:
+    boot_ups = running.host.health("p0").boot_ups
+    running.until(Faults(reset=1.0), lambda injected: injected.reset > 0)
+    assert running.condition() is Condition.RESTARTING
+    assert running.host.health("p0").boot_ups == boot_ups + running.injected().reset
+
+
+def test_unplugged_and_plugged_in_again(running: Suffers) -> None:
+    running.until(Faults(unplugged=True), lambda _: running.condition() is Condition.LOST)
+    assert running.injected().unplugged == 1
+    assert eventually(lambda: running.host.health("p0").rejoins == 1)
+
+
+def test_bus_off_and_recovery(running: Suffers) -> None:
+    running.fleet.bus_off("can0", off=True)
+    assert eventually(lambda: running.condition() is Condition.LOST)
+    running.fleet.bus_off("can0", off=False)
+    running.is_back()
+    assert eventually(lambda: running.host.health("p0").last_emergency == 0x8140)
+
+
+def test_silent_and_deaf_node(running: Suffers) -> None:
+    running.until(Faults(silent=True), lambda _: running.condition() is Condition.LOST)
+    running.until(Faults(deaf=True), lambda _: running.condition() is Condition.STALE)
+    assert running.injected().silenced > 0
+    assert running.injected().unheard > 0

@@ -6,6 +6,7 @@ holds values of two readings shows itself whatever else went wrong.
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable, Iterator
 
@@ -22,6 +23,8 @@ from vcan_sim.fleet import Fleet
 
 from .conftest import eventually
 from .tagged import Tags
+
+pytestmark = pytest.mark.real_time
 
 SCANS = 40
 """How many scans suffer; the pace is one in 25 ms."""
@@ -146,12 +149,21 @@ def test_counters_of_scans_long_past_or_impossible(running: Hand) -> None:
 
 
 def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Hand) -> None:
-    """One of a scan to come stops the stream for three periods: nobody can know which counter is right."""
+    """One of a scan to come stops the stream for three periods: nobody can know which counter is right. What
+    becomes of each of them is counted in tests/sim/test_faults_in_time.py, where time stands still."""
     injected = running.suffer(Faults(miscounted=0.01))
     assert injected.miscounted > 2
-    complete = running.lane().assembler.scans_complete
+    before = running.lane().assembler
     running.scans(5)
-    assert running.lane().assembler.scans_complete >= complete + 4
+    after = running.lane().assembler
+    assert after.scans_complete >= before.scans_complete + 4
+    whole = dataclasses.replace(
+        after,
+        scans_complete=before.scans_complete,
+        chunks_accepted=before.chunks_accepted,
+        summaries_accepted=before.summaries_accepted,
+    )
+    assert whole == before  # whole scans and nothing else
 
 
 def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
@@ -181,23 +193,23 @@ def test_lost_syncs(running: Hand) -> None:
 
 
 def test_everything_at_once(running: Hand) -> None:
-    injected = running.suffer(
-        Faults(
-            lost=0.02,
-            duplicated=0.02,
-            reordered=0.02,
-            late=0.02,
-            short=0.02,
-            remote=0.02,
-            torn=0.05,
-            summary_lost=0.05,
-            sync_lost=0.05,
-        ),
-        2 * SCANS,
+    chunks = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted")
+    faults = dict.fromkeys(chunks, 0.02) | dict.fromkeys(("torn", "summary_lost", "sync_lost"), 0.06)
+    injected = running.suffer(Faults(miscounted_by=-10, **faults), 2 * SCANS)
+    counted, bus = running.lane().assembler, running.host.stats().buses["can0"]
+    assert min(dataclasses.asdict(injected)[fault] for fault in faults) > 0
+    assert counted.bad_length == bus.malformed == injected.short
+    assert bus.ignored == injected.remote
+    assert counted.duplicates == injected.duplicated
+    assert counted.late + counted.bad_counter == injected.late + injected.miscounted
+    assert counted.chunks_lost == (
+        injected.lost + injected.late + injected.short + injected.remote + injected.miscounted
     )
-    counted = running.lane().assembler
-    assert counted.bad_length == injected.short
-    assert counted.scans_mixed <= injected.torn
+    assert counted.scans_torn == injected.scans_spoilt
+    assert counted.scans_mixed == injected.torn
+    assert counted.conflicts == injected.torn_chunks
+    assert counted.summaries_lost == injected.summary_lost
+    assert counted.scans_missed == injected.torn + injected.sync_lost + overruns(running.fleet, "p0")
 
 
 def test_threads_do_not_pile_up(running: Hand) -> None:

@@ -9,8 +9,8 @@ sooner), so with the usual range of 240 scans a frame may be 237 periods old.
 
 **Two scans under one counter**, from a node that did not count on or from two nodes with one node-ID, show
 in a frame that comes twice with other content. Nobody can tell then whose the rest is: such a scan is thrown
-away whole. So is a scan with frames missing whose others lie more than two periods apart: it began with a frame
-that had the counter of a scan to come, and that scan's own frame of the same place comes after the timeout.
+away whole. So is a scan with frames missing whose others lie more than two periods apart: it began with a
+frame that had the counter of a scan to come, and that scan's own frame of that place comes after the timeout.
 Two halves of which no frame overlaps cannot be told from one scan.
 
 **Order of counters.** Up to half the counter range ahead is newer, the rest is late and dropped. After a

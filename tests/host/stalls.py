@@ -1,5 +1,5 @@
 """Tests that count frames in real time on a machine that others use too: one that stood still while a test
-ran is no witness, and the test is run again. A machine, or code of ours, that always stands still fails it."""
+ran is no witness, and the test runs again. A machine, or code of ours, that always stands still fails it."""
 
 from __future__ import annotations
 

@@ -74,7 +74,8 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
             faults = _faults(running)
     except BringUpCancelled:
         return 0
-    report.note("nodes are pre-operational")
+    masters = any(bus.role == "master" for bus in plan.buses)
+    report.note("nodes are pre-operational" if masters else "nodes are left to their master")
     for fault in faults:
         report.note(f"fault: {fault}")
     if running.stats().malformed:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.model.config.table import Allowed
@@ -72,18 +73,24 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
         field = table.model_fields.get(part)
         if field is None:
             break
-        marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
-        inner = _tables_in(field.annotation)
-        allowed = next(iter([*marks, *_marks_in(field.annotation)]), "a table" if inner else None)
+        inner = tables_in(field.annotation)
+        allowed = allowed_in(field) or ("a table" if inner else None)
         if inner and depth < len(location) - 1:
             table = inner[0]
     return list(table.model_fields), allowed
 
 
-def _tables_in(annotation: Any) -> list[type[BaseModel]]:
+def allowed_in(field: FieldInfo) -> str | None:
+    """What may be written at a key; None where its type says it all."""
+    marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
+    return next(iter([*marks, *_marks_in(field.annotation)]), None)
+
+
+def tables_in(annotation: Any) -> list[type[BaseModel]]:
+    """The tables that a key may hold, alone or in a list."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [table for part in get_args(annotation) for table in _tables_in(part)]
+    return [table for part in get_args(annotation) for table in tables_in(part)]
 
 
 def _marks_in(annotation: Any) -> list[str]:

@@ -1,13 +1,10 @@
-"""What the pages of docs/ say exists, runs, and has the value it prints."""
+"""What the pages of docs/ name exists, and has the value they give."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 import re
-import subprocess
-import sys
 import types
 from pathlib import Path
 
@@ -18,95 +15,37 @@ from typer.main import get_command
 
 from skinnode.model.elastic import HertzContact, Rubber
 
-DOCS = Path(__file__).parents[1] / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+from .blocks import DOCS, PAGES
+
 PAGE = (DOCS / "solver.md").read_text(encoding="utf-8")
-GROUP = "239.74.163.4"
-"""Where the nodes of the pages are; a test gives them a group of their own."""
-
-
-def anchor(heading: str) -> str:
-    """As GitHub makes it."""
-    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def text_of(page: Path) -> str:
     return page.read_text(encoding="utf-8")
 
 
-@pytest.mark.timeout(300)
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_blocks_of_a_page_run_in_order(page: Path, tmp_path: Path, multicast_group: str) -> None:
-    """Python that begins with a file's name is that file, other Python runs and prints something. Of the
-    commands, nodes run beside what follows, and data sheets are written."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(DOCS.parent), str(tmp_path)])}
-    beside: list[subprocess.Popen[str]] = []
-    try:
-        for language, block in re.findall(r"```(\w+)\n(.*?)```", text_of(page), flags=re.DOTALL):
-            code = block.replace(GROUP, multicast_group)
-            named = re.match(r"# (\w+\.py)\n", code)
-            if language == "python" and named:
-                (tmp_path / named[1]).write_text(code)
-            elif language == "python":
-                done = subprocess.run(
-                    [sys.executable, "-W", "error", "-c", code],
-                    capture_output=True,
-                    text=True,
-                    timeout=100,
-                    cwd=tmp_path,
-                    env=environment,
-                )
-                assert done.returncode == 0, done.stderr
-                assert done.stdout
-            elif language == "sh":
-                for line in code.splitlines():
-                    command = [str(Path(sys.executable).with_name("skinnode")), *line.split()[1:]]
-                    if line.startswith("skinnode node"):
-                        node = subprocess.Popen(
-                            command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True
-                        )
-                        beside.append(node)
-                        assert node.stdout is not None
-                        assert "Ctrl-C ends" in node.stdout.readline()
-                    elif line.startswith("skinnode eds"):
-                        subprocess.run(command, cwd=tmp_path, env=environment, check=True, timeout=60)
-    finally:
-        for node in beside:
-            node.terminate()
-            node.communicate(timeout=20)
-    assert [node.returncode for node in beside] == [0] * len(beside)
+_COMMAND = re.compile(
+    r"(?:`|^|\.venv/bin/)skinnode ((?:(?:bench|hand|lss) )?[a-z]+)([^`\n]*)", flags=re.MULTILINE
+)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_exist_with_their_options(page: Path) -> None:
     from skinnode.cli.main import app
 
-    lines = re.findall(r"(?:`|^|\.venv/bin/)skinnode ([^`\n]+)", text_of(page), flags=re.MULTILINE)
     commands: set[tuple[str, str | None]] = set()
-    for line in lines:
-        found = re.match(r"(?:bench )?[a-z]+", line)
-        assert found, line
-        commands |= {(found[0], option) for option in [None, *re.findall(r"--[a-z-]+", line)]}
+    for name, rest in _COMMAND.findall(text_of(page)):
+        commands |= {(name, option) for option in [None, *re.findall(r"--[a-z-]+", rest)]}
     wanted = {
         "solver.md": {("bench kernel", None), ("bench stability", None), ("bench path", "--plot")},
         "node.md": {("node", "--source"), ("eds", "--layout"), ("host", None)},
+        "first-ten-minutes.md": {("scan", "--hand"), ("record", "--seconds"), ("replay", "--fast")},
     }
     assert wanted.get(page.name, set()) <= commands
     for name, option in commands:
         done = CliRunner().invoke(get_command(app), [*name.split(), "--help"])
         assert done.exit_code == 0, name
         assert option is None or option in done.output, f"{name} {option}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_and_pictures_lead_somewhere(page: Path) -> None:
-    text = text_of(page)
-    headings = {anchor(heading) for heading in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)}
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        if target.startswith("#"):
-            assert target[1:] in headings, target
-        elif not target.startswith("http"):
-            assert (DOCS / target).is_file(), target
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

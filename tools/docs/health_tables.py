@@ -1,0 +1,41 @@
+"""The conditions of a patch and the faults of a simulated node, from their definitions."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Final
+
+import markdown_text as md
+
+from skinnode.host.health import Condition
+from vcan_sim.faults import OF_CHUNKS, OF_SCANS, Faults
+
+_PLAIN: Final = {
+    "NEVER_SEEN": "Nothing was heard of it since the host started.",
+    "OPERATIONAL": "All is well.",
+}
+"""Of members that say it by their name."""
+
+
+def conditions() -> str:
+    docs = {**_PLAIN, **md.member_docs(Condition)}
+    return md.table(("condition", "when"), ((str(c), docs[c.name]) for c in Condition))
+
+
+def faults() -> str:
+    """What `vcan-sim --fault` can do."""
+    docs = md.member_docs(Faults)
+    kinds = {"bool": "on or off", "int": "integer", "int | None": "integer"}
+    rows = []
+    for name, kind in inspect.get_annotations(Faults).items():
+        value = kinds.get(str(kind), "share of the frames")
+        if name in (*OF_CHUNKS, *OF_SCANS):
+            value = "share of the chunks" if name in OF_CHUNKS else "share of the scans"
+        elif name.endswith("_s"):
+            value = "seconds" if name.startswith("restart") else "a second"
+        rows.append((md.code(name), value, docs.get(name, "Does not arrive.")))
+    return md.table(("fault", "value", "what happens"), rows)
+
+
+TABLES: Final[dict[str, Callable[[], str]]] = {"conditions": conditions, "injected-faults": faults}

@@ -1,0 +1,44 @@
+"""Hooks of the documentation: a line `<!-- generated: NAME -->` of a page becomes what TABLES says of NAME,
+made from the code when the site is built. A name that is not there, or that no page uses, ends the build."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import command_pages
+import hand_keys
+import health_tables
+import wire_tables
+from mkdocs.exceptions import PluginError
+
+TABLES: dict[str, Callable[[], str]] = {
+    **hand_keys.TABLES,
+    **wire_tables.TABLES,
+    **health_tables.TABLES,
+    **command_pages.TABLES,
+}
+_MARK = re.compile(r"^<!-- generated: ([\w-]+) -->$", flags=re.MULTILINE)
+_used: set[str] = set()
+
+
+def on_pre_build(**_: Any) -> None:
+    _used.clear()
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    def made(mark: re.Match[str]) -> str:
+        name = mark[1]
+        if name not in TABLES:
+            raise PluginError(f"{page.file.src_path}: got generated: {name}, allowed: {', '.join(TABLES)}")
+        _used.add(name)
+        return TABLES[name]()
+
+    return _MARK.sub(made, markdown)
+
+
+def on_env(env: Any, **_: Any) -> Any:
+    if unused := sorted(TABLES.keys() - _used):
+        raise PluginError(f"no page has <!-- generated: {unused[0]} -->")
+    return env

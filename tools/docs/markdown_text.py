@@ -1,0 +1,51 @@
+"""Markdown as the generators write it."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Iterable, Sequence
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A pipe table; bars in cells are escaped, but for those in code."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    parts = text.split("`")
+    return "`".join(part if i % 2 else part.replace("|", r"\|") for i, part in enumerate(parts))
+
+
+def code(text: object) -> str:
+    """``text`` as code; empty for an empty one."""
+    shown = str(text)
+    return f"`{shown}`" if shown else ""
+
+
+def prose(docstring: str) -> str:
+    """A docstring in one line of Markdown: its roles and double backticks become code."""
+    text = re.sub(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`", r"`\1`", docstring)
+    return " ".join(text.replace("``", "`").split())
+
+
+def c_hex(value: int, digits: int = 4) -> str:
+    """0x and capitals."""
+    return f"0x{value:0{digits}X}"
+
+
+def member_docs(kind: type) -> dict[str, str]:
+    """What stands below each member of a class in its source."""
+    (body,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(body, ast.ClassDef)
+    docs: dict[str, str] = {}
+    name = ""
+    for line in body.body:
+        target = line.targets[0] if isinstance(line, ast.Assign) else getattr(line, "target", None)
+        if isinstance(target, ast.Name):
+            name = target.id
+        elif name and isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant):
+            docs[name], name = prose(str(line.value.value)), ""
+    return docs

@@ -1,0 +1,20 @@
+"""The roles of docstrings (:class:`~skinnode.model.frames.FieldFrame`) as code, for the Python reference."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import griffe
+
+_ROLE = re.compile(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`")
+
+
+class Roles(griffe.Extension):
+    """Rewrites every docstring as it is loaded."""
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        if obj.docstring is not None:
+            obj.docstring.value = (
+                _ROLE.sub(r"`\1`", obj.docstring.value).replace("``", "`").replace("::\n", ":\n")
+            )

@@ -79,10 +79,10 @@ def set_node(
     from skinnode.cli._bus import find_bus
     from skinnode.cli._console import print_json, progress
     from skinnode.errors import ConfigError
-    from skinnode.node.lss import BIT_RATES_BPS, LssAddress
     from skinnode.technician.commission import commission, only_unconfigured
     from skinnode.technician.line import Line
     from skinnode.wire import indices as od
+    from skinnode.wire.lss import BIT_RATES_BPS, LssAddress
 
     if node_id is None and bit_rate is None:
         raise ConfigError("--node-id, --bit-rate", None, "one of them at least")

@@ -69,11 +69,11 @@ def node(
     from skinnode.node import NodeRunner, PatchNode
     from skinnode.node.clock import EXACT, THRIFTY
     from skinnode.node.find_source import make_source
-    from skinnode.node.lss import NOT_CONFIGURED
     from skinnode.node.memory import FileMemory
     from skinnode.pauses import short_pauses
     from skinnode.signals import until_told
     from skinnode.transport import CanPort
+    from skinnode.wire.lss import NOT_CONFIGURED
     from skinnode.wire.profile import PatchProfile
 
     if node_id is None and store is None:
@@ -138,7 +138,7 @@ class _Progress:
 
 
 def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
-    from skinnode.node.lss import NOT_CONFIGURED
+    from skinnode.wire.lss import NOT_CONFIGURED
 
     (board,) = runner.nodes
     return _Progress(

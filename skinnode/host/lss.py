@@ -1,30 +1,63 @@
-"""Finding a patch by its serial number: layer setting services, the master's side (CiA 305 v3.0).
+"""Layer setting services, the master's side (CiA 305 v3.0): nodes without a node-ID are found, a node is
+selected by its address, gets a node-ID and a bit rate, and stores them.
 
-One dialogue at a time on a bus. No sleeps: a slave answers a switch selective within a few milliseconds, and
-one that is not there not at all.
+A slave that does not agree is silent, so every *no* costs a waiting time. Answers bear no number: one that
+comes late, to a question that was given up, looks like one to the question of now. So a node counts as found
+or selected only when it has told its own address, which nobody else's answer can; and a service that got no
+answer is given up only when none can be under way any more.
 """
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Final
 
+from skinnode.errors import BusError
 from skinnode.wire import indices as od
+from skinnode.wire.lss import (
+    BIT_RATES_BPS,
+    LSS_DONE,
+    NOT_CONFIGURED,
+    RESET_SCAN,
+    LssAddress,
+    LssCommand,
+    LssState,
+)
 
 ANSWER_S: Final = 0.1
 """How long an answer may take; the frame has the lowest priority but for heartbeats."""
 
-_SWITCH_GLOBAL, _CONFIGURE_NODE_ID, _INQUIRE_NODE_ID = 0x04, 0x11, 0x5E
-_SELECT_VENDOR, _SELECT_PRODUCT, _SELECT_REVISION, _SELECT_SERIAL, _SELECTED = 0x40, 0x41, 0x42, 0x43, 0x44
-_WAITING: Final = 0
-_NOT_CONFIGURED: Final = 0xFF
+_SCAN_ANSWERS_S: Final = (0.03, 0.15)
+"""The same within a fastscan, where every *no* is waited for; the longer one where the first found nobody
+who agrees in the end."""
+
+_TRIES: Final = 2
+"""Questions of which silence means that nobody is there; a busy machine may miss one."""
+
+_SETTLE: Final = 0.2
+"""Share of the waiting time that the answers of several slaves to one question may lie apart."""
+
+_UNDER_WAY_S: Final = 0.4
+"""After which an answer that was due is not waited for, nor feared, any more."""
+
+_PARTS: Final = 4
+_LIKELY: Final = (od.VENDOR_ID, od.PRODUCT_CODE, od.REVISION_NUMBER)
+"""A patch of ours: three questions in place of 96."""
+
 _NMT_RESET_COMMUNICATION: Final = 0x82
 
 
+class LssFailed(BusError):
+    """A slave refused a service or fell silent."""
+
+
 class LssMaster:
-    """Speaks through ``send``; :meth:`on_response` is given what comes on 0x7E4."""
+    """Speaks through ``send``; :meth:`on_response` gets what comes on 0x7E4. One thread at a time may ask,
+    but for :meth:`give_node_id`, which waits for its turn."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         self._send = send
@@ -41,43 +74,145 @@ class LssMaster:
         not take it. A patch that is there already is left alone. Nothing is stored in it: that is for
         technicians. Raises BusError."""
         with self._dialogue:
-            if not self._select(serial):
+            if not self.select(LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, od.REVISION_NUMBER, serial)):
                 return False
             try:
-                answer = self._ask(_INQUIRE_NODE_ID, b"", _INQUIRE_NODE_ID)
-                if answer is None or answer[1] == node_id:
-                    return answer is not None
-                active = answer[1]
-                taken = self._ask(_CONFIGURE_NODE_ID, bytes([node_id]), _CONFIGURE_NODE_ID)
-            finally:  # a slave without a node-ID boots when it is let go
-                self._request(_SWITCH_GLOBAL, bytes([_WAITING]))
-            if taken is None or taken[1]:
+                active = self.node_id()
+                if active != node_id:
+                    self.set_node_id(node_id)
+            except LssFailed:
                 return False
-            if active != _NOT_CONFIGURED:
-                self._send(od.NMT_COB_ID, bytes([_NMT_RESET_COMMUNICATION, active]))
+            finally:  # a slave without a node-ID boots when it is let go
+                self.release()
+            if active not in (None, node_id):
+                self._send(od.NMT_COB_ID, bytes((_NMT_RESET_COMMUNICATION, active)))
             return True
 
-    def _select(self, serial: int) -> bool:
-        """Switch the one patch with this serial number to configuration."""
-        self._request(_SWITCH_GLOBAL, bytes([_WAITING]))
-        for command, value in (
-            (_SELECT_VENDOR, od.VENDOR_ID),
-            (_SELECT_PRODUCT, od.PRODUCT_CODE),
-            (_SELECT_REVISION, od.REVISION_NUMBER),
-        ):
+    # --- who is there
+
+    def any_unconfigured(self) -> bool:
+        """Whether there is a node without a node-ID (identify non-configured remote slave)."""
+        wanted = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
+        return any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) for _ in range(_TRIES))
+
+    def find_unconfigured(self) -> LssAddress | None:
+        """One node without a node-ID, by fastscan; it is in configuration until :meth:`release`. None where
+        there is none, or nobody agrees in the end."""
+        for answer_s in _SCAN_ANSWERS_S:
+            if self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is None:
+                return None
+            parts: list[int] = []
+            while len(parts) < _PARTS:
+                value = self._scan_part(len(parts), answer_s)
+                if value is None:
+                    break
+                parts.append(value)
+            else:
+                address = LssAddress(*parts)
+                if self._is_in_configuration(address):
+                    return address
+        return None
+
+    def _scan_part(self, part: int, answer_s: float) -> int | None:
+        """The part of the address of the node that stays in the race; None where nobody agrees in the end."""
+        following = (part + 1) % _PARTS
+        if part < len(_LIKELY) and self._scan(_LIKELY[part], 0, part, following, answer_s) is not None:
+            return _LIKELY[part]
+        value = 0
+        for bit in range(31, -1, -1):
+            if self._scan(value, bit, part, part, answer_s) is None:
+                value |= 1 << bit
+        return value if self._scan(value, 0, part, following, answer_s) is not None else None
+
+    def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
+        data = value.to_bytes(4, "little") + bytes((bit, part, following))
+        answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
+        if answer is not None:  # others may agree a little later: not to the next question
+            time.sleep(answer_s * _SETTLE)
+        return answer
+
+    # --- one node
+
+    def select(self, address: LssAddress) -> bool:
+        """Switch the node with that address to configuration; False where there is none."""
+        self.release()
+        for command, value in enumerate(address[:3], LssCommand.SELECT_VENDOR):
             self._request(command, value.to_bytes(4, "little"))
-        return self._ask(_SELECT_SERIAL, serial.to_bytes(4, "little"), _SELECTED) is not None
+        serial, selected = address.serial_number.to_bytes(4, "little"), bytes((LssCommand.SELECTED,))
+        if self._ask(LssCommand.SELECT_SERIAL, serial, selected) is None:
+            return False
+        if self._is_in_configuration(address):
+            return True
+        self.release()
+        return False
 
-    def _request(self, command: int, data: bytes) -> None:
-        self._send(od.LSS_REQUEST_COB_ID, (bytes([command]) + data).ljust(8, b"\0"))
+    def _is_in_configuration(self, address: LssAddress) -> bool:
+        """Whether the node in configuration says that it has that address."""
+        return all(
+            self._ask(command, b"", bytes((command,)) + value.to_bytes(4, "little")) is not None
+            for command, value in enumerate(address, LssCommand.INQUIRE_VENDOR)
+        )
 
-    def _ask(self, command: int, data: bytes, wanted: int) -> bytes | None:
-        """The answer to a request, None where there is none."""
-        while not self._answers.empty():  # of a dialogue that was given up, or of somebody else's
+    def node_id(self) -> int | None:
+        """Of the node in configuration; None for none. Raises LssFailed."""
+        answer = self._must(LssCommand.INQUIRE_NODE_ID, b"", "the inquiry for its node-ID")
+        return None if answer[1] == NOT_CONFIGURED else answer[1]
+
+    def set_node_id(self, node_id: int) -> None:
+        """It counts from the node's next reset of communication on. Raises LssFailed."""
+        answer = self._must(LssCommand.CONFIGURE_NODE_ID, bytes((node_id,)), f"node-ID {node_id}")
+        _require_done(answer, f"node-ID {node_id}")
+
+    def set_bit_rate(self, bitrate_bps: int) -> None:
+        """It counts from the node's next power-on on, if stored. Raises LssFailed, ValueError for a bit rate
+        that CiA 301 does not have."""
+        codes = {rate: code for code, rate in BIT_RATES_BPS.items()}
+        if bitrate_bps not in codes:
+            raise ValueError(f"bitrate: got {bitrate_bps}, must be one of {', '.join(map(str, codes))}")
+        what = f"bit rate {bitrate_bps}"
+        request = bytes((0, codes[bitrate_bps]))
+        _require_done(self._must(LssCommand.CONFIGURE_BIT_TIMING, request, what), what)
+
+    def store(self) -> None:
+        """Have the node keep its node-ID and bit rate over a power cycle. Raises LssFailed."""
+        answer = self._must(LssCommand.STORE, b"", "the store command")
+        _require_done(answer, "the store command")
+
+    def release(self) -> None:
+        """All nodes back to waiting; one that got its first node-ID boots."""
+        self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
+
+    # --- frames
+
+    def _must(self, command: int, data: bytes, what: str) -> bytes:
+        answer = self._ask(command, data)
+        if answer is None:
+            time.sleep(_UNDER_WAY_S)
+            raise LssFailed(f"{what}: got no answer by LSS, allowed: one within {ANSWER_S:g} s")
+        return answer
+
+    def _ask(
+        self, command: int, data: bytes = b"", wanted: bytes | None = None, answer_s: float = ANSWER_S
+    ) -> bytes | None:
+        """The answer to a request, None where there is none in time: the first that begins with ``wanted``,
+        by default with the command itself. Others belong to a question before."""
+        wanted = bytes((command,)) if wanted is None else wanted
+        while not self._answers.empty():
             self._answers.get()
         self._request(command, data)
-        try:
-            answer = self._answers.get(timeout=ANSWER_S)
-        except queue.Empty:
-            return None
-        return answer if answer[0] == wanted else None
+        end_s = time.monotonic() + answer_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            with contextlib.suppress(queue.Empty):
+                answer = self._answers.get(timeout=left_s)
+                if answer.startswith(wanted):
+                    return answer
+        return None
+
+    def _request(self, command: int, data: bytes) -> None:
+        self._send(od.LSS_REQUEST_COB_ID, (bytes((command,)) + data).ljust(8, b"\0"))
+
+
+def _require_done(answer: bytes, what: str) -> None:
+    if answer[1] != LSS_DONE:
+        detail = f" (the maker's own code {answer[2]})" if answer[1] == 0xFF else ""
+        raise LssFailed(f"{what}: got error code {answer[1]}{detail}, allowed: 0 (done)")

@@ -16,7 +16,7 @@ from typing import Final, Protocol
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.error_control import ErrorControl
-from skinnode.node.lss import NOT_CONFIGURED, BitRateChange, LssAddress, LssSlave
+from skinnode.node.lss import BitRateChange, LssSlave
 from skinnode.node.memory import Memory
 from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.od import ObjectStore
@@ -30,6 +30,7 @@ from skinnode.node.tpdo import TpdoEngine
 from skinnode.transport.bus_state import BusState
 from skinnode.wire import indices as od
 from skinnode.wire.dictionary import Object
+from skinnode.wire.lss import NOT_CONFIGURED, LssAddress
 
 HARDWARE_VERSION: Final = "none"
 """A node in software has no board."""

@@ -10,68 +10,23 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Collection
-from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Final
 
 from skinnode.node.clock import NO_DEADLINE_NS
-
-NOT_CONFIGURED: Final = 0xFF
-"""The node-ID of a node that has none."""
-
-BIT_RATES_BPS: Final = {
-    0: 1_000_000,
-    1: 800_000,
-    2: 500_000,
-    3: 250_000,
-    4: 125_000,
-    6: 50_000,
-    7: 20_000,
-    8: 10_000,
-}
-"""Table 0 of the bit timing service: 5 is reserved, 9 would be automatic detection."""
+from skinnode.wire.lss import (
+    BIT_RATES_BPS,
+    LSS_DONE,
+    NOT_CONFIGURED,
+    RESET_SCAN,
+    LssAddress,
+    LssCommand,
+    LssState,
+)
 
 _CIA_301_TABLE: Final = 0
 
-_DONE, _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 0, 1, 1, 2
+_OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
 """Error codes of the configuration services; 1 has its meaning from the service."""
-
-
-class LssCommand(IntEnum):
-    """Command specifiers; an answer repeats its request's where it has none of its own."""
-
-    SWITCH_GLOBAL = 0x04
-    CONFIGURE_NODE_ID = 0x11
-    CONFIGURE_BIT_TIMING = 0x13
-    ACTIVATE_BIT_TIMING = 0x15
-    STORE = 0x17
-    SELECT_VENDOR = 0x40
-    SELECT_SERIAL = 0x43
-    SELECTED = 0x44
-    IDENTIFY_VENDOR = 0x46
-    IDENTIFY_SERIAL_HIGH = 0x4B
-    IDENTIFY_NOT_CONFIGURED = 0x4C
-    IDENTIFIED = 0x4F
-    IDENTIFIED_NOT_CONFIGURED = 0x50
-    FASTSCAN = 0x51
-    INQUIRE_VENDOR = 0x5A
-    INQUIRE_SERIAL = 0x5D
-    INQUIRE_NODE_ID = 0x5E
-
-
-class LssState(IntEnum):
-    """States of the slave; the value is the mode of the global switch."""
-
-    WAITING = 0
-    CONFIGURATION = 1
-
-
-class LssAddress(NamedTuple):
-    """The identity object, 0x1018, in its order. Unique to a device in the world."""
-
-    vendor_id: int
-    product_code: int
-    revision_number: int
-    serial_number: int
 
 
 # What each frame of a switch selective and of an identify asks of which part of the address.
@@ -88,8 +43,6 @@ _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x4B: (3, operator.le),
 }
 _FIRST_QUESTIONS: Final = (LssCommand.SELECT_VENDOR, LssCommand.IDENTIFY_VENDOR)
-
-_RESET_SCAN: Final = 0x80  # as the bit to check: everybody answers and begins at the vendor-ID
 
 
 class LssSlave:
@@ -196,7 +149,7 @@ class LssSlave:
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
         """One question of the search: are the bits of the address from ``bit`` up those of ``value``? Silence
         means no, so that many slaves can be asked at once."""
-        if bit == _RESET_SCAN:
+        if bit == RESET_SCAN:
             self._scan_part = 0
         else:
             if bit > 31 or part > 3 or next_part > 3 or part != self._scan_part:
@@ -215,13 +168,13 @@ class LssSlave:
                 if not (1 <= node_id <= 127 or node_id == NOT_CONFIGURED):
                     return _frame(command, _OUT_OF_RANGE)
                 self.pending_node_id = node_id
-                return _frame(command, _DONE)
+                return _frame(command, LSS_DONE)
             case LssCommand.CONFIGURE_BIT_TIMING:
                 bit_rate_bps = BIT_RATES_BPS.get(data[2]) if data[1] == _CIA_301_TABLE else None
                 if bit_rate_bps not in self._bit_rates_bps:
                     return _frame(command, _OUT_OF_RANGE)
                 self.pending_bit_rate_bps = bit_rate_bps
-                return _frame(command, _DONE)
+                return _frame(command, LSS_DONE)
             case LssCommand.ACTIVATE_BIT_TIMING:
                 if self._activate is not None:
                     self._activate(self.pending_bit_rate_bps, int.from_bytes(data[1:3], "little"))
@@ -241,7 +194,7 @@ class LssSlave:
             self._store(self.pending_node_id, self.pending_bit_rate_bps)
         except OSError:
             return _STORE_FAILED
-        return _DONE
+        return LSS_DONE
 
 
 class BitRateChange:

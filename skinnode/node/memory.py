@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from skinnode.errors import SkinError
-from skinnode.node.lss import BIT_RATES_BPS, NOT_CONFIGURED
+from skinnode.wire.lss import BIT_RATES_BPS, NOT_CONFIGURED
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import ConfigError
-from skinnode.node.lss import LssAddress
+from skinnode.host.lss import LssFailed
 from skinnode.technician.line import Line
-from skinnode.technician.lss import LssFailed
 from skinnode.technician.survey import find_unconfigured
 from skinnode.wire import indices as od
+from skinnode.wire.lss import LssAddress
 
 BOOT_S: Final = 5.0
 """How long a node may take to boot at its new node-ID."""

@@ -9,10 +9,10 @@ from typing import Final, NamedTuple, Self
 
 from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
+from skinnode.host.lss import LssMaster
 from skinnode.host.network import RemoteOd
 from skinnode.model.config import BusConfig
 from skinnode.technician.heard import Beat, Heard
-from skinnode.technician.lss import LssMaster
 from skinnode.wire import indices as od
 
 STATES: Final = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import NodeError
-from skinnode.node.lss import LssAddress
 from skinnode.technician.line import Line
 from skinnode.wire import indices as od
+from skinnode.wire.lss import LssAddress
 
 PACE_S: Final = 0.001
 """Between two questions: a sixth of a bus at 1 Mbit/s, so that PDOs under way are not held up."""

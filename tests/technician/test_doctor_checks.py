@@ -11,8 +11,8 @@ import pytest
 from skinnode.doctor.checks import diagnose
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.model.config import PatchConfig
-from skinnode.node.lss import LssAddress
 from skinnode.technician.heard import Emergency
+from skinnode.wire.lss import LssAddress
 
 from .healthy import NOISE, STEP, bus_of, node, quiet_ratio, scans_of, stats
 

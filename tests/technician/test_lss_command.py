@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from skinnode.model.config import BusConfig
 from skinnode.node import NmtState, PatchNode, VolatileMemory
-from skinnode.node.lss import NOT_CONFIGURED
+from skinnode.wire.lss import NOT_CONFIGURED
 
 from .conftest import boards, run
 

@@ -9,11 +9,11 @@ import pytest
 
 from skinnode.model.config import BusConfig
 from skinnode.node import NmtState, PatchNode, VolatileMemory
-from skinnode.node.lss import NOT_CONFIGURED, LssAddress
 from skinnode.technician.line import Line
 from skinnode.technician.survey import survey
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
+from skinnode.wire.lss import NOT_CONFIGURED, LssAddress
 
 from .conftest import LAYOUT, run
 

@@ -1,0 +1,65 @@
+"""Layer setting services on the wire (CiA 305 v3.0): what master and slave both must know."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+NOT_CONFIGURED: Final = 0xFF
+"""The node-ID of a node that has none."""
+
+BIT_RATES_BPS: Final = {
+    0: 1_000_000,
+    1: 800_000,
+    2: 500_000,
+    3: 250_000,
+    4: 125_000,
+    6: 50_000,
+    7: 20_000,
+    8: 10_000,
+}
+"""Table 0 of the bit timing service: 5 is reserved, 9 would be automatic detection."""
+
+LSS_DONE: Final = 0
+"""Error code of a configuration service that was carried out."""
+
+RESET_SCAN: Final = 0x80
+"""Of a fastscan, as the bit to check: every node without a node-ID answers, and begins at the vendor-ID."""
+
+
+class LssCommand(IntEnum):
+    """Command specifiers; an answer repeats its request's where it has none of its own."""
+
+    SWITCH_GLOBAL = 0x04
+    CONFIGURE_NODE_ID = 0x11
+    CONFIGURE_BIT_TIMING = 0x13
+    ACTIVATE_BIT_TIMING = 0x15
+    STORE = 0x17
+    SELECT_VENDOR = 0x40
+    SELECT_SERIAL = 0x43
+    SELECTED = 0x44
+    IDENTIFY_VENDOR = 0x46
+    IDENTIFY_SERIAL_HIGH = 0x4B
+    IDENTIFY_NOT_CONFIGURED = 0x4C
+    IDENTIFIED = 0x4F
+    IDENTIFIED_NOT_CONFIGURED = 0x50
+    FASTSCAN = 0x51
+    INQUIRE_VENDOR = 0x5A
+    INQUIRE_SERIAL = 0x5D
+    INQUIRE_NODE_ID = 0x5E
+
+
+class LssState(IntEnum):
+    """States of the slave; the value is the mode of the global switch."""
+
+    WAITING = 0
+    CONFIGURATION = 1
+
+
+class LssAddress(NamedTuple):
+    """The identity object, 0x1018, in its order. Unique to a device in the world."""
+
+    vendor_id: int
+    product_code: int
+    revision_number: int
+    serial_number: int

@@ -130,7 +130,7 @@ def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -
     with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path), "--json"]) as host:
         assert host.says('"elapsed_s"')
         assert eventually(lambda: sum('"elapsed_s"' in line for line in host.lines) >= 2)
-        assert host.end(number) == (0, "")
+        assert host.end(number) == (0, ""), host.lines[-3:]
         last = json.loads([line for line in host.lines if "elapsed_s" in line][-1])
         assert set(last["patches"]) == {"thumb", "index"}
         for patch in last["patches"].values():

@@ -197,7 +197,7 @@ def test_an_interface_that_goes_down_and_comes_up_again(
     make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
 ) -> None:
     """The other bus does not notice."""
-    hand = make_hand()
+    hand = make_hand(sync={"period_ms": 100})
     table = hand.model_dump(mode="json")
     table["buses"].append({"name": "kernel", "interface": "socketcan", "channel": "vcan0"})
     table["patches"][1]["bus"] = "kernel"
@@ -210,7 +210,7 @@ def test_an_interface_that_goes_down_and_comes_up_again(
         try:
             subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
             assert eventually(lambda: host.stats().buses["kernel"].outages == 1)
-            take(host.fields(timeout_s=10, patch="p0"), 50)  # more than a second
+            take(host.fields(timeout_s=10, patch="p0"), 12)  # more than a second
         finally:
             subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
         take(host.fields(timeout_s=10, patch="p1"), 10)

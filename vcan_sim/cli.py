@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.errors import SkinError
+from skinnode.cli._usage import Seconds, run
 
 if TYPE_CHECKING:
     from skinnode.node import NmtState
@@ -36,9 +36,7 @@ def simulate(
     channel: Annotated[
         str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
-    ] = None,
+    seconds: Seconds = None,
     fault: Annotated[
         str,
         typer.Option(
@@ -70,11 +68,7 @@ def simulate(
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    try:
-        app(args=argv)
-    except (SkinError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)
+    run(app, argv)
 
 
 def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:

@@ -41,6 +41,14 @@ def sole_user(option: str, file: Path) -> Iterator[None]:
         os.close(lock)
 
 
+def read_text(option: str, file: Path) -> str:
+    """All of ``file``, the value of ``option``, a character a byte. Raises ConfigError where it cannot be."""
+    try:
+        return file.read_text(encoding="latin-1")
+    except OSError as error:
+        raise ConfigError(option, str(file), f"a file that can be read ({error.strerror})") from error
+
+
 def write_text(option: str, file: Path, text: str) -> None:
     """Raises ConfigError where ``file``, the value of ``option``, does not take all of ``text``."""
     try:

@@ -141,7 +141,9 @@ def path(
 @app.command()
 def node(
     json: JsonFile = None,
-    seconds: Annotated[float, typer.Option(min=0.2, help="Length of each measurement on the bus.")] = 10.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.2, max=3600.0, help="Length of each measurement on the bus.")
+    ] = 10.0,
     rounds: Rounds = 31,
     interface: Annotated[str, typer.Option(help="Of python-can; virtual is in the process.")] = "virtual",
     channel: Annotated[str | None, typer.Option(help="Default: one that nobody else has.")] = None,

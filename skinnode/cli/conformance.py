@@ -44,7 +44,7 @@ def conformance(
     Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
     """
     from skinnode.cli._bus import find_bus
-    from skinnode.cli._files import require_writable
+    from skinnode.cli._files import read_text, require_writable
     from skinnode.conformance import connect, parse_eds, run_cases, select
     from skinnode.conformance.report import list_lines, result_line, summary_line
     from skinnode.errors import ConfigError
@@ -59,7 +59,7 @@ def conformance(
     for option, file in (("--junit", junit), ("--html", html), ("--json", json_file)):
         if file is not None:
             require_writable(option, file)
-    sheet = parse_eds(eds.read_text(encoding="latin-1"), str(eds)) if eds is not None else None
+    sheet = None if eds is None else parse_eds(read_text("--eds", eds), str(eds))
     bus = find_bus(interface, channel, bitrate, fd, None, None).bus
     with CanPort(bus) as port:
         dut = connect(port, node_id, sheet)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
+from skinnode.cli._usage import Seconds
+
 if TYPE_CHECKING:
     from skinnode.host import Host, HostStats
     from skinnode.model.config import HandConfig
@@ -32,9 +34,7 @@ def host(
     channel: Annotated[
         str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
-    ] = None,
+    seconds: Seconds = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
 ) -> None:
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.

@@ -1,4 +1,4 @@
-"""The ``skinnode`` command: names the subcommands, turns errors into one line and an exit status.
+"""The ``skinnode`` command: names the subcommands.
 
 Exit status: 0 fine, 1 a fault was found, 2 could not run (bad input, no bus, no node). One file a subcommand;
 each imports what it needs when it runs, so that ``--help`` answers at once.
@@ -6,8 +6,7 @@ each imports what it needs when it runs, so that ``--help`` answers at once.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -29,7 +28,7 @@ from skinnode.cli import (
     replay,
     scan,
 )
-from skinnode.errors import SkinError
+from skinnode.cli._usage import run
 
 app = typer.Typer(
     name="skinnode",
@@ -72,16 +71,6 @@ def _root(
     pass
 
 
-def run(command: Callable[[Sequence[str] | None], object], argv: Sequence[str] | None = None) -> None:
-    """Run ``command``; an error of ours or of an argument ends as one line on stderr and status 2."""
-    try:
-        command(argv)
-    except (SkinError, ValueError, OSError) as error:
-        line = " ".join(str(error).split())
-        print(f"error: {line}", file=sys.stderr)
-        sys.exit(2)
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    run(lambda arguments: app(args=arguments), argv)
+    run(app, argv)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._layouts import HELP as LAYOUT_HELP
+from skinnode.cli._usage import Seconds
 
 if TYPE_CHECKING:
     from skinnode.node import NodeRunner
@@ -49,9 +50,7 @@ def node(
     strict_timing: Annotated[
         bool, typer.Option("--strict-timing", help="Timers to 0.2 ms instead of 2 ms; takes CPU.")
     ] = False,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
-    ] = None,
+    seconds: Seconds = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
 ) -> None:
     """Run one patch as a CANopen node; its resistances come from your source.
@@ -108,7 +107,7 @@ def node(
         with short_pauses(), NodeRunner(port, [board]) as runner:
             where = f"{interface} {channel}{', CAN FD' if fd else ''}"
             sizes = f"{profile.rows} × {profile.columns} wires, {code_bits}-bit codes"
-            who = f"node {node_id}" if node_id is not None else "node without a node-ID of its own"
+            who = _who(board.node_id, node_id)
             _note(f"{who} ({sizes}, source {source}) on {where}; Ctrl-C ends", as_json)
             _watch(runner, port, told, seconds, as_json)
         faults = _faults(_progress(runner, port, 0.0))
@@ -116,6 +115,14 @@ def node(
         _note(f"fault: {fault}", as_json)
     if faults:
         raise typer.Exit(1)
+
+
+def _who(node_id: int, given: int | None) -> str:
+    """The node-ID in use: one that LSS has stored counts, not the one of --node-id."""
+    from skinnode.wire.lss import NOT_CONFIGURED
+
+    who = "node without a node-ID" if node_id == NOT_CONFIGURED else f"node {node_id}"
+    return who if node_id == given or given is None else f"{who} (LSS stored it; not {given})"
 
 
 @dataclass(frozen=True, slots=True)

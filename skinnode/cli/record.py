@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from skinnode.cli._usage import Seconds
+
 if TYPE_CHECKING:
     from skinnode.model.config import HandConfig
     from skinnode.record import Recorder
@@ -42,9 +44,7 @@ def record(
     channel: Annotated[
         str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after this long; default: at Ctrl-C.", metavar="S")
-    ] = None,
+    seconds: Seconds = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
 ) -> None:
     """Run a hand's patches as `skinnode host` does and record every frame, received and sent.

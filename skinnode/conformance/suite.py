@@ -22,7 +22,7 @@ def select(names: Sequence[str]) -> tuple[Case, ...]:
         return CASES
     wanted = {name.strip().upper() for name in names if name.strip()}
     known = {case.id for case in CASES} | {case.area for case in CASES}
-    for name in sorted(wanted - known):
+    for name in sorted(wanted - known) if wanted else [",".join(names)]:
         areas = ", ".join(dict.fromkeys(case.area for case in CASES))
         raise ConfigError("--only", name, f"an area ({areas}) or a case such as SDO-07")
     return tuple(case for case in CASES if case.id in wanted or case.area in wanted)

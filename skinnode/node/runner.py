@@ -60,7 +60,7 @@ class NodeRunner:
         self._heard = 0
         self._bus_state = BusState.ACTIVE
         self._sent_before = 0  # frames, when everything had begun to fail: one more, and the bus is back
-        self._stopping = threading.Event()
+        self._powered, self._stopping = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
 
@@ -70,8 +70,10 @@ class NodeRunner:
         return self._error is not None
 
     def start(self) -> None:
-        """Power on. The boot-up messages follow from the thread, in the order of the nodes."""
+        """Power on, in the order of the nodes, and return when they have their node-IDs; what goes wrong is
+        raised by :meth:`stop`."""
         self._thread.start()
+        self._powered.wait()
 
     def stop(self) -> None:
         """End and join the thread; the nodes are off. Raises what ended the thread before, and does nothing
@@ -102,10 +104,12 @@ class NodeRunner:
             now_ns = time.monotonic_ns()
             for node in self.nodes:
                 node.power_on(now_ns)
+            self._powered.set()
             self._drive()
         except BaseException as error:  # whatever it is, it belongs to whoever calls stop()
             self._error = error
         finally:
+            self._powered.set()
             for node in self.nodes:
                 node.power_off()
 

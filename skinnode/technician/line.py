@@ -21,8 +21,8 @@ STATES: Final = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operati
 LONGEST_HEARTBEAT_S: Final = 2.5
 """How long a heartbeat is waited for; nodes that beat more seldom are not known to be there by it."""
 
-GUARD_ANSWER_S: Final = 0.15
-"""How long the answer to a remote frame may take."""
+GUARD_ANSWERS_S: Final = (0.15, 0.5)
+"""How long the answer to a remote frame may take; a node, or a machine, that was busy is asked once more."""
 
 _POLL_S: Final = 0.002
 
@@ -114,10 +114,13 @@ class Line:
                 return State(None, f"no heartbeat, though one every {heartbeat_s:g} s is set")
         if not guarding:
             return State(None, "no heartbeat, and a master guards the node")
-        asked_ns = time.monotonic_ns()
-        self.link.ask_remote(od.heartbeat_cob_id(node_id))
-        beat = self._beat(node_id, asked_ns, GUARD_ANSWER_S)
-        return State(beat.state, "guarding") if beat is not None else State(None, "no heartbeat, no guarding")
+        for answer_s in GUARD_ANSWERS_S:
+            asked_ns = time.monotonic_ns()
+            self.link.ask_remote(od.heartbeat_cob_id(node_id))
+            beat = self._beat(node_id, asked_ns, answer_s)
+            if beat is not None:
+                return State(beat.state, "guarding")
+        return State(None, "no heartbeat, no guarding")
 
     def close(self) -> None:
         self.link.close()

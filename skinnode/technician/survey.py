@@ -192,10 +192,14 @@ def _only_heard(line: Line, node_id: int) -> FoundNode | None:
 
 
 def _two_serials(line: Line, node_id: int) -> str:
+    """What speaks for two nodes; empty where the second answer was a late one to the sweep before."""
     answers = line.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
+    answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:]]
+    if len(answers) < 2:
+        return ""
     serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
     shown = " and ".join(map(str, serials))
-    return f"one question got {max(2, len(answers))} answers" + (f": serials {shown}" if shown else "")
+    return f"one question got {len(answers)} answers" + (f": serials {shown}" if shown else "")
 
 
 def _number(line: Line, node_id: int, index: int, subindex: int) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -46,21 +47,57 @@ def skinnode_version() -> str:
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "line"),
     [
-        ("demo", "--patches", "0"),
-        ("demo", "--patches", "17"),
-        ("demo", "--seconds", "zero"),
-        ("demo", "--seconds", "nan"),
-        ("demo", "--no-such-option"),
-        ("no-such-command",),
+        ("demo --patches 0", "skinnode demo: --patches: got '0', allowed: an integer from 1 to 16"),
+        ("demo --patches 17", "skinnode demo: --patches: got '17', allowed: an integer from 1 to 16"),
+        ("demo --seconds zero", "skinnode demo: --seconds: got 'zero', allowed: a number from 1.0 to 3600.0"),
+        ("demo --seconds nan", "skinnode demo: --seconds: got 'nan', allowed: a number from 1.0 to 3600.0"),
+        ("scan --bitrat 1", "skinnode scan: got '--bitrat', allowed: the options of --help (--bitrate"),
+        ("scan --bitrate x", "skinnode scan: --bitrate: got 'x', allowed: an integer"),
+        ("scan --bitrate 5", "--bitrate: got 5, allowed: a bit rate from 10000 to 1000000"),
+        ("info", "skinnode info: NODE: got nothing, allowed: a value"),
+        ("node", "skinnode node: --source: got nothing, allowed: a value"),
+        ("host hand.toml --seconds -1", "skinnode host: --seconds: got '-1', allowed: a number of seconds"),
+        ("node --source simulated --seconds inf", "skinnode node: --seconds: got 'inf', allowed: a number"),
+        ("record hand.toml x --seconds nan", "skinnode record: --seconds: got 'nan', allowed: a number"),
+        ("conformance --only ,", "--only: got ',', allowed: an area"),
+        ("conformance --node-id 4 --eds no.eds", "--eds: got 'no.eds', allowed: a file that can be read"),
+        (
+            "lss set --serial -4",
+            "skinnode lss set: --serial: got '-4', allowed: an integer from 0 to 4294967295",
+        ),
+        ("no-such-command", "skinnode: no such command 'no-such-command'"),
     ],
 )
-def test_wrong_usage_is_status_2_without_a_traceback(arguments: tuple[str, ...]) -> None:
-    done = skinnode(*arguments)
+def test_wrong_usage_is_one_line_and_status_2(arguments: str, line: str) -> None:
+    done = skinnode(*arguments.split())
     assert done.returncode == 2
+    assert done.stdout == ""
+    (said,) = done.stderr.splitlines()
+    assert said.startswith(f"error: {line}")
+
+
+def test_a_group_without_a_command_shows_its_help() -> None:
+    done = skinnode("lss")
+    assert done.returncode == 2
+    assert "list" in done.stdout + done.stderr
     assert "Traceback" not in done.stderr
-    assert done.stderr.strip()
+
+
+def test_completion_is_written_for_the_shell() -> None:
+    """What ``skinnode --install-completion`` installs; ``--show-completion`` prints it by itself."""
+    script = completion(_SKINNODE_COMPLETE="source_bash")
+    assert "_SKINNODE_COMPLETE=complete_bash" in script
+    asked = completion(_SKINNODE_COMPLETE="complete_bash", COMP_WORDS="skinnode do", COMP_CWORD="1")
+    assert asked.split() == ["doctor"]
+
+
+def completion(**environment: str) -> str:
+    environment = {**os.environ, **environment}
+    return subprocess.run(
+        [str(SKINNODE)], capture_output=True, text=True, env=environment, check=False
+    ).stdout
 
 
 @pytest.mark.parametrize("option", ["--json", "--plot"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -51,8 +50,6 @@ def boards(bus: BusConfig, *node_ids: int, **options: Any) -> Iterator[list[Patc
             for node_id in node_ids
         ]
         with NodeRunner(port, nodes):
-            while not all(node._handlers for node in nodes):  # until the thread has powered them on
-                time.sleep(0.001)
             yield nodes
 
 

@@ -1,0 +1,101 @@
+"""What a user got wrong on the command line, as one line and status 2; and how every command ends."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from skinnode.errors import SkinError
+
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # of click, or of typer's own copy of it
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise typer.BadParameter(f"{text!r} is not a number of seconds from 0 on")
+    return value
+
+
+Seconds = Annotated[
+    float | None,
+    typer.Option(parser=_seconds, help="End after this long; default: at Ctrl-C.", metavar="S"),
+]
+
+
+def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:
+    """Run ``app`` and exit with its status: an error of ours or of an argument is one line on stderr and
+    status 2."""
+    try:
+        status = app(args=argv, standalone_mode=False)
+    except _UsageError as error:
+        if not _wants_help(error):
+            _end(usage_line(error))
+        sys.exit(2)
+    except typer.Abort:
+        _end("stopped at the question; nothing was changed")
+    except (SkinError, ValueError, OSError) as error:
+        _end(" ".join(str(error).split()))
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _end(line: str) -> None:
+    print(f"error: {line}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _wants_help(error: Any) -> bool:
+    """Whether a group was called without a command; then its help is what is wanted."""
+    if type(error).__name__ != "NoArgsIsHelpError":
+        return False
+    text = error.ctx.get_help()  # rich prints it by itself and returns nothing
+    if text:
+        typer.echo(text, err=True)
+    return True
+
+
+def usage_line(error: Any) -> str:
+    """``skinnode scan: --bitrate: got 'x', allowed: an integer``."""
+    message = " ".join(error.format_message().split()).rstrip(".")
+    param, kind = getattr(error, "param", None), type(error).__name__
+    if kind == "NoSuchOption":
+        perhaps = f" ({', '.join(error.possibilities)}?)" if error.possibilities else ""
+        message = f"got {error.option_name!r}, allowed: the options of --help{perhaps}"
+    elif param is not None and kind == "MissingParameter":
+        message = f"{_name(param)}: got nothing, allowed: {_number(param) or 'a value'}"
+    elif param is not None and kind == "BadParameter":
+        got, _, allowed = message.rpartition(": ")[2].partition(" is not ")
+        if error.__cause__ is not None and hasattr(error.__cause__, "errors"):  # pydantic converts for typer
+            got, allowed = repr(error.__cause__.errors()[0]["input"]), ""
+        message = f"{_name(param)}: got {got}, allowed: {allowed or _number(param)}"
+    else:
+        message = message[:1].lower() + message[1:]
+    return f"{error.ctx.command_path}: {message}" if error.ctx is not None else message
+
+
+def _name(param: Any) -> str:
+    """As the user writes it: the option, or what the help calls the argument."""
+    if param.param_type_name == "option":
+        return str(max(param.opts, key=len))
+    return str(param.metavar or param.name.upper())
+
+
+def _number(param: Any) -> str:
+    """Which numbers; empty for what is none. From the parameter, or from its type as click has it."""
+    converter = getattr(param, "type", param)
+    described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
+    name = described.__name__ if isinstance(described, type) else getattr(converter, "name", "")
+    number = {"int": "an integer", "float": "a number"}.get(name.partition(" ")[0].replace("integer", "int"))
+    low, high = getattr(converter, "min", None), getattr(converter, "max", None)
+    if number is None or low is high is None:
+        return number or ""
+    if high is None:
+        return f"{number} of at least {low}"
+    return f"{number} up to {high}" if low is None else f"{number} from {low} to {high}"

@@ -77,7 +77,7 @@ def formats() -> str:
                 f"{profile.n_chunks} × {profile.chunk_bytes} bytes + 1",
                 f"{scan_s * 1e3:.2f}",
                 f"{1 / scan_s:.0f}",
-                md.code(f"{step:.1e}".replace("e-0", "e-")),
+                f"{step * 1e6:.2g} ppm",
             )
         )
     head = (

@@ -35,6 +35,18 @@ def test_commands_of_the_table_exist() -> None:
         assert done.returncode == 0, done.stderr
 
 
+def test_the_table_has_every_command() -> None:
+    from typer.main import get_command
+
+    from skinnode.cli.main import app
+
+    rows = [line for line in README.splitlines() if line.startswith("| `")]
+    for name, command in get_command(app).commands.items():
+        words = [f"{name} {inner}" for inner in getattr(command, "commands", {})] or [name]
+        for word in words:
+            assert any(word in row for row in rows), word
+
+
 def test_the_second_example_runs_against_simulated_patches(multicast_group: str) -> None:
     folder = Path(__file__).parents[1]
     simulator = subprocess.Popen(

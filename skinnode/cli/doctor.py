@@ -138,4 +138,5 @@ def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
         out.print("\nnot judged:")
         for line in lines:
             out.print(Padding(escape(line), (0, 0, 0, 10)))
-    out.print(f"\n{len(findings)} findings" if findings else "\nnothing is wrong with what was looked at")
+    count = "1 finding" if len(findings) == 1 else f"{len(findings)} findings"
+    out.print(f"\n{count}" if findings else "\nnothing is wrong with what was looked at")

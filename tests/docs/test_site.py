@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import skinnode
 from skinnode.model.config import HandConfig
 from skinnode.wire.profile import REFERENCE_PROFILES
 
@@ -103,6 +104,13 @@ def test_generated_tables_have_what_they_are_made_of(site: Path) -> None:
     for item in REFERENCE_PROFILES[0].objects():
         assert item.name in wire or f"{item.index:04X}" in wire or item.name[-1].isdigit(), item.name
     assert not re.search("generated:", hand + wire)
+
+
+def test_the_python_reference_has_every_public_name(site: Path) -> None:
+    page = (site / "python.html").read_text(encoding="utf-8")
+    for name in skinnode.__all__:
+        if name != "__version__":
+            assert re.search(rf'id="skinnode\.(?:[\w.]+\.)?{name}"', page), name
 
 
 def test_a_picture_from_outside_would_be_found() -> None:

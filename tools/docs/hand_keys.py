@@ -42,7 +42,7 @@ def _sections(path: str, model: type[BaseModel], *, listed: bool) -> list[str]:
     rows, below = [], []
     for name, field in model.model_fields.items():
         inner = tables_in(field.annotation)
-        rows.append(_row(name, field, is_table=bool(inner)))
+        rows.append(_row(name, field))
         if inner:
             key = f"{path}.{name}".strip(".")
             below += _sections(key, inner[0], listed=get_origin(field.annotation) is tuple)
@@ -51,11 +51,12 @@ def _sections(path: str, model: type[BaseModel], *, listed: bool) -> list[str]:
     return [f"## {title}\n\n{text}{md.table(head, rows)}", *below]
 
 
-def _row(name: str, field: FieldInfo, *, is_table: bool) -> tuple[str, ...]:
-    about = md.prose(field.description or "")
+def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
+    inner = tables_in(field.annotation)
+    about = md.prose(field.description or (inner[0].__doc__ if inner else "") or "")
     kind = _kind(field.annotation)
     allowed = allowed_in(field) or {"boolean": "true or false"}.get(kind, "")
-    if is_table:
+    if inner:
         kind, allowed = ("tables" if kind.startswith("list") else kind), allowed or "see below"
     elif kind == "table":
         allowed = "names and values"

@@ -11,14 +11,18 @@ from types import FrameType
 
 @contextmanager
 def until_told() -> Iterator[threading.Event]:
-    """An event that SIGINT (Ctrl-C) and SIGTERM set. The handlers from before are back at the end of the
-    block. For the main thread; Python allows no other to handle signals (ValueError)."""
+    """An event that SIGINT (Ctrl-C), SIGTERM and, unless it is ignored as under nohup, SIGHUP (the terminal
+    is gone) set. The handlers from before are back at the end of the block. For the main thread; Python
+    allows no other to handle signals (ValueError)."""
     told = threading.Event()
 
     def tell(_signal: int, _frame: FrameType | None) -> None:
         told.set()
 
-    kept = {number: signal.signal(number, tell) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    kept = {number: signal.signal(number, tell) for number in numbers}
     try:
         yield told
     finally:

@@ -195,7 +195,7 @@ class HealthWatch:
                 if isinstance(now, BusHealth) and counter == "foreign":
                     detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
                 elif isinstance(now, PatchHealth) and counter == "emergencies":
-                    detail = f", last 0x{now.last_emergency or 0:04X}"
+                    detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
                 self._tell(name, counter, f"{count - told} {words}{detail}")
 
     def _tell(self, subject: str, what: str, text: str) -> None:

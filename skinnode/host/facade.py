@@ -27,11 +27,10 @@ from skinnode.host.start import bring_up_all, go_on_unless, start_all
 from skinnode.host.station import Station
 from skinnode.host.supervisor import NodeStats, Supervisor
 from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
-from skinnode.host.tap import HostTap, tap_lane, tap_link
+from skinnode.host.tap import HostTap, tap_bus, tap_link
 from skinnode.host.workers import Workers
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
+from skinnode.model.config import HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
-from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 from skinnode.wire.plan import check_plan
 from skinnode.wire.profile import PatchProfile
@@ -138,7 +137,6 @@ class Host:
         boot_deadline_s: float = bringup.BOOT_DEADLINE_S,
         cancelled: Callable[[], bool] = _never,
         tap: HostTap | None = None,
-        open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> Iterator[Host]:
         """Bring a hand up; shut it down at the end of the ``with`` block.
 
@@ -149,7 +147,6 @@ class Host:
             boot_deadline_s: how long a node may take to answer for the first time.
             cancelled: asked during bring-up; when it says True, bring-up ends with BringUpCancelled.
             tap: writes down what passes, bring-up included: a :class:`skinnode.record.Recorder`.
-            open_port: opens the interface of a bus, where that is not one of python-can's.
 
         Raises ConfigError for options, EDS or baseline files that contradict the hand, and for a layout that
         cannot be solved; BusLoadError for a plan that does not fit its bus; BusError for an interface that
@@ -173,7 +170,7 @@ class Host:
             buses = {
                 bus.name: _serve_bus(
                     hand,
-                    stack.enter_context(contextlib.closing(BusLink(bus, {}, publisher.fail, open_port))),
+                    stack.enter_context(contextlib.closing(BusLink(bus, {}, publisher.fail))),
                     ticks if bus.role == "master" else Ticks(hand.sync.counter_overflow),
                 )
                 for bus in hand.buses
@@ -281,17 +278,29 @@ class Host:
     def _all_bus_health(self) -> dict[str, BusHealth]:
         return {bus: self.bus_health(bus) for bus in self._buses}
 
-    def tap(self, tap: HostTap) -> None:
-        """Let ``tap`` write down what passes, from now until the host closes."""
+    def tap(self, tap: HostTap) -> Callable[[], None]:
+        """Let ``tap`` write down what passes, from now until what is returned is called or the host closes.
+        One at a time."""
+        ends = []
         for bus in self._buses.values():
-            stations = [station for station in self._stations.values() if station.link is bus.link]
+            lanes = [station.lane for station in self._stations.values() if station.link is bus.link]
+            ends.append(tap_bus(tap, bus.link, lanes))
 
-            def begin(link: BusLink = bus.link, stations: Sequence[Station] = tuple(stations)) -> None:
-                tap_link(tap, link)
-                for station in stations:
-                    tap_lane(tap, station.lane)
+        def untap() -> None:
+            for end in ends:
+                end()
 
-            bus.link.call(begin)
+        return untap
+
+    def tare(self, patch: str) -> None:
+        """Have a patch take what it feels now for being untouched, by RPDO1, which nobody answers: the host
+        notices the new baseline and reads it, ``stats().nodes[patch].baselines`` counts. The node forgets it
+        at power-off unless told to store (0x1010).
+
+        Raises KeyError for no such patch, NodeError where it must not be done (the host is a guest there, or
+        the baseline is that of a file) or cannot (the node is not operational), BusError.
+        """
+        self._stations[patch].tare()
 
     def stats(self) -> HostStats:
         """All counters."""

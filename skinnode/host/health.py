@@ -14,6 +14,7 @@ from typing import Final
 
 from skinnode.errors import CodecError
 from skinnode.host.code_watch import CodeWatch, WireFault
+from skinnode.wire.emergency import error_text
 from skinnode.wire.indices import emcy_cob_id, heartbeat_cob_id
 
 _log = logging.getLogger(__name__)
@@ -81,6 +82,8 @@ class PatchHealth:
     """EMCY messages with an error, since the host started."""
     last_emergency: int | None
     """Code of the newest of them."""
+    emergency_text: str
+    """The newest of them in words; empty before the first."""
     error_register: int
     rejoins: int = 0
     """Times the node came back and was brought up again since the host started."""
@@ -143,6 +146,7 @@ class NodeMonitor:
         self._t_restart_ns: int | None = None
         self._boot_ups = self._emergencies = self._error_register = 0
         self._last_emergency: int | None = None
+        self._emergency_text = ""
         self.running = False
         """Set once the node was started: from then on a boot-up is a restart."""
         self.rejoins = 0
@@ -190,7 +194,7 @@ class NodeMonitor:
         self._error_register = data[2]
         if code:
             self._emergencies += 1
-            self._last_emergency = code
+            self._last_emergency, self._emergency_text = code, error_text(code, data[3:])
 
     def said_since(self, state: int, t_ns: int) -> bool:
         """Whether the newest heartbeat came after ``t_ns`` and carried ``state``."""
@@ -228,6 +232,7 @@ class NodeMonitor:
             boot_ups=self._boot_ups,
             emergencies=self._emergencies,
             last_emergency=self._last_emergency,
+            emergency_text=self._emergency_text,
             error_register=self._error_register,
             rejoins=self.rejoins,
             refusal=self.refusal,

@@ -37,11 +37,7 @@ class BusLink(Dealer):
     """
 
     def __init__(
-        self,
-        config: BusConfig,
-        handlers: Mapping[int, Handler],
-        on_failure: Callable[[SkinError], None],
-        open_port: Callable[[BusConfig], CanPort] = CanPort,
+        self, config: BusConfig, handlers: Mapping[int, Handler], on_failure: Callable[[SkinError], None]
     ) -> None:
         super().__init__(config, handlers, time.monotonic_ns())
         self._on_failure = on_failure
@@ -54,7 +50,7 @@ class BusLink(Dealer):
         self.t_dealt_ns = 0
         """What was received up to then has been dealt out, monotonic."""
         self._stop = threading.Event()
-        self._port = open_port(config)
+        self._port = CanPort(config)
         self.network = SkinNetwork(self.send)
         self._receiver = Receiver(self._port)
         self._thread = threading.Thread(target=self._run, name=f"mainline {config.name}", daemon=True)
@@ -95,6 +91,10 @@ class BusLink(Dealer):
         """From now on ``listener`` gets every frame that was sent, with the time at which it was handed to
         the interface, on the thread that sent it."""
         self._sent_listeners = (*self._sent_listeners, listener)
+
+    def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
+        """From now on ``listener`` gets no more. On the mainline."""
+        self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object]) -> None:
         """Have ``job`` done by the mainline, before any frame that is received from now on."""

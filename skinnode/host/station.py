@@ -9,13 +9,14 @@ from typing import Final
 from skinnode.errors import BusError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.bringup import Bringer, NodeFacts
-from skinnode.host.health import STOPPED
+from skinnode.host.health import OPERATIONAL, STOPPED
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.pipeline import Solver
 from skinnode.host.reception import PatchReception
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.wire import indices as od
+from skinnode.wire.codec import pack_command
 from skinnode.wire.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
@@ -108,6 +109,18 @@ class Station:
             return None
         self.facts = facts.with_baseline(baseline_ohm)
         return Solver(self.facts, self._hand.solver)
+
+    def tare(self) -> None:
+        """Tell the node to take what it feels now for its baseline. Any thread. Raises as
+        :meth:`Host.tare`."""
+        node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
+        if self.is_guest:
+            raise NodeError(node_id, f"{said}: the host is a guest there")
+        if self.patch.baseline is not None:  # it would be written back at once
+            raise NodeError(node_id, f"{said}: its baseline is that of {self.patch.baseline}")
+        if not self.monitor.running or self.monitor.nmt_state != OPERATIONAL:  # PDOs are heard by no other
+            raise NodeError(node_id, f"{said}: it is not operational")
+        self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
 
     def withhold(self) -> int:
         """Have the mainline withhold scans; returns the number that :meth:`start` wants. Raises NodeTimeout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from skinnode.host.link import BusLink
@@ -21,13 +21,36 @@ class HostTap(LaneTap, Protocol):
         """A frame that the interface has taken. On whatever thread sent it."""
 
 
-def tap_link(tap: HostTap, link: BusLink) -> None:
-    """From now on ``tap`` hears of every frame."""
-    link.listen(functools.partial(tap.received, link.config.name))
-    link.listen_to_sent(functools.partial(tap.sent, link.config.name))
+def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
+    """From now on ``tap`` hears of every frame, until what is returned is called. Both on the mainline, or
+    before it runs."""
+    received = functools.partial(tap.received, link.config.name)
+    sent = functools.partial(tap.sent, link.config.name)
+    link.listen(received)
+    link.listen_to_sent(sent)
+
+    def end() -> None:
+        link.unlisten(received)
+        link.unlisten_to_sent(sent)
+
+    return end
 
 
-def tap_lane(tap: HostTap, lane: Lane) -> None:
-    """From now on ``tap`` hears of the lane; first of how it is. Mainline."""
-    lane.tap = tap
-    lane.tell_tap()
+def tap_bus(tap: HostTap, link: BusLink, lanes: Sequence[Lane]) -> Callable[[], None]:
+    """Have the mainline let ``tap`` hear of every frame and of the lanes, first of how they are; and no more
+    when what is returned is called, from any thread."""
+    ends: list[Callable[[], None]] = []
+
+    def begin() -> None:
+        ends.append(tap_link(tap, link))
+        for lane in lanes:
+            lane.tap = tap
+            lane.tell_tap()
+
+    def end() -> None:
+        for lane in lanes:
+            lane.tap = None
+        ends.pop()()
+
+    link.call(begin)
+    return lambda: link.call(end)

@@ -63,6 +63,7 @@ def test_emergency_makes_faulty_until_it_is_over(monitor: NodeMonitor) -> None:
     health = monitor.health(2 * MS, 0.25, 0.08)
     assert health.condition is Condition.FAULTY
     assert (health.emergencies, health.last_emergency, health.error_register) == (1, 0x5000, 0x81)
+    assert health.emergency_text == "wire open or shorted: upper wire open 3"
     monitor.on_emergency(bytes(8), 3 * MS)
     health = monitor.health(4 * MS, 0.25, 0.08)
     assert health.condition is Condition.OPERATIONAL

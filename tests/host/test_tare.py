@@ -1,0 +1,87 @@
+"""Taring a patch of a running hand, and listening in for a while."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skinnode.errors import NodeError
+from skinnode.host import Host
+from skinnode.model.config import HandConfig
+from skinnode.record import Recorder
+from skinnode.transport import CanPort
+
+from .conftest import Rack, eventually, heard
+
+
+def depth_m(host: Host, patch: str) -> float:
+    field = host.latest(patch)
+    return 0.0 if field is None else float(np.abs(field.displacement_m).max())
+
+
+def test_a_pressed_patch_reads_zero_after_a_tare(hand: HandConfig, rack: Rack) -> None:
+    with Host.from_config(hand) as host:
+        rest_ohm = rack.sources["p0"].ohm
+        rack.sources["p0"].ohm = 0.98 * rest_ohm  # all crossings, as a warmer rubber would
+        assert eventually(lambda: depth_m(host, "p0") > 1e-5)
+        host.tare("p0")
+        assert eventually(lambda: host.stats().nodes["p0"].baselines == 1)
+        assert eventually(lambda: depth_m(host, "p0") < 1e-6)
+        assert host.stats().nodes["p1"].baselines == 0
+
+
+def test_a_guest_does_not_tare(make_hand: Callable[..., HandConfig], rack_of: Callable[..., Rack]) -> None:
+    bus = {"channel": uuid.uuid4().hex[:8], "role": "guest", "guest_sends": "sdo"}
+    hand = make_hand(1, sync={"period_ms": 25, "counter_overflow": 0}, buses=[bus])
+    rack_of(hand).plug("p0")
+    with Host.from_config(hand) as host:
+        with pytest.raises(NodeError, match=r"p0.*not tared: the host is a guest"):
+            host.tare("p0")
+        with pytest.raises(KeyError):
+            host.tare("thumb")
+
+
+def test_a_baseline_of_a_file_is_not_tared_over(
+    make_hand: Callable[..., HandConfig], rack_of: Callable[..., Rack], tmp_path: Path
+) -> None:
+    own = make_hand(1)
+    rack = rack_of(own)
+    np.savetxt(tmp_path / "p0.txt", rack.sources["p0"].ohm)
+    rack.plug("p0")
+    patch = own.patches[0].model_copy(update={"baseline": tmp_path / "p0.txt"})
+    with (
+        Host.from_config(own.model_copy(update={"patches": (patch,)})) as host,
+        pytest.raises(NodeError, match=r"its baseline is that of .*p0\.txt"),
+    ):
+        host.tare("p0")
+
+
+def test_who_is_not_operational_is_not_tared(
+    make_hand: Callable[..., HandConfig],
+    rack_of: Callable[..., Rack],
+    listener_of: Callable[[HandConfig], CanPort],
+) -> None:
+    hand = make_hand(2, bring_up={"missing": "wait"})
+    rack_of(hand).plug("p1")
+    listener = listener_of(hand)
+    with Host.from_config(hand, boot_deadline_s=0.2) as host:
+        with pytest.raises(NodeError, match="not operational"):
+            host.tare("p0")
+        host.tare("p1")
+        assert eventually(lambda: any((f.can_id, f.data[:4]) == (0x206, b"tare") for f in heard(listener)))
+
+
+def test_a_tap_hears_nothing_after_its_end(hand: HandConfig, rack: Rack, tmp_path: Path) -> None:
+    with Host.from_config(hand) as host, Recorder(hand, tmp_path / "one.log") as recorder:
+        untap = host.tap(recorder)
+        assert eventually(lambda: recorder.stats().frames > 50)
+        untap()
+        scans = host.stats().patches["p0"].solved
+        assert eventually(lambda: host.stats().patches["p0"].solved > scans + 2)
+        frames = recorder.stats().frames
+        assert eventually(lambda: host.stats().patches["p0"].solved > scans + 10)
+        assert recorder.stats().frames == frames

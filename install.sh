@@ -1,6 +1,7 @@
 #!/bin/sh
 # install.sh [EXTRA]: make the virtual environment .venv beside this file and install skinnode into it.
 #   sh install.sh          what a robot needs, and plots
+#   sh install.sh tui      what a robot needs, and the full screen of skinnode monitor
 #   sh install.sh bench    what a robot needs, and Ceres to measure against
 #   sh install.sh test     the first, editable, with everything the tests use
 # Needs Python 3.11 or newer (PYTHON=... chooses one). On a Debian without the venv module it installs that first.
@@ -9,8 +10,8 @@ cd "$(dirname "$0")"
 python=${PYTHON:-python3}
 extra=${1:-plot}
 case $extra in
-    plot | bench | test) ;;
-    *) echo "install.sh: got $extra, allowed: plot, bench or test" >&2; exit 2 ;;
+    plot | tui | bench | test) ;;
+    *) echo "install.sh: got $extra, allowed: plot, tui, bench or test" >&2; exit 2 ;;
 esac
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
@@ -29,5 +30,5 @@ if [ ! -x .venv/bin/pip ]; then
 fi
 case $extra in
     test) .venv/bin/pip install --quiet --editable '.[test]' ;;
-    plot | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
+    plot | tui | bench) .venv/bin/pip install --quiet ".[$extra]" ;;
 esac

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import math
 import signal
-import sys
 import threading
 import time
 from collections import deque
@@ -29,7 +28,7 @@ from skinnode.host.pipeline import LaneStats
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
-from skinnode.pauses import short_pauses
+from skinnode.pauses import responsive_threads, short_pauses
 from skinnode.wire.codec import CodeScale
 from vcan_sim.fleet import Fleet
 
@@ -204,7 +203,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         "boot-up, identity, configuration, start",
         soft_wrap=True,
     )
-    with _responsive_threads(), _ended_by_sigterm(), Fleet(hand) as fleet:
+    with responsive_threads(), _ended_by_sigterm(), Fleet(hand) as fleet:
         with Host.from_config(hand) as host, short_pauses():
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
@@ -257,18 +256,6 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
     )
     traces = (watch.trace() for watch in watches.values())
     return Run(report, tuple(trace for trace in traces if trace is not None))
-
-
-@contextlib.contextmanager
-def _responsive_threads() -> Iterator[None]:
-    """Node and host share one interpreter here; at Python's 5 ms a thread could wait longer than a scan takes
-    to solve. The two of a real hand do not share one."""
-    kept = sys.getswitchinterval()
-    sys.setswitchinterval(5e-4)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(kept)
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from skinnode.cli import (
     host,
     info,
     lss,
+    monitor,
     nmt,
     node,
     od,
@@ -47,6 +48,7 @@ app.command(name="info")(info.info)
 app.command(name="od")(od.od)
 app.command(name="nmt")(nmt.nmt)
 app.add_typer(lss.app, name="lss")
+app.command(name="monitor")(monitor.monitor)
 app.command(name="doctor")(doctor.doctor)
 app.command(name="record")(record.record)
 app.command(name="replay")(replay.replay)

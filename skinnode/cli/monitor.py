@@ -1,0 +1,175 @@
+"""``skinnode monitor``: a hand on a full screen, or as a line of JSON a second."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.cli._bus import Channel, Interface
+
+if TYPE_CHECKING:
+    import threading
+
+    from skinnode.model.config import HandConfig
+    from skinnode.monitor.source import Source
+
+_SIMULATED = 4
+"""Patches of the hand that is simulated where no file says which."""
+
+
+def monitor(
+    hand: Annotated[
+        Path | None, typer.Argument(help="The hand to run and to look at.", metavar="[HAND.toml]")
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(help="Look at a recording of `skinnode record`.", metavar="RECORDING"),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="Of --replay: 2 is twice as fast.", metavar="X")] = 1.0,
+    simulate: Annotated[
+        bool,
+        typer.Option(
+            "--simulate", help="Press simulated patches on a bus of their own: those of the hand, or four."
+        ),
+    ] = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Where the key r records to.", metavar="FOLDER")
+    ] = Path(),
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="End after this long; default: at q.", metavar="S")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="No screen: a JSON object a second, for programs.")
+    ] = False,
+) -> None:
+    """Show a hand on the terminal: height and shear, contacts, health, rates, bus load, events.
+
+    It runs the hand as `skinnode host` does, but waits for patches that are missing.
+    Keys: 1-9 choose a patch, z shows it alone, t tares it, r records, space holds
+    the picture, ? helps, q quits. Needs the extra `tui`. Exit status 0 if nothing
+    was wrong while it ran, 1 if something was (it is printed at the end), 2 if it
+    could not run.
+    """
+    from skinnode.errors import NOTHING, ConfigError, Shown
+
+    if not as_json:
+        _require_screen()
+    if (hand is not None or simulate) == (replay is not None):
+        got = NOTHING if replay is None else Shown("it and --replay")
+        raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
+    if not output.is_dir():
+        raise ConfigError("--output", str(output), "an existing folder")
+    from skinnode.host import BringUpCancelled
+    from skinnode.pauses import responsive_threads, short_pauses
+    from skinnode.signals import until_told
+
+    with until_told() as told, ExitStack() as stack:
+        try:
+            if replay is not None:
+                source = _recording(stack, replay, speed)
+            else:
+                source = _running(stack, _plan(hand, interface, channel, simulate), told, simulate, as_json)
+        except BringUpCancelled:
+            return
+        with responsive_threads(), short_pauses():
+            faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, output)
+    for fault in faults:
+        print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
+    if faults:
+        raise typer.Exit(1)
+
+
+def _require_screen() -> None:
+    """Raises ConfigError where there is no terminal, or nothing to draw on it with."""
+    from importlib.util import find_spec
+
+    from skinnode.errors import ConfigError, Shown
+
+    if find_spec("textual") is None:
+        allowed = "it (pip install 'skinnode[tui]', or sh install.sh tui), or --json"
+        raise ConfigError("skinnode monitor", Shown("no textual"), allowed)
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise ConfigError("standard input and output", Shown("no terminal"), "one, or --json")
+
+
+def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
+    """The hand to run, missing patches waited for."""
+    from skinnode.cli.demo import demo_hand
+    from skinnode.model.config import load_hand
+
+    if hand is not None:
+        plan = load_hand(hand).on(interface, channel)
+    else:
+        plan = demo_hand(_SIMULATED, seed=1)
+        # forces are the posterior's to tell
+        solver = plan.solver.model_copy(update={"method": "posterior"})
+        plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
+    if simulate:
+        from skinnode.cli._simulated import on_simulated_buses
+
+        plan = on_simulated_buses(plan)
+    waiting = plan.bring_up.model_copy(update={"missing": "wait"})
+    return plan.model_copy(update={"bring_up": waiting})
+
+
+def _running(
+    stack: ExitStack, plan: HandConfig, told: threading.Event, simulate: bool, quiet: bool
+) -> Source:
+    """A host of that hand; ``stack`` ends it. Raises as :meth:`Host.from_config`."""
+    from skinnode.cli._console import progress
+    from skinnode.host import Host
+    from skinnode.host.pipeline import check_solvable
+    from skinnode.jit import is_cold
+    from skinnode.monitor.source import HostSource
+
+    with progress(quiet) as tell:
+        tell("compiling the kernels, once" if is_cold() else "preparing the solvers")
+        for patch in plan.patches:
+            check_solvable(patch, plan.solver)
+        if simulate:
+            from skinnode.cli._simulated import simulated
+
+            stack.enter_context(simulated(plan))
+        tell(f"bringing up {len(plan.patches)} patches")
+        host = stack.enter_context(Host.from_config(plan, cancelled=told.is_set))
+    return stack.enter_context(HostSource(host))
+
+
+def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
+    """A recording that is played; ``stack`` ends it. Raises ConfigError."""
+    from skinnode.monitor.source import ReplaySource
+    from skinnode.record import replay
+
+    return stack.enter_context(ReplaySource(replay(path, speed=speed)))
+
+
+def _show(source: Source, told: threading.Event, seconds: float | None, output: Path) -> list[str]:
+    """The screen; what was wrong meanwhile. Raises the SkinError that ended the source."""
+    from skinnode.monitor.app import MonitorApp, terminal_colours
+
+    app = MonitorApp(
+        source, folder=output, colours=terminal_colours(os.environ), over=told.is_set, seconds=seconds
+    )
+    app.run(mouse=False)  # the terminal's own: text can be selected and copied
+    if app.failure is not None:
+        raise app.failure
+    return app.faults.lines
+
+
+def _print(source: Source, told: threading.Event, seconds: float | None) -> list[str]:
+    """A line of JSON a second; what was wrong meanwhile. Raises the SkinError that ended the source."""
+    from skinnode.cli._files import plain
+    from skinnode.monitor.report import FaultBook, watch
+
+    faults = FaultBook()
+    for line in watch(source, told, seconds, faults):
+        print(json.dumps(plain(line)), flush=True)
+    return faults.lines

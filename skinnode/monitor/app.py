@@ -1,0 +1,291 @@
+"""The full screen: takes the newest from a source some times a second, and does what keys say."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import ClassVar, Final
+
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+
+from skinnode.errors import SkinError
+from skinnode.monitor.look import Ui, look_for
+from skinnode.monitor.maps import Colours, Scale
+from skinnode.monitor.paint import screen
+from skinnode.monitor.report import FaultBook
+from skinnode.monitor.source import Source
+from skinnode.monitor.state import History, Level, LogLine, View, log_line, time_of_day
+from skinnode.monitor.terminal import PatientDriver
+from skinnode.monitor.widgets import Canvas, Dialog
+
+PERIOD_S: Final = 0.1
+"""From one picture to the next, at least."""
+SHARE: Final = 0.2
+"""Share of a processor that drawing may take: what costs more is drawn less often."""
+SLOWEST_S: Final = 0.5
+
+_LOG_LINES: Final = 500
+_BEGIN_S: Final = 3.0
+_MESSAGE_S: Final = 5.0
+_TARE_S: Final = 3.0
+"""How long a new baseline may take to be read."""
+
+HELP: Final = """\
+ 1 … 9, ← →, tab   choose a patch
+ z, enter          that patch alone, and back (also esc)
+ t, T              tare it, or all of them: what is felt now is zero
+ r                 record, and stop recording
+ space             hold the picture; the host goes on
+ a                 arrows of shear on the maps, or not
+ q, ctrl-c         quit
+
+ Bright is deep; the bar beside "contacts" says how deep. Arrows show
+ shear, to the right along the upper wires, upwards across them. A
+ map without colours is an old one: its patch sends nothing now."""
+
+# What libraries warn of is for programmers.
+_SAID_BY_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
+
+
+class MonitorApp(App[None]):
+    """The monitor of a source, until a key, ``over`` or ``seconds`` end it. Recordings go to ``folder``."""
+
+    ENABLE_COMMAND_PALETTE = False
+    CSS = "Screen { background: #11131a; } Screen:ansi { background: ansi_default; }"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q,ctrl+c,ctrl+q", "leave", "quit", priority=True),
+        Binding("right,tab,l", "choose(1)", "next patch", priority=True),
+        Binding("left,shift+tab,h", "choose(-1)", "patch before", priority=True),
+        *[Binding(str(number), f"choose_number({number})", "patch") for number in range(1, 10)],
+        Binding("z,enter", "zoom", "zoom"),
+        Binding("escape", "unzoom", "back"),
+        Binding("t", "tare(False)", "tare"),
+        Binding("T", "tare(True)", "tare all"),
+        Binding("r", "record", "record"),
+        Binding("space,p", "pause", "pause"),
+        Binding("a", "arrows", "arrows"),
+        Binding("question_mark,f1", "help", "help"),
+    ]
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        folder: Path,
+        colours: Colours,
+        over: Callable[[], bool] = lambda: False,
+        seconds: float | None = None,
+    ) -> None:
+        super().__init__(driver_class=PatientDriver, ansi_color=colours != "rgb")
+        self.faults = FaultBook()
+        self.failure: SkinError | None = None
+        """What ended the source."""
+        self._source, self._folder, self._told, self._seconds = source, folder, over, seconds
+        self._look = look_for(colours)
+        self.canvas = Canvas()
+        self._names = [patch.name for patch in source.hand.patches]
+        self._selected = 0
+        self._zoomed = self._paused = False
+        self._arrows = True
+        self._message: tuple[float, str, Level] = (0.0, "", "good")
+        self._history = History(source.hand)
+        self._baselines: Mapping[str, int] = {}
+        self._lines: deque[LogLine] = deque(maxlen=_LOG_LINES)
+        self._scale = Scale()
+        self._view: View | None = None
+        self._tares: dict[str, tuple[float, int]] = {}
+        self._begun_s = time.monotonic()
+        self._cpu_s = 0.0
+        self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
+        self._records = _Records(self._lines)
+
+    def compose(self) -> ComposeResult:
+        yield self.canvas
+
+    def on_mount(self) -> None:
+        logging.getLogger().addHandler(self._records)
+        self._begun_s = time.monotonic()
+        self._cpu_s = time.thread_time()
+        self._turn()
+
+    def on_unmount(self) -> None:
+        logging.getLogger().removeHandler(self._records)
+
+    # --- the picture
+
+    def _turn(self) -> None:
+        """Look and draw, and come back when it is time."""
+        now_s = time.monotonic()
+        driver = self._driver
+        gone = isinstance(driver, PatientDriver) and driver.gone
+        late = self._seconds is not None and now_s - self._begun_s >= self._seconds
+        try:
+            self._look_at_source()
+        except SkinError as error:
+            self.failure = error
+        if gone or late or self._told() or self.failure is not None:
+            self.exit()
+            return
+        if not (isinstance(driver, PatientDriver) and driver.busy):
+            self._draw()
+        cpu_s = time.thread_time()
+        spent_s, self._cpu_s = cpu_s - self._cpu_s, cpu_s
+        self.set_timer(min(SLOWEST_S, max(PERIOD_S, spent_s / SHARE)), self._turn)
+
+    def _look_at_source(self) -> None:
+        snapshot = self._source.snapshot()
+        view = self._history.add(snapshot)
+        self._baselines = snapshot.baselines
+        self.faults.look(view, time.monotonic_ns())
+        for event in self._source.events():
+            begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
+            if not begins:  # that a hand begins is no news
+                self._lines.append(log_line(event, self._wall_minus_mono_ns))
+        self._settle_tares()
+        if not self._paused:
+            self._view = view
+            self._scale.look(view.t_ns, view.deepest_m)
+
+    def _draw(self) -> None:
+        view, ui, full_m, log = self._view, self._ui(), self._scale.full_m, tuple(self._lines)
+        if view is not None:
+            self.canvas.show(lambda width, height: screen(view, ui, log, full_m, self._look, width, height))
+
+    def _ui(self) -> Ui:
+        now_s = time.monotonic()
+        until_s, message, level = self._message
+        return Ui(
+            title=self._source.title,
+            selected=self._names[self._selected],
+            elapsed_s=now_s - self._begun_s,
+            zoomed=self._zoomed,
+            paused=self._paused,
+            arrows=self._arrows,
+            over=self._source.over,
+            live=self._source.live,
+            recording=self._source.recording,
+            message=message if now_s < until_s else "",
+            message_level=level,
+        )
+
+    def _say(self, text: str, level: Level = "good") -> None:
+        self._message = time.monotonic() + _MESSAGE_S, text, level
+        self._lines.append(LogLine(time_of_day(time.time_ns()), "", text, level))
+        self._draw()
+
+    # --- keys
+
+    def action_leave(self) -> None:
+        self.exit()
+
+    def action_choose(self, step: int) -> None:
+        self._selected = (self._selected + step) % len(self._names)
+        self._draw()
+
+    def action_choose_number(self, number: int) -> None:
+        if number <= len(self._names):
+            self._selected = number - 1
+            self._draw()
+
+    def action_zoom(self) -> None:
+        self._zoomed = not self._zoomed
+        self._draw()
+
+    def action_unzoom(self) -> None:
+        self._zoomed = False
+        self._draw()
+
+    def action_pause(self) -> None:
+        self._paused = not self._paused
+        self._draw()
+
+    def action_arrows(self) -> None:
+        self._arrows = not self._arrows
+        self._draw()
+
+    def action_help(self) -> None:
+        self.push_screen(Dialog(HELP, question=False))
+
+    def action_tare(self, everything: bool) -> None:
+        names = self._names if everything else [self._names[self._selected]]
+        if not self._source.live:
+            self._say("a recording cannot be tared", "bad")
+            return
+        what = "all patches" if everything else names[0]
+        felt = [
+            f"{name} {1e6 * (self._view.patch(name).depth_m or 0.0):.0f} µm" for name in names if self._view
+        ]
+        text = f"Tare {what}?\n\nWhat is felt now will be zero: {', '.join(felt)}.\nLeave the skin alone.\n\n"
+        self.push_screen(
+            Dialog(text + "y, enter: tare     any other key: no", question=True),
+            lambda sure: self._tare(names) if sure else None,
+        )
+
+    def _tare(self, names: list[str]) -> None:
+        told = []
+        for name in names:
+            count = self._baselines.get(name, 0)
+            try:
+                self._source.tare(name)
+            except SkinError as error:
+                self._say(str(error), "bad")
+            else:
+                self._tares[name] = time.monotonic() + _TARE_S, count
+                told.append(name)
+        if told:
+            self._say(f"{', '.join(told)}: told to tare")
+
+    def _settle_tares(self) -> None:
+        """Tell what became of tares."""
+        for name, (until_s, before) in list(self._tares.items()):
+            if self._baselines.get(name, 0) > before:
+                del self._tares[name]
+                self._say(f"{name}: tared, its new baseline is in use")
+            elif time.monotonic() > until_s:
+                del self._tares[name]
+                self._say(f"{name}: no new baseline within {_TARE_S:g} s of the tare", "bad")
+
+    async def action_record(self) -> None:
+        source = self._source
+        try:
+            if source.recording is None:
+                path = await asyncio.to_thread(source.record, self._folder)
+                self._say(f"recording to {path}")
+            else:
+                ended = await asyncio.to_thread(source.stop_recording)
+                lost = f", {ended.dropped} lost" if ended.dropped else ""
+                why = f": {ended.failure}" if ended.failure else ""
+                level: Level = "bad" if lost or why else "good"
+                self._say(f"{ended.frames} frames{lost}{why} in {ended.path}", level)
+        except SkinError as error:
+            self._say(str(error), "bad")
+
+
+class _Records(logging.Handler):
+    """Warnings of the log, as lines on the screen: on the terminal they would destroy the picture."""
+
+    def __init__(self, lines: deque[LogLine]) -> None:
+        super().__init__(logging.WARNING)
+        self._lines = lines
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.name.startswith("skinnode") and record.name not in _SAID_BY_EVENTS:
+            text = " ".join(record.getMessage().split())
+            self._lines.append(LogLine(time_of_day(int(record.created * 1e9)), "", text, "note"))
+
+
+def terminal_colours(environment: Mapping[str, str]) -> Colours:
+    """What the terminal has by its environment, as rich works it out."""
+    from rich.console import Console
+
+    if environment.get("NO_COLOR"):
+        return "none"
+    system = Console(force_terminal=True, _environ=environment).color_system
+    if system in ("truecolor", "256"):
+        return "rgb"
+    return "none" if system is None else "ansi"

@@ -1,0 +1,196 @@
+"""The screen as lines of text: header, buses, patches, contacts and log, of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from rich.segment import Segment
+
+from skinnode.monitor import maps
+from skinnode.monitor.look import Look, Ui, beside, pad, spread, width_of
+from skinnode.monitor.maps import Line
+from skinnode.monitor.paint_patch import GONE, alone, facts, tiles
+from skinnode.monitor.state import BusView, LogLine, PatchView, View
+from skinnode.monitor.touches import Touch
+
+LEAST_WIDTH: Final = 50
+LEAST_HEIGHT: Final = 16
+"""A smaller screen shows only how large it would have to be."""
+
+
+def screen(
+    view: View, ui: Ui, log: Sequence[LogLine], full_m: float, look: Look, width: int, height: int
+) -> list[Line]:
+    """``height`` lines of ``width`` characters; the log's newest line is its last."""
+    if width < LEAST_WIDTH or height < LEAST_HEIGHT:
+        told = f"{width} × {height} is too small: {LEAST_WIDTH} × {LEAST_HEIGHT} at least"
+        return [pad([Segment(told[:width], look.text)], width, look)] + [
+            pad([], width, look) for _ in range(height - 1)
+        ]
+    buses = [_bus_line(bus, look, width) for bus in view.buses[: max(1, height // 8)]]
+    upper = height - 2 - len(buses) - (8 if height < 28 else 12)
+    if ui.zoomed:
+        patch = view.patch(ui.selected)
+        middle = alone(patch, ui, full_m, look, width, upper)
+        log = [line for line in log if line.subject in (patch.name, patch.bus, "")]
+    else:
+        middle = tiles(view.patches, ui, full_m, look, width, upper)
+    lower = height - 2 - len(buses) - len(middle)
+    return [
+        _header(view, ui, look, width),
+        *buses,
+        *middle,
+        *_lower(view, ui, log, full_m, look, width, lower),
+        _keys(ui, look, width),
+    ]
+
+
+def as_text(lines: Sequence[Line]) -> str:
+    """Without styles, for tests and for people who cannot see colours."""
+    return "\n".join("".join(segment.text for segment in line) for line in lines)
+
+
+def _header(view: View, ui: Ui, look: Look, width: int) -> Line:
+    bar = look.bar
+    seconds = int(ui.elapsed_s)
+    left = [
+        Segment(" ", bar),
+        Segment(ui.title, look.key),
+        Segment(f"  {seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}", bar),
+    ]
+    wrong = sum(patch.level == "bad" for patch in view.patches) + sum(
+        bus.level == "bad" for bus in view.buses
+    )
+    if wrong:
+        left += [Segment("  ", bar), Segment(f" {wrong} {'fault' if wrong == 1 else 'faults'} ", look.alarm)]
+    if ui.paused:
+        left += [Segment("  ", bar), Segment(" PAUSED ", look.alarm)]
+    if ui.over:
+        left += [Segment("  ", bar), Segment(" END OF RECORDING ", look.alarm)]
+    if ui.recording is not None:
+        frames = f" ● REC {ui.recording.frames} frames "
+        left += [Segment("  ", bar), Segment(frames, look.alarm)]
+    rates = f"{view.scans_hz:.1f} scans/s  "
+    if width >= 100:
+        rates += f"{view.fields_hz:.0f} fields/s  "
+    if view.latency_s is not None and view.latency_max_s is not None:
+        rates += f"latency {1e3 * view.latency_s:.1f} ms, worst {1e3 * view.latency_max_s:.1f} "
+    return spread(left, [Segment(rates, bar)], width, look, bar)
+
+
+def _bus_line(bus: BusView, look: Look, width: int) -> Line:
+    cells = 12 if width < 110 else 24
+    full = min(cells, round(bus.load * cells))
+    load = look.bad if bus.load > 0.9 else look.note if bus.load > 0.7 else look.gauge
+    line = [
+        Segment(f" {bus.name:<6.12}", look.strong),
+        Segment("load ", look.dim),
+        Segment("█" * full, load),
+        Segment("·" * (cells - full), look.dim),
+        Segment(f"{100 * bus.load:4.0f} %  ", look.text),
+        Segment(f"{bus.frames_hz:5.0f}", look.text),
+        Segment(" frames/s  ", look.dim),
+        Segment("; ".join(bus.words) or "nothing lost", look.of(bus.level)),
+    ]
+    where = [Segment(f"  {bus.where} ({bus.role}) ", look.dim)]
+    if width_of(line) + width_of(where) > width:
+        return pad(line, width, look)
+    return spread(line, where, width, look)
+
+
+def _keys(ui: Ui, look: Look, width: int) -> Line:
+    if ui.message:
+        style = look.alarm if ui.message_level == "bad" else look.key
+        return pad([Segment(f" {ui.message} ", style)], width, look, look.bar)
+    keys = [("1-9", "patch"), ("z", "back" if ui.zoomed else "zoom")]
+    if ui.live:
+        keys += [("t", "tare"), ("r", "stop recording" if ui.recording else "record")]
+    keys += [("space", "go on" if ui.paused else "pause"), ("a", "arrows"), ("?", "help"), ("q", "quit")]
+    line = [Segment(" ", look.bar)]
+    for key, what in keys:
+        line += [Segment(key, look.key), Segment(f" {what}  ", look.bar)]
+    return pad(line, width, look, look.bar)
+
+
+# --- contacts and log
+
+
+def _lower(
+    view: View, ui: Ui, log: Sequence[LogLine], full_m: float, look: Look, width: int, height: int
+) -> list[Line]:
+    """Contacts and events: below each other, or beside where there is room. Where there is a lot, the figures
+    of the patch that is chosen as well."""
+    chosen = view.patch(ui.selected)
+    patches = (chosen,) if ui.zoomed else view.patches
+    scale = [] if ui.zoomed else maps.legend(full_m, 10, look.colours, look.text)
+    if width >= 130:
+        left = min(80, width // 2)
+        figures = [] if ui.zoomed else [[], *facts(chosen, look, left - 2)]
+        share = height - len(figures) if height - len(figures) >= 7 else height
+        below = [[Segment(" ", look.text), *line] for line in figures[: height - share]]
+        lines = [*_contacts(patches, scale, look, left - 2, share), *below]
+        blocks = [(lines, left), (_log(log, look, width - left, height), width - left)]
+        return beside(blocks, height, look)
+    share = min(4, max(2, height // 2))
+    lines = [
+        *_contacts(patches, scale, look, width, share),
+        *_log(log, look, width, height - share),
+    ]
+    return [pad(line, width, look) for line in lines]
+
+
+def _rule(title: str, tail: Line, look: Look, width: int) -> Line:
+    left = [Segment("─ ", look.dim), Segment(title, look.dim), Segment(" ", look.dim)]
+    dashes = max(0, width - width_of(left) - width_of(tail) - 1)
+    return pad(
+        [*left, Segment("─" * dashes, look.dim), Segment(" " if tail else "", look.text), *tail], width, look
+    )
+
+
+def _contacts(patches: Sequence[PatchView], scale: Line, look: Look, width: int, height: int) -> list[Line]:
+    rows = [(patch, touch) for patch in patches if patch.condition not in GONE for touch in patch.touches]
+    rows.sort(key=lambda row: -(row[1].force_n or 1e3 * row[1].depth_m))
+    hidden = len(rows) - (height - 1)
+    title = "contacts" + (f" ({hidden} more)" if hidden > 0 else "")
+    lines = [_rule(title, scale, look, width)]
+    lines += [pad(_touch_line(patch, touch, look), width, look) for patch, touch in rows[: height - 1]]
+    if not rows:
+        known = any(patch.depth_m is not None for patch in patches)
+        lines.append([Segment(" nothing touches" if known else " nothing known yet", look.dim)])
+    return [*lines, *([[]] * (height - len(lines)))]
+
+
+def _touch_line(patch: PatchView, touch: Touch, look: Look) -> Line:
+    if touch.force_n is None:
+        force = [Segment("force not known ", look.dim)]
+    else:
+        std = "" if touch.force_std_n is None else f" ± {touch.force_std_n:.2f}"
+        force = [Segment(f"{touch.force_n:6.2f}{std} N  ", look.strong)]
+    line = [Segment(f" {patch.name:<9.9}", look.text), *force]
+    if touch.shear_n is not None:
+        size = float((touch.shear_n[0] ** 2 + touch.shear_n[1] ** 2) ** 0.5)
+        sign = maps.arrow(*touch.shear_n) if size >= 0.005 else "·"
+        line.append(Segment(f"{sign} {size:4.2f} N  ", look.text))
+    return [
+        *line,
+        Segment(f"x {1e3 * touch.x_m:5.1f}  y {1e3 * touch.y_m:5.1f} mm  ", look.text),
+        Segment(f"{1e6 * touch.area_m2:4.0f} mm²  {1e6 * touch.depth_m:4.0f} µm", look.dim),
+    ]
+
+
+def _log(log: Sequence[LogLine], look: Look, width: int, height: int) -> list[Line]:
+    lines = [_rule("events", [], look, width)]
+    shown = log[-(height - 1) :] if height > 1 else []
+    for line in shown:
+        subject = f"{line.subject} " if line.subject else ""
+        lines.append(
+            [
+                Segment(f" {line.time} ", look.dim),
+                Segment(subject, look.strong),
+                Segment(line.text, look.of(line.level) if line.level != "good" else look.text),
+            ]
+        )
+    if not shown:
+        lines.append([Segment(" nothing happened", look.dim)])
+    return [*lines, *([[]] * (height - len(lines)))]

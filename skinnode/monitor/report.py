@@ -1,0 +1,159 @@
+"""What is left of a session when the screen is gone, and what programs get instead of one."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, Final
+
+from skinnode.host.health import Condition, PatchHealth
+from skinnode.monitor.source import Source
+from skinnode.monitor.state import History, PatchView, View
+from skinnode.monitor.touches import Touch
+
+SETTLE_NS: Final = 3_000_000_000
+"""How long a patch may take to become operational before the monitor counts it as a fault."""
+
+LOOK_S: Final = 0.1
+LINE_S: Final = 1.0
+"""How often a program is told, and how often it is looked for faults."""
+
+
+class FaultBook:
+    """What was wrong during a session, each fault once, in the order it was seen."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[str, str], str] = {}
+        self._begun_ns: int | None = None
+        self._settled: set[str] = set()
+
+    @property
+    def lines(self) -> list[str]:
+        """A line each."""
+        return list(self._found.values())
+
+    def look(self, view: View, real_ns: int) -> None:
+        """Write down what is wrong at ``real_ns``, by the clock of the monitor."""
+        if self._begun_ns is None:
+            self._begun_ns = real_ns
+        patient = real_ns - self._begun_ns < SETTLE_NS
+        for patch in view.patches:
+            if patch.condition == Condition.OPERATIONAL:
+                self._settled.add(patch.name)
+            elif patch.name in self._settled or not patient:
+                self._add(patch.name, patch.condition, patch.condition)
+            for key, text in _lasting(patch.health):
+                self._add(patch.name, key, text)
+            counts = patch.lane.assembler
+            for what, count in (
+                ("scans torn", counts.scans_torn),
+                ("scans missed", counts.scans_missed),
+                ("chunks lost", counts.chunks_lost),
+            ):
+                if count:
+                    self._add(patch.name, what, f"{count} {what}")
+        for bus in view.buses:
+            if bus.level == "bad":
+                for word in bus.words:
+                    self._add(bus.name, word.lstrip("0123456789 ").partition(":")[0], word)
+
+    def _add(self, subject: str, key: str, text: str) -> None:
+        self._found[subject, key] = f"{subject}: {text}"
+
+
+def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
+    """What is wrong beside the condition; what makes it one fault, and its text."""
+    wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
+    found = [(text, text) for text in wires]
+    if health.duplicate_id:
+        found.append(("duplicate", f"two nodes have node-ID {health.node_id}"))
+    if health.last_emergency:
+        code = f"EMCY 0x{health.last_emergency:04X}"
+        found.append((code, f"{code} {health.emergency_text}"))
+    return found
+
+
+def watch(
+    source: Source, told: threading.Event, seconds: float | None, faults: FaultBook
+) -> Iterator[dict[str, Any]]:
+    """A table for programs every second until told, time is up or the source is over, and one at the end;
+    what was wrong meanwhile goes into ``faults``. Raises the SkinError that ended the source."""
+    begun_s = due_s = time.monotonic()
+    due_s += LINE_S
+    history = History(source.hand)
+    ending, pending = False, list[str]()
+    while not ending:
+        ending = told.wait(LOOK_S) or source.over
+        now_s = time.monotonic()
+        ending |= seconds is not None and now_s >= begun_s + seconds
+        view = history.add(source.snapshot())
+        faults.look(view, time.monotonic_ns())
+        pending += [str(event) for event in source.events()]
+        if ending or now_s >= due_s:
+            due_s += LINE_S
+            yield {"elapsed_s": round(now_s - begun_s, 2), **as_json(view), "events": pending}
+            pending = []
+
+
+def as_json(view: View) -> dict[str, Any]:
+    """The view for programs: without the fields themselves."""
+    return {
+        "patches": {patch.name: _patch_json(patch) for patch in view.patches},
+        "buses": {
+            bus.name: {
+                "level": bus.level,
+                "words": list(bus.words),
+                "load": round(bus.load, 4),
+                "frames_hz": round(bus.frames_hz, 1),
+                "lost": bus.lost,
+            }
+            for bus in view.buses
+        },
+        "fields_hz": round(view.fields_hz, 2),
+        "latency_s": view.latency_s,
+        "latency_max_s": view.latency_max_s,
+    }
+
+
+def _patch_json(patch: PatchView) -> dict[str, Any]:
+    counts = patch.lane.assembler
+    return {
+        "node_id": patch.node_id,
+        "bus": patch.bus,
+        "condition": patch.condition,
+        "level": patch.level,
+        "words": list(patch.words),
+        "wires": [
+            {"side": fault.side, "number": fault.number, "state": str(fault.state)}
+            for fault in patch.health.wires
+        ],
+        "emergencies": patch.health.emergencies,
+        "rate_hz": round(patch.rate_hz, 2),
+        "latency_s": patch.latency_s,
+        "latency_max_s": patch.latency_max_s,
+        "scan": patch.scan,
+        "trusted": patch.trusted,
+        "torn": counts.scans_torn,
+        "missed": counts.scans_missed,
+        "skipped": patch.lane.skipped,
+        "chunks_lost": counts.chunks_lost,
+        "depth_m": patch.depth_m,
+        "depth_std_m": patch.depth_std_m,
+        "shear_m": list(patch.shear_m),
+        "contacts": [_touch_json(touch) for touch in patch.touches],
+    }
+
+
+def _touch_json(touch: Touch) -> dict[str, Any]:
+    return {
+        "x_m": touch.x_m,
+        "y_m": touch.y_m,
+        "place_std_m": touch.place_std_m,
+        "depth_m": touch.depth_m,
+        "area_m2": touch.area_m2,
+        "area_std_m2": touch.area_std_m2,
+        "normal_force_n": touch.force_n,
+        "normal_force_std_n": touch.force_std_n,
+        "shear_force_n": None if touch.shear_n is None else list(touch.shear_n),
+    }

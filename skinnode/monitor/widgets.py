@@ -1,0 +1,92 @@
+"""What the screen is made of: a canvas that draws only lines that changed, and two dialogs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import BindingType
+from textual.geometry import Region
+from textual.screen import ModalScreen
+from textual.strip import Strip
+from textual.widget import Widget
+from textual.widgets import Static
+
+from skinnode.monitor.maps import Line
+
+Painter = Callable[[int, int], list[Line]]
+"""Lines for a width and a height."""
+
+
+class Canvas(Widget):
+    """Shows what a painter paints. Of a new picture only the lines that differ go to the terminal."""
+
+    DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._painter: Painter = lambda width, height: []
+        self._strips: list[Strip] = []
+
+    def show(self, painter: Painter) -> None:
+        """Show this from now on, at whatever size."""
+        self._painter = painter
+        self._paint()
+
+    @property
+    def text(self) -> str:
+        """What is to be read."""
+        return "\n".join(strip.text for strip in self._strips)
+
+    def on_resize(self) -> None:
+        self._strips = []
+        self._paint()
+
+    def render_line(self, y: int) -> Strip:
+        return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
+
+    def _paint(self) -> None:
+        width, height = self.size
+        if not width or not height:
+            return
+        before = self._strips
+        self._strips = [Strip(line, width) for line in self._painter(width, height)]
+        changed = [
+            Region(0, y, width, 1)
+            for y, strip in enumerate(self._strips)
+            if y >= len(before) or strip != before[y]
+        ]
+        if changed:
+            self.refresh(*changed)
+
+
+class Dialog(ModalScreen[bool]):
+    """Some text in a box; closed with True by ``enter`` or ``y`` where it is a question, else by any key."""
+
+    CSS = """
+    Dialog { align: center middle; background: $background 40%; }
+    Dialog Static {
+        width: auto; max-width: 76; height: auto; padding: 1 2; border: round #8cf5e1;
+        background: #232838; color: #c9cedb;
+    }
+    Dialog:ansi Static { border: round ansi_cyan; background: ansi_default; color: ansi_default; }
+    """
+    AUTO_FOCUS = None
+    BINDINGS: ClassVar[list[BindingType]] = []
+
+    def __init__(self, text: str, *, question: bool) -> None:
+        super().__init__()
+        self._text, self._question = text, question
+
+    @property
+    def text(self) -> str:
+        """What it says."""
+        return self._text
+
+    def compose(self) -> ComposeResult:
+        yield Static(self._text, markup=False)
+
+    def on_key(self, event: object) -> None:
+        key = getattr(event, "key", "")
+        self.dismiss(self._question and key in ("y", "enter"))

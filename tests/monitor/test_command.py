@@ -1,0 +1,90 @@
+"""``skinnode monitor`` without a screen: for programs, and what it says where it cannot run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from skinnode.host import Host
+from skinnode.model.config import HandConfig
+from skinnode.record import Recorder, replay
+from vcan_sim.fleet import Fleet
+
+from .conftest import PATIENCE_S, PROGRAM, a_hand, write_hand
+
+
+def run(*arguments: str, program: list[str] = PROGRAM) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*program, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, stdin=subprocess.DEVNULL
+    )
+
+
+def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
+    with Fleet(crossing_hand):
+        done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "4")
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == 4
+    newest = lines[-1]
+    assert {patch["condition"] for patch in newest["patches"].values()} == {"operational"}
+    assert newest["patches"]["p0"]["rate_hz"] == pytest.approx(2.5, abs=0.6)
+    assert newest["buses"]["can0"]["level"] == "good"
+    assert 0 < newest["latency_s"] < 1
+
+
+def test_json_of_a_hand_that_is_not_there_is_a_fault(tmp_path: Path, crossing_hand: HandConfig) -> None:
+    done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "3.2")
+    assert done.returncode == 1
+    newest = json.loads(done.stdout.splitlines()[-1])
+    assert {patch["condition"] for patch in newest["patches"].values()} == {"never seen"}
+    assert done.stderr.splitlines() == ["fault: p0: never seen", "fault: p1: never seen"]
+
+
+def test_json_of_a_recording(tmp_path: Path) -> None:
+    hand, path = a_hand(2, sync={"period_ms": 200}), tmp_path / "run.log"
+    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
+        time.sleep(1.5)
+    solved = len(list(replay(path)))
+    done = run("--replay", str(path), "--speed", "2", "--json")
+    assert done.returncode == 0, done.stderr
+    newest = json.loads(done.stdout.splitlines()[-1])
+    assert sum(patch["scan"] is not None for patch in newest["patches"].values()) == 2
+    assert solved > 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--simulate"], "standard input and output: got no terminal, allowed: one, or --json"),
+        (["--json"], "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate and --replay RECORDING"),
+        (["--json", "--simulate", "-o", "/nowhere"], "--output: got '/nowhere', allowed: an existing folder"),
+        (["--json", "/nowhere.toml"], "nowhere.toml"),
+        (["--json", "--replay", "/nowhere.log"], "nowhere"),
+    ],
+)
+def test_what_cannot_run_is_one_line(arguments: list[str], said: str) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert said in done.stderr
+
+
+def test_without_textual_one_line_says_what_to_install() -> None:
+    code = "import sys; sys.modules['textual'] = None; from skinnode.cli.main import main; main()"
+    done = run("--simulate", program=[sys.executable, "-c", code, "monitor"])
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "sh install.sh tui" in done.stderr
+
+
+def test_simulated_patches_are_a_hand_to_begin_with() -> None:
+    done = run("--simulate", "--json", "--seconds", "2")
+    newest = json.loads(done.stdout.splitlines()[-1])
+    assert set(newest["patches"]) == {"palm", "thumb", "index", "middle"}
+    assert all(patch["rate_hz"] > 0 for patch in newest["patches"].values()), done.stderr

@@ -1,0 +1,220 @@
+"""What the view says of a host, held against the truth of the simulator; maps and lines of any size."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skinnode.host import Host
+from skinnode.model.frames import FieldFrame, SolveStats
+from skinnode.model.layout import PatchLayout
+from skinnode.model.status import Status
+from skinnode.monitor import maps
+from skinnode.monitor.look import Ui, look_for
+from skinnode.monitor.maps import Colours, Scale, aspect_of, paint_map, paint_shear, surface_of
+from skinnode.monitor.paint import as_text, screen
+from skinnode.monitor.report import FaultBook, as_json
+from skinnode.monitor.source import HostSource, ReplaySource
+from skinnode.monitor.state import History, View
+from skinnode.record import Recorder, replay
+from vcan_sim.fleet import Fleet
+
+from .conftest import a_hand
+
+LAYOUT = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
+"""10 × 10 electrodes."""
+
+
+def a_field(moved_m: dict[tuple[int, int], tuple[float, float, float]], std_m: float = 1e-7) -> FieldFrame:
+    displacement_m = np.zeros_like(LAYOUT.upper_m)
+    for place, vector in moved_m.items():
+        displacement_m[place] = vector
+    wires = displacement_m.shape[0]
+    return FieldFrame(
+        displacement_m=displacement_m,
+        displacement_std_m=np.full_like(displacement_m, std_m),
+        status=(Status.CONVERGED,) * wires,
+        residual=np.zeros(wires),
+        stats=SolveStats(0, 0, 0, 0.0),
+    )
+
+
+def cells(lines: list[maps.Line], sign: str) -> set[tuple[int, int]]:
+    text = as_text(lines).split("\n")
+    return {(x, y) for y, line in enumerate(text) for x, found in enumerate(line) if found == sign}
+
+
+@pytest.mark.parametrize(("width", "height"), [(20, 10), (40, 20), (60, 30)])
+@pytest.mark.parametrize(("wire", "electrode"), [(0, 0), (9, 9), (2, 7)])
+def test_an_electrode_has_its_cell(width: int, height: int, wire: int, electrode: int) -> None:
+    surface = surface_of(a_field({(wire, electrode): (0.0, 0.0, -3e-4)}), LAYOUT.upper_m)
+    lines = paint_map(surface, width, height, 3e-4, "none", arrows=False)
+    heaviest = next(sign for sign in "@%#*+=-:" if sign in as_text(lines))
+    found = cells(lines, heaviest)
+    across, down = width / 10, height / 10
+    for x, y in found:
+        assert electrode * across <= x + 0.5 <= (electrode + 1) * across
+        assert (9 - wire) * down <= y + 0.5 <= (10 - wire) * down
+
+
+def test_colours_are_the_brighter_the_deeper() -> None:
+    steps = {(5, i): (0.0, 0.0, -3e-5 * i) for i in range(10)}
+    lines = paint_map(surface_of(a_field(steps), LAYOUT.upper_m), 10, 10, 3e-4, "rgb", arrows=False)
+    line = lines[4]  # that of wire 5
+    shades = []
+    for segment in line:
+        assert segment.style is not None
+        colour = segment.style.bgcolor
+        assert colour is not None
+        assert colour.triplet is not None
+        shades += [sum(colour.triplet)] * len(segment.text)
+    assert shades == sorted(shades)
+    assert shades[-1] > 10 * max(1, shades[0])
+
+
+def test_sixteen_colours_and_none_are_kept_to() -> None:
+    surface = surface_of(a_field({(4, 4): (1e-4, 0.0, -3e-4)}), LAYOUT.upper_m)
+    for colours in ("ansi", "none"):
+        lines = paint_map(surface, 30, 15, 3e-4, colours, arrows=True)
+        lines += paint_shear(surface, 30, 15, 3e-4, colours)
+        for segment in (segment for line in lines for segment in line):
+            style = segment.style
+            for colour in () if style is None else (style.color, style.bgcolor):
+                assert colour is None or (
+                    colours == "ansi" and colour.number is not None and colour.number < 16
+                )
+
+
+@pytest.mark.parametrize("turn", range(8))
+def test_arrows_of_all_eight_directions(turn: int) -> None:
+    angle = turn * np.pi / 4
+    everywhere = {
+        (wire, electrode): (2e-4 * np.cos(angle), 2e-4 * np.sin(angle), -3e-4)
+        for wire in range(10)
+        for electrode in range(10)
+    }
+    surface = surface_of(a_field(everywhere), LAYOUT.upper_m)
+    sign = "→↗↑↖←↙↓↘"[turn]
+    assert len(cells(paint_shear(surface, 40, 20, 3e-4, "none"), sign)) >= 100
+    assert cells(paint_map(surface, 40, 20, 3e-4, "none", arrows=True), sign)
+    assert not cells(paint_map(surface, 40, 20, 3e-4, "none", arrows=False), sign)
+
+
+def test_shear_within_its_noise_is_no_arrow_and_unknown_skin_is_not_untouched() -> None:
+    noisy = surface_of(a_field({(4, 4): (1e-4, 0.0, -3e-4)}, std_m=5e-5), LAYOUT.upper_m)
+    assert "→" not in as_text(paint_shear(noisy, 40, 20, 3e-4, "none"))
+    unknown = surface_of(a_field({}, std_m=np.inf), LAYOUT.upper_m)
+    assert set(as_text(paint_map(unknown, 20, 10, 3e-4, "none", arrows=True))) == {"?", "\n"}
+    assert unknown.deepest_m == 0.0
+
+
+def test_a_long_patch_is_drawn_long() -> None:
+    long = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3, upper_wires=4, upper_electrodes=12)
+    assert aspect_of(long.upper_m) == pytest.approx(3.0, rel=0.05)
+    assert maps.fit(60, 30, 3.0) == (60, 10)
+    assert maps.fit(60, 5, 3.0) == (30, 5)
+
+
+def test_the_scale_has_room_for_what_is_deepest_and_goes_back() -> None:
+    scale, second = Scale(), 1_000_000_000
+    scale.look(0, 2e-6)
+    assert scale.full_m == pytest.approx(5e-5)
+    scale.look(1 * second, 5.5e-4)
+    assert scale.full_m == pytest.approx(7e-4)
+    scale.look(2 * second, 1e-5)
+    assert scale.full_m == pytest.approx(7e-4)  # so that it does not flicker
+    scale.look(9 * second, 1e-5)
+    assert scale.full_m == pytest.approx(5e-5)
+
+
+def the_view(source: HostSource, history: History, until: float = 8.0) -> View:
+    """A view of a host that has been looked at for a second, and is pressed."""
+    end_s = time.monotonic() + until
+    view, begun_s = history.add(source.snapshot()), time.monotonic()
+    while time.monotonic() < end_s:
+        time.sleep(0.02)
+        view = history.add(source.snapshot())
+        if time.monotonic() > begun_s + 1.0 and all((patch.depth_m or 0.0) > 1e-4 for patch in view.patches):
+            break
+    return view
+
+
+def test_touches_and_rates_are_those_of_the_scene() -> None:
+    hand = a_hand(1, simulation={"seed": 3, "depth": 0.2, "cycle_s": 2.0, "indenter_radius_m": 0.02})
+    with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
+        view = the_view(source, History(hand))
+        field = host.latest("p0")
+        patch = view.patch("p0")
+        while field is None or field.stamp is None or field.stamp.scan != patch.scan:
+            view = History(hand).add(source.snapshot())
+            patch, field = view.patch("p0"), host.latest("p0")
+        truth_m = fleet.truth_m("p0", field.stamp.device_time_us) - hand.patches[0].layout.build().upper_m
+        report = json.loads(json.dumps(as_json(view)))
+    depth_m = -truth_m[..., 2]
+    assert patch.depth_m == pytest.approx(float(depth_m.max()), abs=5e-6)
+    (touch,) = patch.touches
+    wire, electrode = np.unravel_index(int(depth_m.argmax()), depth_m.shape)
+    x_m, y_m = hand.patches[0].layout.build().upper_m[wire, electrode, :2]
+    assert abs(touch.x_m - x_m) < 4e-3  # a pitch
+    assert abs(touch.y_m - y_m) < 4e-3
+    assert touch.force_n is None  # an exact field without a stiffness knows of none
+    assert report["patches"]["p0"]["contacts"][0]["x_m"] == touch.x_m
+    assert report["patches"]["p0"]["condition"] == "operational"
+    assert report["buses"]["can0"]["level"] == "good"
+
+
+def test_the_posterior_tells_forces() -> None:
+    hand = a_hand(1, solver={"method": "posterior"}, simulation={"depth": 0.3, "indenter_radius_m": 0.02})
+    with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:
+        patch = the_view(source, History(hand)).patch("p0")
+    assert patch.method == "posterior"
+    assert patch.touches
+    assert patch.touches[0].force_n is not None
+    assert patch.touches[0].force_n > 0.1
+
+
+@pytest.mark.parametrize("colours", ["rgb", "ansi", "none"])
+@pytest.mark.parametrize("patches", [1, 3, 16])
+def test_every_line_has_its_width_at_every_size(patches: int, colours: Colours) -> None:
+    hand = a_hand(patches, sync={"period_ms": 200})
+    with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:
+        time.sleep(0.5)
+        view = History(hand).add(source.snapshot())
+    for width, height in ((80, 24), (50, 16), (132, 43), (200, 50), (20, 5)):
+        for zoomed in (False, True):
+            ui = Ui("hand", "p0", zoomed=zoomed, message="said" if zoomed else "")
+            lines = screen(view, ui, [], 1e-4, look_for(colours), width, height)
+            assert len(lines) == height
+            assert {sum(segment.cell_length for segment in line) for line in lines} == {width}
+            if width >= 80 and not zoomed:
+                assert all(f"p{number}" in as_text(lines) for number in range(patches))
+
+
+def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> None:
+    hand = a_hand(2, sync={"period_ms": 200})
+    with (
+        Fleet(hand),
+        Recorder(hand, tmp_path / "run.log") as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
+        end_s = time.monotonic() + 10.0
+        while host.stats().patches["p1"].solved < 6 and time.monotonic() < end_s:
+            time.sleep(0.02)
+        live = host.stats().patches["p0"].solved
+    faults = FaultBook()
+    with ReplaySource(replay(tmp_path / "run.log", speed=20.0)) as source:
+        history = History(source.hand)
+        end_s = time.monotonic() + 10.0
+        while not source.over and time.monotonic() < end_s:
+            faults.look(history.add(source.snapshot()), time.monotonic_ns())
+            time.sleep(0.01)
+        view = history.add(source.snapshot())
+        assert source.over
+        assert not source.live
+    assert view.patch("p0").lane.solved >= live
+    assert view.patch("p0").surface is not None
+    assert faults.lines == []

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from skinnode.errors import ConfigError
+
 app = typer.Typer(help="Measure solver and node on this machine.", no_args_is_help=True)
 
 JsonFile = Annotated[
@@ -168,6 +170,52 @@ def node(
         "Other work of this machine is in the figures."
     )
     _write(json, figures)
+
+
+@app.command()
+def pipeline(
+    json: JsonFile = None,
+    plot: PlotFile = None,
+    seconds: Annotated[float, typer.Option(min=1, help="Length of each measurement.")] = 10.0,
+    short: Annotated[
+        bool, typer.Option("--short", help="Only the rows of which something is asked.")
+    ] = False,
+    interface: Annotated[str, typer.Option(help="udp, or socketcan: one bus, by --channel.")] = "udp",
+    channel: Annotated[str, typer.Option(help="Of socketcan.")] = "vcan0",
+    all_cores: Annotated[
+        bool, typer.Option("--all-cores", help="Do not keep the host to one core and the load to another.")
+    ] = False,
+) -> None:
+    """Four full buses and sixteen patches through a host: losses, latency, CPU. Exit 1 if a line that must be
+    reached is not."""
+    from skinnode.cli import _bench_pipeline as bench
+
+    if interface not in ("udp", "socketcan"):
+        raise ConfigError("--interface", interface, "udp or socketcan")
+    _prepare(json, plot)
+    typer.echo(bench.HEAD)
+    figures = bench.run(
+        seconds,
+        short=short,
+        interface=interface,
+        channel=channel,
+        all_cores=all_cores,
+        report=lambda row: typer.echo(bench.line(row)),
+    )
+    typer.echo(bench.LEGEND)
+    _print_machine(figures)
+    for row in figures["must"]:
+        got = "-" if row["got"] is None else f"{row['got']:.2f}"
+        typer.echo(
+            f"{row['what']:52}{got:>9}  asked {row['asked']:g}: {'' if row['reached'] else 'NOT '}reached"
+        )
+    _write(json, figures)
+    if plot is not None:
+        from skinnode.cli._plot_pipeline import draw
+
+        draw(plot, figures)
+    if not all(row["reached"] for row in figures["must"]):
+        raise typer.Exit(1)
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:

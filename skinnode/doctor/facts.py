@@ -125,7 +125,17 @@ class BusFacts:
     """Of SYNC, as the hand file says."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
     """When SYNCs were heard; not our own."""
+    sync_counters: tuple[int, ...] = ()
+    """As they came with them; 0 where there was none."""
     sync_ours: bool = False
+    role: str = "master"
+    """Of the host on this bus, as the hand file says."""
+    nmt_commands: int = 0
+    """Heard; none of them is ours."""
+    master_node_id: int | None = None
+    """With which the host beats, as the hand file says."""
+    master_beats_s: Float | None = None
+    """When that was heard."""
     heartbeat_ms: int | None = None
     """As the hand file wants it."""
     patches: tuple[PatchFacts, ...] = ()

@@ -57,6 +57,8 @@ def gather(
         bus.bitrate_bps,
         period_s=None if hand is None else hand.sync.period_s,
         heartbeat_ms=None if hand is None else hand.bring_up.heartbeat_ms,
+        role=bus.role,
+        master_node_id=bus.heartbeat_node_id,
         patches=() if hand is None else tuple(_wanted(p, hand, bus) for p in hand.patches_on(bus.name)),
     )
     state, bitrate = link_facts(bus)
@@ -126,7 +128,12 @@ def _examine(
         unconfigured=found.unconfigured,
         strangers=tuple(n for n in found.nodes if n.node_id not in {p.node_id for p in asked}),
         sync_s=np.empty(0) if ours else np.array([t_ns for t_ns, _ in list(capture.syncs)]) * 1e-9,
+        sync_counters=() if ours else tuple(counter for _, counter in list(capture.syncs)),
         sync_ours=ours,
+        nmt_commands=heard.cob_ids[od.NMT_COB_ID],
+        master_beats_s=None
+        if facts.master_node_id is None
+        else np.array([beat.t_ns for beat in list(heard.node(facts.master_node_id).beats)]) * 1e-9,
         patches=tuple(_with_scans(patch, heard, capture, profiles) for patch in asked),
     )
 

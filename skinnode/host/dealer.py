@@ -78,6 +78,7 @@ class Dealer:
         self._foreign_ids: dict[int, int] = {}
         self._bus_state: BusState | None = None
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
+        self._unmetered: list[Frame] = []
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._marks: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=_MARKS)
         self._load = 0.0
@@ -105,24 +106,28 @@ class Dealer:
 
     def deal(self, batch: Sequence[Frame]) -> None:
         """Frames to their handlers, in order."""
-        if batch:
-            for listener in self._listeners:
-                listener(batch)
+        if not batch:
+            return
+        for listener in self._listeners:
+            listener(batch)
+        handlers, takes_fd = self._handlers, self.config.fd
+        keep, before = self._unmetered.append, len(self._unmetered)
         for frame in batch:
-            if frame.remote or frame.error or frame.extended or (frame.fd and not self.config.fd):
-                if frame.error:
+            can_id, data, t_ns, remote, error, extended, fd = frame
+            if remote or error or extended or (fd and not takes_fd):
+                if error:
                     self._on_error_frame(frame)
                 else:
                     self._ignored += 1
                 continue
-            self._received += 1
-            self._meter.add(frame.can_id, frame.data, fd=frame.fd)
-            handler = self._handlers.get(frame.can_id)
+            keep(frame)
+            handler = handlers.get(can_id)
             if handler is None:
                 self._foreign += 1
-                self._foreign_ids[frame.can_id] = self._foreign_ids.get(frame.can_id, 0) + 1
+                self._foreign_ids[can_id] = self._foreign_ids.get(can_id, 0) + 1
                 continue
-            handler(frame.data, frame.t_ns)
+            handler(data, t_ns)
+        self._received += len(self._unmetered) - before
 
     def poll(self, now_ns: int) -> None:
         """Tell the pollers the time, after a batch."""
@@ -179,6 +184,9 @@ class Dealer:
 
     def _mark(self, now_ns: int) -> None:
         """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
+        for frame in self._unmetered:
+            self._meter.add(frame.can_id, frame.data, fd=frame.fd)
+        self._unmetered.clear()
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

@@ -29,8 +29,9 @@ from skinnode.host.supervisor import NodeStats, Supervisor
 from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
 from skinnode.host.tap import HostTap, tap_bus, tap_link
 from skinnode.host.workers import Workers
-from skinnode.model.config import HandConfig, PatchConfig, load_hand
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
+from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 from skinnode.wire.plan import check_plan
 from skinnode.wire.profile import PatchProfile
@@ -137,6 +138,7 @@ class Host:
         boot_deadline_s: float = bringup.BOOT_DEADLINE_S,
         cancelled: Callable[[], bool] = _never,
         tap: HostTap | None = None,
+        open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> Iterator[Host]:
         """Bring a hand up; shut it down at the end of the ``with`` block.
 
@@ -147,6 +149,7 @@ class Host:
             boot_deadline_s: how long a node may take to answer for the first time.
             cancelled: asked during bring-up; when it says True, bring-up ends with BringUpCancelled.
             tap: writes down what passes, bring-up included: a :class:`skinnode.record.Recorder`.
+            open_port: opens the interface of a bus, where that is not one of python-can's.
 
         Raises ConfigError for options, EDS or baseline files that contradict the hand, and for a layout that
         cannot be solved; BusLoadError for a plan that does not fit its bus; BusError for an interface that
@@ -170,7 +173,7 @@ class Host:
             buses = {
                 bus.name: _serve_bus(
                     hand,
-                    stack.enter_context(contextlib.closing(BusLink(bus, {}, publisher.fail))),
+                    stack.enter_context(contextlib.closing(BusLink(bus, {}, publisher.fail, open_port))),
                     ticks if bus.role == "master" else Ticks(hand.sync.counter_overflow),
                 )
                 for bus in hand.buses

@@ -37,7 +37,11 @@ class BusLink(Dealer):
     """
 
     def __init__(
-        self, config: BusConfig, handlers: Mapping[int, Handler], on_failure: Callable[[SkinError], None]
+        self,
+        config: BusConfig,
+        handlers: Mapping[int, Handler],
+        on_failure: Callable[[SkinError], None],
+        open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> None:
         super().__init__(config, handlers, time.monotonic_ns())
         self._on_failure = on_failure
@@ -50,7 +54,7 @@ class BusLink(Dealer):
         self.t_dealt_ns = 0
         """What was received up to then has been dealt out, monotonic."""
         self._stop = threading.Event()
-        self._port = CanPort(config)
+        self._port = open_port(config)
         self.network = SkinNetwork(self.send)
         self._receiver = Receiver(self._port)
         self._thread = threading.Thread(target=self._run, name=f"mainline {config.name}", daemon=True)

@@ -77,6 +77,13 @@ class RemoteOd:
 
         return bytes(self._transfer(index, 0, "block read", ask))
 
+    def read_large(self, index: int) -> bytes:
+        """By block transfer, or segment by segment from a node that refuses that."""
+        try:
+            return self.read_block(index)
+        except SdoAbort:
+            return self.read_bytes(index, 0)
+
     def write_block(self, index: int, data: bytes) -> None:
         """Write a value of many bytes by block transfer with CRC."""
 

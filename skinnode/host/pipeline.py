@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -30,6 +30,11 @@ from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
 from skinnode.wire.codec import SummaryFlag, decode
 
 _log = logging.getLogger(__name__)
+
+
+WATCH_AFTER_NS: Final = 5_000_000
+"""How long after its last frame a scan is looked at for what is wrong with it: the fields that a program
+waits for come first, and those of all patches of one SYNC are due together."""
 
 
 class Solver:
@@ -128,7 +133,7 @@ class LaneTap(Protocol):
 
 class Lane:
     """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
-    them."""
+    them. ``on_scan`` is told of each at once, ``watch`` a while later."""
 
     def __init__(
         self,
@@ -139,11 +144,14 @@ class Lane:
         tick: Callable[[int], Tick | None],
         on_scan: Callable[[Scan], None],
         partial: Partial = "pass",
+        watch: Callable[[Scan], None] = lambda scan: None,
     ) -> None:
         self._patch, self._passes_partial = patch, partial == "pass"
         self._solver: Solver | None = None  # None: withhold
         self._assembler, self._workers, self._publisher = assembler, workers, publisher
         self._tick, self._on_scan = tick, on_scan
+        self._watch = watch
+        self._unwatched: deque[tuple[int, Scan]] = deque()
         self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
         self.tap: LaneTap | None = None
@@ -174,6 +182,8 @@ class Lane:
 
     def poll(self, t_ns: int) -> None:
         """Let a scan go that has waited long enough for what it lacks."""
+        while self._unwatched and t_ns >= self._unwatched[0][0]:
+            self._watch(self._unwatched.popleft()[1])
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
             return
@@ -217,9 +227,12 @@ class Lane:
     def close(self) -> None:
         """Take no scan that is still in the box. Called when the mainline has ended."""
         self._box.clear()
+        while self._unwatched:
+            self._watch(self._unwatched.popleft()[1])
 
     def _offer(self, scan: Scan) -> None:
         self._on_scan(scan)
+        self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
         if scan.flags & SummaryFlag.BASELINE_CHANGED:  # this scan is the first with the new one
             self.withhold()
         elif scan.device_time_us is None:

@@ -4,6 +4,7 @@ ones: nothing here sends, waits or has a thread."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from skinnode.host.code_watch import CodeWatch
 from skinnode.host.dealer import Dealer
@@ -18,6 +19,10 @@ from skinnode.wire import indices as od
 from skinnode.wire.assembler import Scan, ScanAssembler
 from skinnode.wire.codec import CodeScale
 from skinnode.wire.profile import PatchProfile
+
+LEAST_GRACE_NS: Final = 5_000_000
+"""How long a summary is waited for at least, when all chunks are there; half a period where that is longer.
+On a full bus it gives way to the chunks of all other patches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +68,18 @@ def receive_patch(
 
     def on_scan(scan: Scan) -> None:
         monitor.on_scan(scan.t_last_ns)
-        watch.on_scan(scan)
 
     assembler = ScanAssembler(
         PatchProfile.from_config(patch, dealer.config),
         counter_overflow=ticks.counter_overflow,
         period_ns=hand.sync.period_ms * 1_000_000,
+        grace_ns=max(LEAST_GRACE_NS, hand.sync.period_ms * 500_000),
         node_id=patch.node_id,
         on_reject=dealer.reject,
     )
-    lane = Lane(patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial)
+    lane = Lane(
+        patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial, watch.on_scan
+    )
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)

@@ -258,7 +258,7 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
     """(U, K) R0 in ohm, 0 where there is none. Raises NodeError."""
-    data = remote.read_bytes(od.BASELINE_DOMAIN, 0)
+    data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
         raise NodeError(
             remote.node_id, f"baseline (0x2301): got {len(data)} bytes, allowed: {4 * profile.n_codes}"

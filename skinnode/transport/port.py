@@ -37,7 +37,7 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 22
 """Asked of the kernel where the interface is a socket: a waiting frame takes about 800 bytes of it."""
 
 # Python has no names for these. <asm-generic/socket.h>, <linux/in.h>, <linux/in6.h>
-_SO_RCVBUFFORCE: Final = 33
+SO_RCVBUFFORCE: Final = 33
 _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
@@ -101,7 +101,7 @@ class CanPort:
         self._dropped_before = 0  # by readers before the present one
         self._away = False
         self._bus = self._open()
-        self._reader = self._socket_reader() if config.interface == _SOCKETCAN else None
+        self._reader = self._open_reader()
         # Frames sent to a multicast group come back, and every member has the same address and port. The one
         # field that tells them apart is the channel, which python-can sends along and nobody reads.
         self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
@@ -132,9 +132,15 @@ class CanPort:
             _tune_socket(bus.fileno())
         return bus
 
-    def _socket_reader(self) -> SocketReader:
+    def _open_reader(self) -> SocketReader | None:
+        """Reads the interface in place of python-can; None where python-can does it."""
         bus: Any = self._bus  # python-can's SocketcanBus
-        return SocketReader(bus.socket)
+        return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
+
+    @property
+    def reads_batches(self) -> bool:
+        """Whether :meth:`recv_batch` may return more than one frame."""
+        return self._reader is not None
 
     @property
     def sent(self) -> int:
@@ -255,7 +261,7 @@ class CanPort:
             self._bus.shutdown()
         self._link_gone = None
         self._bus = self._open()
-        self._reader = self._socket_reader() if self.config.interface == _SOCKETCAN else None
+        self._reader = self._open_reader()
         self._away = False
 
     def set_bitrate(self, bitrate_bps: int) -> None:
@@ -296,7 +302,7 @@ def _tune_socket(fileno: int) -> None:
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
-            duplicate.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+            duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         # python-can binds to any address, and such a socket hears every group that anyone on the machine has

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
+from skinnode.transport.recvmmsg import MessageBatch
 
 if TYPE_CHECKING:
     from skinnode.model.config import BusConfig
@@ -25,11 +26,17 @@ _SO_TIMESTAMPNS: Final = 35
 _SO_TIMESTAMPING: Final = 37
 _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1 << 6
 
-_HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; 8 or 64 bytes follow
-_FD_MTU: Final = 72
+HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; 8 or 64 bytes follow
+FD_MTU: Final = 72
+"""Bytes of struct canfd_frame, which tell it from a classic one."""
 _STAMPS: Final = struct.Struct("@qqqqqq")  # seconds and nanoseconds: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
+_CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head, level, type
+_ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
+_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that is a time and nothing else
+_CONTROLS: Final = struct.Struct(f"@Nii6q{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
+_HEADERS: Final = struct.Struct(f"<IBB2x{FD_MTU - HEADER.size}x")
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _FLAGS: Final = _EXTENDED | _REMOTE | _ERROR
@@ -59,7 +66,7 @@ class SocketReader:
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
         """Frames that the kernel had no room for in the socket's buffer."""
-        self._failure: OSError | None = None
+        self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
         """Whether the newest frame bore one."""
         self._delay = HardwareDelay()
@@ -70,46 +77,44 @@ class SocketReader:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Frames that wait, at most ``most``; waits up to ``timeout_s`` for the first. Raises OSError if the
-        interface fails."""
-        if self._failure is not None:
-            failure, self._failure = self._failure, None
-            raise failure
-        if not self._poll.poll(max(0, round(timeout_s * 1e3))):
-            return []
-        frames: list[Frame] = []
-        receive, unpack = self._sock.recvmsg, _HEADER.unpack_from
-        wall_to_mono_ns = time.monotonic_ns() - time.time_ns()
+        """Frames that wait, at most ``most`` or a batch; waits up to ``timeout_s`` for the first. Raises
+        OSError if the interface fails."""
+        lengths, controls_used = self._batch.receive(self._sock, most)
+        if not lengths:
+            if not self._poll.poll(max(0, round(timeout_s * 1e3))):
+                return []
+            lengths, controls_used = self._batch.receive(self._sock, most)
         now_ns = time.monotonic_ns()
-        try:
-            while len(frames) < most:
-                raw, ancillary, _, _ = receive(_FD_MTU, _ANCILLARY_BYTES, socket.MSG_DONTWAIT)
-                word, length, _ = unpack(raw)
-                t_ns = self._arrival(ancillary, now_ns, wall_to_mono_ns)
-                if word & _FLAGS:
-                    remote, error = bool(word & _REMOTE), bool(word & _ERROR)
-                    extended = bool(word & _EXTENDED)
-                    can_id = word & (0x1FFF_FFFF if extended or error else 0x7FF)
-                    data = b"" if remote else raw[8 : 8 + length]
-                    frames.append(Frame(can_id, data, t_ns, remote, error, extended, len(raw) == _FD_MTU))
-                elif len(raw) == _FD_MTU:
-                    frames.append(Frame(word, raw[8 : 8 + length], t_ns, fd=True))
-                else:
-                    frames.append(Frame(word, raw[8 : 8 + length], t_ns))
-        except BlockingIOError:
-            pass
-        except OSError as error:
-            if not frames:
-                raise
-            self._failure = error  # the kernel tells once; the frames that came before it come first
+        wall_to_mono_ns = now_ns - time.time_ns()
+        payload, controls = self._batch.taken(len(lengths))
+        frames: list[Frame] = []
+        new, at = tuple.__new__, 0  # a NamedTuple's own __new__ takes twice as long
+        heads, stamps = _HEADERS.iter_unpack(payload), _CONTROLS.iter_unpack(controls)
+        for length, control, head, stamp in zip(lengths, controls_used, heads, stamps, strict=True):
+            word, used, _ = head
+            _, _, kind, seconds, nanoseconds, _, _, hardware_s, _ = stamp
+            if control == _STAMPED_BYTES and kind == _SO_TIMESTAMPING and seconds and not hardware_s:
+                t_ns = seconds * 1_000_000_000 + nanoseconds + wall_to_mono_ns
+                if not -_NEWEST_NS < now_ns - t_ns < _OLDEST_NS:
+                    t_ns = now_ns
+            else:
+                t_ns = self._arrival(controls, len(frames), control, now_ns, wall_to_mono_ns)
+            data, fd = payload[at + HEADER.size : at + HEADER.size + used], length == FD_MTU
+            remote, error, extended = word & _REMOTE != 0, word & _ERROR != 0, word & _EXTENDED != 0
+            can_id = word & (0x1FFF_FFFF if extended or error else 0x7FF)
+            frames.append(new(Frame, (can_id, b"" if remote else data, t_ns, remote, error, extended, fd)))
+            at += FD_MTU
         return frames
 
-    def _arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int, wall_to_mono_ns: int) -> int:
-        """When a frame came in, by the monotonic clock."""
-        t_ns = now_ns
-        for _, kind, data in ancillary:
+    def _arrival(self, controls: bytes, number: int, used: int, now_ns: int, wall_to_mono_ns: int) -> int:
+        """When the frame of this number in the batch came in, by the monotonic clock."""
+        t_ns, at = now_ns, number * _ANCILLARY_BYTES
+        end = at + used
+        while at < end:
+            length, _, kind = _CONTROL.unpack_from(controls, at)
             if kind == _SO_TIMESTAMPING:
-                seconds, nanoseconds, _, _, hardware_s, hardware_ns = _STAMPS.unpack(data)
+                stamps = _STAMPS.unpack_from(controls, at + _CONTROL.size)
+                seconds, nanoseconds, _, _, hardware_s, hardware_ns = stamps
                 if seconds:
                     t_ns = seconds * 1_000_000_000 + nanoseconds + wall_to_mono_ns
                     if not -_NEWEST_NS < now_ns - t_ns < _OLDEST_NS:
@@ -118,7 +123,8 @@ class SocketReader:
                 if hardware_s:
                     t_ns = self._delay.arrival_ns(hardware_s * 1_000_000_000 + hardware_ns, t_ns)
             elif kind == _SO_RXQ_OVFL:
-                (self.dropped,) = _DROPS.unpack(data)
+                (self.dropped,) = _DROPS.unpack_from(controls, at + _CONTROL.size)
+            at += -(-length // _ALIGNED) * _ALIGNED
         return t_ns
 
 

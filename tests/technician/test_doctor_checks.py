@@ -46,6 +46,13 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
         ({"strangers": (node(9),)}, "node 9 is not in the hand", Sure.CERTAIN),
         ({"dropped": 12}, "this machine dropped frames", Sure.CERTAIN),
         ({"sync_s": np.empty(0)}, "nobody sends SYNC", Sure.CERTAIN),
+        ({"sync_counters": (1, 200, 2, 201, 3, 202) * 4}, "two producers of SYNC", Sure.CERTAIN),
+        (
+            {"master_node_id": 1, "master_beats_s": 0.125 * np.arange(9)},
+            "two masters with one heartbeat",
+            Sure.LIKELY,
+        ),
+        ({"nmt_commands": 2}, "somebody commands the nodes", Sure.POSSIBLE),
         ({"sync_s": 0.1 * np.arange(50)}, "another period", Sure.CERTAIN),
         ({"sync_s": np.delete(0.08 * np.arange(60), [20, 21])}, "SYNCs are missing", Sure.CERTAIN),
         (
@@ -59,6 +66,21 @@ def test_bus(changes: dict[str, Any], what: str, sure: Sure) -> None:
     finding = one(bus_of(WELL, **changes))
     assert what in finding.what
     assert finding.sure is sure
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sync_counters": tuple(k % 240 + 1 for k in range(200, 300))},
+        {"sync_counters": tuple(k for k in range(1, 60) if k % 9)},  # some were lost: timing tells that
+        {"sync_counters": (0,) * 60},
+        {"master_node_id": 1, "master_beats_s": 0.25 * np.arange(12)},
+        {"master_node_id": 1, "master_beats_s": np.empty(0)},
+        {"role": "guest", "nmt_commands": 4},
+    ],
+)
+def test_one_master_is_as_it_should_be(changes: dict[str, Any]) -> None:
+    assert diagnose(bus_of(WELL, **changes)) == []
 
 
 @pytest.mark.parametrize(

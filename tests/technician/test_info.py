@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
+from skinnode.errors import SdoAbort
+from skinnode.host.network import RemoteOd
 from skinnode.model.config import BusConfig
 from skinnode.node import PatchNode
 from skinnode.technician.info import read_info
@@ -48,6 +51,30 @@ def test_tells_what_is_in_the_node(any_bus: BusConfig, powered: Powered, line_on
     assert patch.baseline_missing == 0
     assert patch.rejected == {"SYNC": 1}
     assert found.faults == ()
+
+
+def test_the_baseline_is_read_as_a_block_and_else_in_segments(
+    bus: BusConfig, powered: Powered, line_on: LineOn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    skin = Rest(LAYOUT)
+    powered(bus, 5, source=skin)
+    line, expected = line_on(bus), np.median(skin.read(0))
+    segments = RemoteOd.read_bytes
+
+    def no_segments(remote: RemoteOd, index: int, subindex: int) -> bytes:
+        assert index != od.BASELINE_DOMAIN
+        return segments(remote, index, subindex)
+
+    def no_block(remote: RemoteOd, index: int) -> bytes:
+        raise SdoAbort(remote.node_id, 0x05040001, "no such command")
+
+    for name, refused in (("read_bytes", no_segments), ("read_block", no_block)):
+        with monkeypatch.context() as patched:
+            patched.setattr(RemoteOd, name, refused)
+            patch = read_info(line, 5).patch
+        assert patch is not None
+        assert patch.baseline_ohm is not None
+        np.testing.assert_allclose(patch.baseline_ohm[1], expected, rtol=1e-6)
 
 
 def test_names_wires_at_fault_and_the_history(bus: BusConfig, powered: Powered, line_on: LineOn) -> None:

@@ -23,6 +23,8 @@ def _no_thread_is_left() -> Iterator[None]:
 class Script:
     """A port that plays frames and then an error, or silence."""
 
+    reads_batches = True
+
     def __init__(self, count: int, error: BusError | None = None) -> None:
         self.config = BusConfig(name="script")
         self.left, self.error = count, error

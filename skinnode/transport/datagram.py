@@ -1,0 +1,68 @@
+"""A bus made of datagrams, for load tests: frames as SocketCAN lays them out in memory, one in each UDP
+packet to this machine.
+
+The reader is that of SocketCAN to the last line: the same system calls, times of the kernel, its bounded
+buffer and its count of what did not fit. What is not there is the CAN driver and the protocol below the
+socket; in their place is UDP over the loopback device, which costs the receiver about as much.
+"""
+
+from __future__ import annotations
+
+import socket
+from typing import Any, Final
+
+import can
+
+from skinnode.errors import BusError
+from skinnode.transport.port import RECEIVE_BUFFER_BYTES, SO_RCVBUFFORCE, CanPort
+from skinnode.transport.socketcan import HEADER, SocketReader
+
+LOOPBACK: Final = "127.0.0.1"
+_MTU: Final = {False: 8, True: 64}  # bytes of data in <linux/can.h>'s struct can_frame and struct canfd_frame
+
+
+def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
+    """The packet of a frame with an 11-bit identifier."""
+    return HEADER.pack(can_id, len(data), 0) + data.ljust(_MTU[fd], b"\0")
+
+
+def free_channel() -> str:
+    """A port of this machine that nobody listens to at the moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((LOOPBACK, 0))
+        return str(sock.getsockname()[1])
+
+
+class DatagramPort(CanPort):
+    """Listens to packets; ``channel`` is the number of its UDP port. It sends nothing."""
+
+    def _open(self) -> can.BusABC:
+        try:
+            return _DatagramBus(self.config.channel)
+        except (OSError, ValueError, OverflowError) as error:
+            raise BusError(f"{self._where}: does not open ({error}), allowed: a free UDP port") from error
+
+    def _open_reader(self) -> SocketReader | None:
+        bus: Any = self._bus
+        return SocketReader(bus.socket)
+
+
+class _DatagramBus(can.BusABC):
+    def __init__(self, channel: str) -> None:
+        super().__init__(channel)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self.socket.bind((LOOPBACK, int(channel)))
+            self.socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+        except PermissionError:  # only root may exceed net.core.rmem_max
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise can.CanOperationError("a bus of datagrams only listens")
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self.socket.close()

@@ -1,0 +1,215 @@
+"""Recordings on the real road: every interface, faults and clocks that jump while they run, `--listen`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+from typer.testing import CliRunner
+
+from skinnode.cli.main import app
+from skinnode.errors import BusError
+from skinnode.host import Host
+from skinnode.model.config import BusConfig, HandConfig, parse_hand
+from skinnode.model.frames import FieldFrame
+from skinnode.record import Recorder, replay
+from skinnode.transport import CanPort
+from vcan_sim.faults import NO_FAULTS, Faults
+from vcan_sim.fleet import Fleet
+
+from .test_replay import SMALL, key
+
+PATIENCE_S = 20.0
+
+
+def hand_on(bus: BusConfig) -> HandConfig:
+    table = {"name": "can0", "interface": bus.interface, "channel": bus.channel}
+    patches = [{"name": f"p{i}", "node_id": 5 + i, "layout": SMALL} for i in range(2)]
+    return parse_hand({"buses": [table], "patches": patches, "sync": {"period_ms": 50}})
+
+
+def reachable(bus: BusConfig) -> None:
+    """Skips where there is no multicast."""
+    try:
+        with CanPort(bus) as port, CanPort(bus) as other:
+            port.send(0x7FF, b"")
+            if other.recv(2.0) is None:
+                pytest.skip("no multicast on this machine")
+    except BusError:
+        pytest.skip("no multicast on this machine")
+
+
+class Run:
+    """A hand that is recorded, and the fields that it gave live."""
+
+    def __init__(self, fleet: Fleet, host: Host) -> None:
+        self.fleet, self.host = fleet, host
+        self.live: dict[tuple[str, int], FieldFrame] = {}
+        self._fields = host.fields(capacity=10_000)
+
+    def take(self, fields: int, patch: str = "p0") -> None:
+        """Wait for that many more of ``patch``."""
+        wanted = self._count(patch) + fields
+        end_s = time.monotonic() + PATIENCE_S
+        while self._count(patch) < wanted:
+            assert time.monotonic() < end_s
+            self.collect(0.05)
+
+    def collect(self, timeout_s: float = 0.0) -> None:
+        while (field := self._fields.get(timeout_s)) is not None:
+            self.live[key(field)] = field
+
+    def _count(self, patch: str) -> int:
+        return sum(name == patch for name, _ in self.live)
+
+
+@contextlib.contextmanager
+def recorded(bus: BusConfig, path: Path) -> Iterator[Run]:
+    hand = hand_on(bus)
+    with (
+        Fleet(hand) as fleet,
+        Recorder(hand, path) as recorder,
+        Host.from_config(hand, tap=recorder) as host,
+    ):
+        run = Run(fleet, host)
+        yield run
+        run.collect()
+    assert recorder.stats().failure is None
+    assert recorder.stats().dropped == 0
+
+
+def assert_same(path: Path, live: dict[tuple[str, int], FieldFrame]) -> None:
+    """Every field that was solved live comes out of the recording with the same bits."""
+    run = replay(path)
+    again = {key(field): field for field in run}
+    assert (run.log.damaged, run.complaints, run.ended) == (0, [], True)
+    assert set(live) <= set(again)
+    for which, field in live.items():
+        other = again[which]
+        assert other.displacement_m.tobytes() == field.displacement_m.tobytes(), which
+        assert other.displacement_std_m.tobytes() == field.displacement_std_m.tobytes(), which
+        assert other.status == field.status
+
+
+def test_a_run_with_faults_is_the_same_again_on_every_interface(any_bus: BusConfig, tmp_path: Path) -> None:
+    """Chunks that get lost, a scan cut off by a reset, a node that is unplugged and comes back."""
+    reachable(any_bus)
+    path = tmp_path / "run.log"
+    with recorded(any_bus, path) as run:
+        run.take(10)
+        for faults in (Faults(lost=0.05, late=0.05, reordered=0.05), Faults(reset=1.0)):
+            run.fleet.inject(faults, "p0")
+            run.take(10, "p1")
+            run.fleet.inject(NO_FAULTS)
+            run.take(5)
+        run.fleet.inject(Faults(unplugged=True), "p0")
+        run.take(20, "p1")
+        run.fleet.inject(NO_FAULTS)
+        run.take(10)
+    assert_same(path, run.live)
+
+
+@pytest.mark.vcan
+def test_an_interface_that_goes_down_while_it_is_recorded(tmp_path: Path) -> None:
+    bus = BusConfig(name="can0", interface="socketcan", channel="vcan0")
+    path = tmp_path / "run.log"
+    with recorded(bus, path) as run:
+        run.take(10)
+        try:
+            subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+            end_s = time.monotonic() + PATIENCE_S
+            while not run.host.stats().buses["can0"].outages:
+                assert time.monotonic() < end_s
+                time.sleep(0.05)
+        finally:
+            subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+        run.take(10)
+        run.take(10, "p1")
+    assert_same(path, run.live)
+
+
+@pytest.mark.vcan
+@pytest.mark.skipif(os.environ.get("VCAN_GUEST") != "1", reason="sets the clock: in a guest of its own only")
+@pytest.mark.parametrize("jump_s", [3600, -3600])
+def test_the_wall_clock_jumps_while_it_is_recorded(tmp_path: Path, jump_s: int) -> None:
+    bus = BusConfig(name="can0", interface="socketcan", channel="vcan0")
+    path = tmp_path / "run.log"
+    begun_s = time.monotonic()
+    with recorded(bus, path) as run:
+        run.take(10)
+        time.clock_settime(time.CLOCK_REALTIME, time.time() + jump_s)
+        try:
+            run.take(15)
+            torn = [lane.assembler.scans_torn for lane in run.host.stats().patches.values()]
+        finally:
+            time.clock_settime(time.CLOCK_REALTIME, time.time() - jump_s)
+        run.take(5)
+    assert torn == [0, 0]
+    assert_same(path, run.live)
+    times_s = [field.stamp.t_receive_ns * 1e-9 for field in replay(path) if field.stamp is not None]
+    assert begun_s < min(times_s)
+    assert max(times_s) < time.monotonic()
+
+
+@pytest.mark.parametrize("jump_s", [3600.0, -3600.0, 0.5])
+def test_times_in_a_recording_that_jump(tmp_path: Path, jump_s: float) -> None:
+    """A clock that was set by whoever wrote the log: the scan it falls into is lost, nobody waits an hour."""
+    bus = BusConfig(name="can0", interface="virtual", channel=tmp_path.name + str(jump_s))
+    path = tmp_path / "run.log"
+    with recorded(bus, path) as run:
+        run.take(30)
+    lines = path.read_text().splitlines()
+    half = len(lines) // 2
+    moved = []
+    for line in lines[half:]:
+        stamp, rest = line[1:].split(")", 1)
+        moved.append(f"({float(stamp) + jump_s:.6f}){rest}")
+    path.write_text("\n".join([*lines[:half], *moved]) + "\n")
+    begun_s = time.monotonic()
+    again = {key(field) for field in replay(path, speed=2000.0)}
+    assert time.monotonic() - begun_s < PATIENCE_S
+    assert len(set(run.live) - again) <= 4  # the scan of either patch, and the one that tells
+
+
+def test_listening_writes_what_is_heard_and_sends_nothing(any_bus: BusConfig, tmp_path: Path) -> None:
+    reachable(any_bus)
+    hand, path = tmp_path / "hand.toml", tmp_path / "run.log"
+    hand.write_text(
+        f'[[buses]]\nname = "can0"\ninterface = "{any_bus.interface}"\nchannel = "{any_bus.channel}"\n'
+        '[[patches]]\nname = "thumb"\nnode_id = 5\n'
+    )
+    over = threading.Event()
+    sent: list[int] = []
+    heard: list[int] = []
+
+    def talk() -> None:
+        with CanPort(any_bus) as port:
+            while not over.wait(0.01):
+                port.send(0x185, len(sent).to_bytes(8, "little"))
+                sent.append(len(sent))
+                while (frame := port.recv(0.0)) is not None:
+                    heard.append(frame.can_id)
+
+    talker = threading.Thread(target=talk)
+    talker.start()
+    try:
+        options = ["record", str(hand), "-o", str(path), "--listen", "--seconds", "1.0", "--json"]
+        done = CliRunner().invoke(app, options)
+    finally:
+        over.set()
+        talker.join()
+    assert done.exit_code == 0, done.output
+    numbers = [int.from_bytes(message.data, "little") for message in can.CanutilsLogReader(str(path))]
+    assert len(numbers) > 30
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert heard == []
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert told[-1] == {"frames": len(numbers), "dropped": 0}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from skinnode.host import Host
+    from skinnode.host import HandFrame, Host
     from skinnode.model.elastic import Rubber
     from skinnode.model.forward import jacobian, resistance_ohm
     from skinnode.model.frames import Contact, FieldFrame, ResistanceFrame, ScanStamp, SolveStats
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from skinnode.solve.tracker import Tracker
 
 _HOME = {
+    "HandFrame": "skinnode.host",
     "Host": "skinnode.host",
     "PatchLayout": "skinnode.model.layout",
     "Rubber": "skinnode.model.elastic",
@@ -52,6 +53,7 @@ __all__ = [
     "Adaptive",
     "Contact",
     "FieldFrame",
+    "HandFrame",
     "Host",
     "PatchLayout",
     "PathResult",

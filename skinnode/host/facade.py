@@ -14,8 +14,10 @@ from typing import Final
 from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
 from skinnode.host.bringup import check_eds, load_baseline
+from skinnode.host.callback import Callbacks, FieldCallback
 from skinnode.host.dealer import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthWatch
+from skinnode.host.hand_frame import HandGatherer, HandSubscription
 from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
@@ -94,10 +96,11 @@ class Host:
         sync: SyncProducer | None,
         supervisor: Supervisor,
         publisher: Publisher,
+        callbacks: Callbacks,
         events: Events,
     ) -> None:
         self.hand = hand
-        self._events = events
+        self._callbacks, self._events = callbacks, events
         self._buses = buses
         self._stations = {station.patch.name: station for station in stations}
         self._sync, self._supervisor, self._publisher = sync, supervisor, publisher
@@ -166,8 +169,9 @@ class Host:
                 check_eds(patch.eds, profile)
             if patch.baseline is not None:
                 load_baseline(patch.baseline, profile)
-        publisher = Publisher(tuple(patch.name for patch in hand.patches))
+        publisher, callbacks = Publisher(tuple(patch.name for patch in hand.patches)), Callbacks()
         with contextlib.ExitStack() as stack:
+            stack.callback(callbacks.join)
             stack.callback(publisher.end)
             ticks = Ticks(hand.sync.counter_overflow)
             buses = {
@@ -221,7 +225,7 @@ class Host:
                 senders = [link.send for link in own]
                 sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
             events = Events()
-            host = cls(hand, buses, stations, sync, supervisor, publisher, events)
+            host = cls(hand, buses, stations, sync, supervisor, publisher, callbacks, events)
             stack.callback(events.end)
             stack.enter_context(HealthWatch(host._all_health, host._all_bus_health, events))
             yield host
@@ -229,13 +233,40 @@ class Host:
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
     ) -> Subscription:
-        """Fields as they are solved, of all patches or of one, from now until the host closes.
+        """Fields as they are solved, of all patches or of one, from now until the host closes: for ``for`` or
+        ``async for``.
 
         With ``timeout_s`` the loop raises TimeoutError when no field came for that long. ``capacity`` is how
         many fields the loop may lag behind before it loses the oldest, as in the hand file unless given.
         """
         kept = self.hand.stream.capacity_fields if capacity is None else capacity
         return self._publisher.subscribe(kept, timeout_s, patch)
+
+    def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
+        """Hand frames from now until the host closes: the fields of all patches of one SYNC, for ``for`` or
+        ``async for``. A patch is waited for two SYNC periods at most, and one that is away not at all.
+        Arguments as of :meth:`fields`; ``capacity`` counts hand frames.
+
+        Raises ValueError for a hand whose patches do not follow one SYNC with a counter.
+        """
+        self._require_one_sync()
+        patches = [patch.name for patch in self.hand.patches]
+        kept = (self.hand.stream.capacity_fields if capacity is None else capacity) * len(patches)
+        patience_ns = 2 * self.hand.sync.period_ms * 1_000_000
+        gatherer = HandGatherer(patches, patience_ns, lambda patch: self.health(patch).condition)
+        return HandSubscription(self.fields(capacity=kept), gatherer, timeout_s)
+
+    def on_field(
+        self,
+        function: Callable[[FieldFrame], object],
+        *,
+        patch: str | None = None,
+        capacity: int | None = None,
+    ) -> FieldCallback:
+        """Call ``function`` with each field from now on, on a thread of its own, until the host closes or the
+        callback returned is closed. A function that blocks or raises loses its own fields, counted there.
+        Arguments as of :meth:`fields`."""
+        return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
 
     def latest(self, patch: str) -> FieldFrame | None:
         """The newest field of a patch, None before the first. Never waits. Raises ValueError for no patch."""
@@ -274,6 +305,13 @@ class Host:
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
         """What happens to the health of patches, wires and buses from now until the host closes."""
         return self._events.subscribe(capacity)
+
+    def _require_one_sync(self) -> None:
+        guests = {patch.bus for patch in self.hand.patches if self.hand.bus(patch.bus).role == "guest"}
+        masters = any(patch.bus not in guests for patch in self.hand.patches)
+        if len(guests) + masters > 1 or self.hand.sync.counter_overflow == 0:
+            producers = "none with a counter" if len(guests) + masters == 1 else f"{len(guests) + masters}"
+            raise ValueError(f"SYNC producers: got {producers}, must be one that all patches follow")
 
     def _all_health(self) -> dict[str, PatchHealth]:
         return {patch: self.health(patch) for patch in self._stations}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import itertools
 import queue
 import weakref
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
@@ -30,7 +32,8 @@ _END: Final = _End()
 
 
 class Subscription:
-    """The fields of a running host, newest last. Iterate over it, or ask with :meth:`get`.
+    """The fields of a running host, newest last. Iterate over it with ``for`` or ``async for``, or ask with
+    :meth:`get`.
 
     A full queue loses its oldest field; ``dropped`` counts. The subscription ends with :meth:`close`, at the
     end of a ``with`` block, or when the last reference to it goes.
@@ -43,6 +46,7 @@ class Subscription:
         self._wanted = patches
         # One counter a patch: a patch has one worker at a time, so each has a single writer.
         self._dropped = dict.fromkeys([*patches, ""], 0)
+        self._wakers: dict[object, Callable[[], object]] = {}  # of event loops that wait
 
     @property
     def dropped(self) -> int:
@@ -55,27 +59,75 @@ class Subscription:
         Raises the SkinError that stopped the host, if one did.
         """
         try:
-            item = self._queue.get(timeout=timeout_s)
+            return self.take(timeout_s)
         except queue.Empty:
             return None
-        return self._open(item)
+
+    def take(self, timeout_s: float | None) -> FieldFrame | None:
+        """The next field, or None when the host has closed. Raises queue.Empty after ``timeout_s`` and the
+        SkinError that stopped the host, if one did."""
+        return self._open(self._queue.get(timeout=timeout_s))
+
+    async def take_async(self, timeout_s: float | None) -> FieldFrame | None:
+        """As :meth:`take`, in an event loop."""
+        loop, arrived, key = asyncio.get_running_loop(), asyncio.Event(), object()
+
+        def wake() -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has closed
+                loop.call_soon_threadsafe(arrived.set)
+
+        self._wakers[key] = wake
+        limit = asyncio.timeout(timeout_s)
+        try:
+            async with limit:
+                while True:
+                    await asyncio.sleep(0)  # others have their turn however fast fields come
+                    arrived.clear()
+                    try:
+                        return self._open(self._queue.get_nowait())
+                    except queue.Empty:
+                        await arrived.wait()
+        except TimeoutError:
+            if not limit.expired():  # it is what stopped the host
+                raise
+            raise queue.Empty from None
+        finally:
+            del self._wakers[key]
 
     def close(self) -> None:
         """Want no more. Fields still queued are gone."""
         self._wanted = frozenset()
+
+    def end(self) -> None:
+        """Want no more, and end the loop that reads, in whatever thread, after the fields still queued."""
+        self.close()
+        self._offer(_END, "")
 
     def __iter__(self) -> Iterator[FieldFrame]:
         """Fields until the host closes. Raises TimeoutError when none came for the subscription's timeout and
         the SkinError that stopped the host, if one did."""
         while True:
             try:
-                item = self._queue.get(timeout=self._timeout_s)
+                field = self.take(self._timeout_s)
             except queue.Empty:
-                raise TimeoutError(f"no field within {self._timeout_s} s") from None
-            field = self._open(item)
+                raise self._too_long() from None
             if field is None:
                 return
             yield field
+
+    async def __aiter__(self) -> AsyncIterator[FieldFrame]:
+        """As ``for``, in an event loop."""
+        while True:
+            try:
+                field = await self.take_async(self._timeout_s)
+            except queue.Empty:
+                raise self._too_long() from None
+            if field is None:
+                return
+            yield field
+
+    def _too_long(self) -> TimeoutError:
+        return TimeoutError(f"no field within {self._timeout_s} s")
 
     def __enter__(self) -> Self:
         return self
@@ -110,6 +162,8 @@ class Subscription:
                 ending = oldest
         if ending is not None:  # the one thing that no reader may miss, even if the queue grows by it
             self._queue.put(ending)
+        for wake in list(self._wakers.values()):
+            wake()
 
 
 class Publisher:

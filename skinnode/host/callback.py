@@ -1,0 +1,91 @@
+"""Fields to a function of a program, on a thread of its own: it may block or raise at its own cost."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from skinnode.errors import SkinError
+from skinnode.host.publish import Subscription
+from skinnode.model.frames import FieldFrame
+
+_log = logging.getLogger(__name__)
+
+LAST_CALL_S: Final = 1.0
+"""How long the end of a host, or of a callback, waits for a call that is under way."""
+
+
+class FieldCallback:
+    """Calls ``function`` with each field of ``fields``, one after the other, until :meth:`close` or the end
+    of the host. What it raises is counted, the first logged with its traceback; the next field follows."""
+
+    def __init__(self, function: Callable[[FieldFrame], object], fields: Subscription) -> None:
+        self._function, self._fields = function, fields
+        self._failed = 0
+        self._thread = threading.Thread(target=self._run, name="callback", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Fields lost because the function was too slow."""
+        return self._fields.dropped
+
+    @property
+    def failed(self) -> int:
+        """Fields at which it raised."""
+        return self._failed
+
+    def close(self) -> None:
+        """Call it no more. Waits for a call under way, a second at most; may be called by the function."""
+        self._fields.end()
+        self.join()
+
+    def join(self) -> None:
+        """Wait until the last call has returned, a second at most; then say that it has not."""
+        if self._thread is threading.current_thread():
+            return
+        self._thread.join(LAST_CALL_S)
+        if self._thread.is_alive():
+            _log.warning("callback %s has not returned and is left behind", _name(self._function))
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is called no more."""
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            for field in self._fields:
+                try:
+                    self._function(field)
+                except Exception as error:
+                    self._failed += 1
+                    if self._failed == 1:
+                        _log.warning("callback %s raised", _name(self._function), exc_info=error)
+        except SkinError as error:  # what stopped the host; other subscribers are told too
+            _log.debug("callback %s: %s", _name(self._function), error)
+
+
+class Callbacks:
+    """All callbacks of a host."""
+
+    def __init__(self) -> None:
+        self._all: list[FieldCallback] = []
+
+    def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
+        """A new one, running."""
+        self._all = [callback for callback in self._all if not callback.ended]
+        callback = FieldCallback(function, fields)
+        self._all.append(callback)
+        return callback
+
+    def join(self) -> None:
+        """Wait for all; their subscriptions have ended."""
+        for callback in self._all:
+            callback.join()
+
+
+def _name(function: Callable[[FieldFrame], object]) -> str:
+    return getattr(function, "__qualname__", repr(function))

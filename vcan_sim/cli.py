@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skinnode.cli._bus import OtherChannel, OtherInterface
 from skinnode.cli._usage import Seconds, run
 
 if TYPE_CHECKING:
@@ -30,12 +31,8 @@ app = typer.Typer(
 @app.command()
 def simulate(
     hand: Annotated[Path, typer.Argument(help="The hand to simulate.", metavar="HAND.toml")],
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
-    ] = None,
-    channel: Annotated[
-        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
-    ] = None,
+    interface: OtherInterface = None,
+    channel: OtherChannel = None,
     seconds: Seconds = None,
     fault: Annotated[
         str,

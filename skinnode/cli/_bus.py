@@ -14,6 +14,12 @@ Interface = Annotated[
     str | None, typer.Option(help="python-can interface; default socketcan.", metavar="NAME")
 ]
 Channel = Annotated[str | None, typer.Option(help="Its channel; default can0.", metavar="NAME")]
+OtherInterface = Annotated[
+    str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+]
+OtherChannel = Annotated[
+    str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+]
 Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
 Fd = Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")]
 Hand = Annotated[

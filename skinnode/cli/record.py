@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from skinnode.cli._bus import OtherChannel, OtherInterface
 from skinnode.cli._usage import Seconds
 
 if TYPE_CHECKING:
@@ -38,12 +39,8 @@ def record(
     listen: Annotated[
         bool, typer.Option("--listen", help="Send nothing, solve nothing: only write down what is heard.")
     ] = False,
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
-    ] = None,
-    channel: Annotated[
-        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
-    ] = None,
+    interface: OtherInterface = None,
+    channel: OtherChannel = None,
     seconds: Seconds = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import struct
 import time
 from collections.abc import Callable, Iterator
 
@@ -137,3 +139,29 @@ def test_silent_and_deaf_node(running: Suffers) -> None:
     running.until(Faults(deaf=True), lambda _: running.condition() is Condition.STALE)
     assert running.injected().silenced > 0
     assert running.injected().unheard > 0
+
+
+def can_socket() -> socket.socket:
+    return socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+
+
+@pytest.mark.vcan
+def test_error_frames_of_the_hosts_own_controller(make_hand: Callable[..., HandConfig]) -> None:
+    """As a driver tells them (linux/can/error.h): passive, off the bus, started anew; and once more off."""
+    passive, off, anew = (0x2000_0004, b"\0\x30"), (0x2000_0040, b""), (0x2000_0100, b"")
+    table = {"name": "can0", "interface": "socketcan", "channel": "vcan0"}
+    hand = make_hand(patches=1, buses=[table], sync={"period_ms": 50})
+    with Fleet(hand), Host.from_config(hand) as host, can_socket() as driver:
+        driver.bind(("vcan0",))
+        events = host.events()
+        for can_id, data in (passive, off, off, anew, off, anew):
+            driver.send(struct.pack("=IB3x8s", can_id, 8, data))
+        assert eventually(lambda: host.bus_health("can0").error_frames == 6)
+        assert host.bus_health("can0").bus_offs == 2
+        solved = host.stats().patches["p0"].solved
+        assert eventually(lambda: host.stats().patches["p0"].solved > solved + 4)
+        told = set()
+        while (event := events.get(0.2)) is not None:
+            told.add((event.subject, event.what))
+    assert {("can0", "bus_offs"), ("can0", "error_frames")} <= told
+    assert discrepancies(host.stats()) == []

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Channel, Interface
-
 if TYPE_CHECKING:
     import threading
 
@@ -27,8 +25,12 @@ def monitor(
     hand: Annotated[
         Path | None, typer.Argument(help="The hand to run and to look at.", metavar="[HAND.toml]")
     ] = None,
-    interface: Interface = None,
-    channel: Channel = None,
+    interface: Annotated[
+        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+    ] = None,
     replay: Annotated[
         Path | None,
         typer.Option(help="Look at a recording of `skinnode record`.", metavar="RECORDING"),
@@ -50,13 +52,13 @@ def monitor(
         bool, typer.Option("--json", help="No screen: a JSON object a second, for programs.")
     ] = False,
 ) -> None:
-    """Show a hand on the terminal: height and shear, contacts, health, rates, bus load, events.
+    """Show a hand on the terminal: touch, contacts, health, rates, load, events.
 
-    It runs the hand as `skinnode host` does, but waits for patches that are missing.
-    Keys: 1-9 choose a patch, z shows it alone, t tares it, r records, space holds
-    the picture, ? helps, q quits. Needs the extra `tui`. Exit status 0 if nothing
-    was wrong while it ran, 1 if something was (it is printed at the end), 2 if it
-    could not run.
+    It runs the hand as `skinnode host` does, but waits for missing patches. Keys:
+    1-9 choose a patch, z shows it alone, t tares it, r records, space holds the
+    picture, ? helps, q quits. Needs the extra `tui`. Exit status 0 if nothing was
+    wrong while it ran, 1 if something was (printed at the end), 2 if it could not
+    run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 

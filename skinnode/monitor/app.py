@@ -116,6 +116,12 @@ class MonitorApp(App[None]):
     def on_unmount(self) -> None:
         logging.getLogger().removeHandler(self._records)
 
+    @property
+    def view(self) -> View:
+        """What is shown. There is something from the first turn on."""
+        assert self._view is not None
+        return self._view
+
     # --- the picture
 
     def _turn(self) -> None:

@@ -28,7 +28,9 @@ def screen(
         return [pad([Segment(told[:width], look.text)], width, look)] + [
             pad([], width, look) for _ in range(height - 1)
         ]
-    buses = [_bus_line(bus, look, width) for bus in view.buses[: max(1, height // 8)]]
+    worst_first = sorted(view.buses, key=lambda bus: ("bad", "note", "good").index(bus.level))
+    shown = view.buses if len(view.buses) <= height // 6 else worst_first[: height // 6]
+    buses = [_bus_line(bus, look, width) for bus in shown]
     upper = height - 2 - len(buses) - (8 if height < 28 else 12)
     if ui.zoomed:
         patch = view.patch(ui.selected)
@@ -154,20 +156,21 @@ def _contacts(patches: Sequence[PatchView], scale: Line, look: Look, width: int,
     hidden = len(rows) - (height - 1)
     title = "contacts" + (f" ({hidden} more)" if hidden > 0 else "")
     lines = [_rule(title, scale, look, width)]
-    lines += [pad(_touch_line(patch, touch, look), width, look) for patch, touch in rows[: height - 1]]
+    name = min(14, max((len(patch.name) for patch in patches), default=0))
+    lines += [pad(_touch_line(patch, touch, look, name), width, look) for patch, touch in rows[: height - 1]]
     if not rows:
         known = any(patch.depth_m is not None for patch in patches)
         lines.append([Segment(" nothing touches" if known else " nothing known yet", look.dim)])
     return [*lines, *([[]] * (height - len(lines)))]
 
 
-def _touch_line(patch: PatchView, touch: Touch, look: Look) -> Line:
+def _touch_line(patch: PatchView, touch: Touch, look: Look, name: int) -> Line:
     if touch.force_n is None:
         force = [Segment("force not known ", look.dim)]
     else:
         std = "" if touch.force_std_n is None else f" ± {touch.force_std_n:.2f}"
         force = [Segment(f"{touch.force_n:6.2f}{std} N  ", look.strong)]
-    line = [Segment(f" {patch.name:<9.9}", look.text), *force]
+    line = [Segment(f" {patch.name:<{name}.{name}} ", look.text), *force]
     if touch.shear_n is not None:
         size = float((touch.shear_n[0] ** 2 + touch.shear_n[1] ** 2) ** 0.5)
         sign = maps.arrow(*touch.shear_n) if size >= 0.005 else "·"

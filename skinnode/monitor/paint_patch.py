@@ -70,7 +70,12 @@ def _map(
     across, down = maps.fit(width, height, patch.surface.aspect)
     gone = patch.condition in GONE
     lines = maps.paint_map(
-        patch.surface, across, down, full_m, "none" if gone else look.colours, arrows=arrows and not gone
+        patch.surface,
+        across,
+        down,
+        full_m,
+        "none" if gone else look.colours,
+        arrows=arrows and not gone and down > 3,
     )
     if gone:
         lines = [[Segment(segment.text, look.dim) for segment in line] for line in lines]
@@ -102,6 +107,8 @@ def _health(patch: PatchView, look: Look, width: int) -> Line:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, look)
     if patch.depth_m is not None and not patch.trusted:
         return pad([Segment(" not trusted", look.note)], width, look)
+    if width < 14 and patch.level == "good":
+        return pad([Segment(f" {patch.rate_hz:.1f}/s", style)], width, look)
     rate = [Segment(f"{patch.rate_hz:.1f}/s", look.dim)] if width >= 18 else []
     return spread([Segment(f" {patch.condition}", style)], rate, width, look)
 

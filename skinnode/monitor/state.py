@@ -192,11 +192,12 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
-    """Of the fields of a patch in these snapshots, each once."""
+    """Of the fields of a patch that were made during these snapshots, each once."""
     found: dict[int, float] = {}
+    since_ns = history[-1].t_ns - HISTORY_NS
     for snapshot in history:
         field = snapshot.fields[name]
-        if field is not None and field.stamp is not None:
+        if field is not None and field.stamp is not None and field.stamp.t_solved_ns >= since_ns:
             stamp = field.stamp
             found[stamp.scan] = max(0, stamp.t_solved_ns - stamp.t_receive_ns) * 1e-9
     return list(found.values())

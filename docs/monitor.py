@@ -1,0 +1,65 @@
+"""The picture of `skinnode monitor` in these pages: four simulated patches, one of which was unplugged.
+
+    python docs/monitor.py          writes docs/img/monitor.svg
+
+The screen is that of the program; only who looks at it is not a terminal.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from pathlib import Path
+
+from skinnode.cli.demo import demo_hand
+from skinnode.host import Host
+from skinnode.monitor.app import MonitorApp
+from skinnode.monitor.source import HostSource
+from vcan_sim.faults import Faults
+from vcan_sim.fleet import Fleet
+
+PICTURE = Path(__file__).with_name("img") / "monitor.svg"
+SIZE = (100, 26)
+PRESSED_M = 4e-4
+LONGEST_S = 30.0
+
+
+async def look(source: HostSource, fleet: Fleet) -> str:
+    """The screen, when a patch has been missed for a while and the others are pressed."""
+    app = MonitorApp(source, folder=Path(), colours="rgb")
+    async with app.run_test(size=SIZE):
+        await asyncio.sleep(4.0)
+        fleet.inject(Faults(unplugged=True), "index")
+        end_s = time.monotonic() + LONGEST_S
+        while time.monotonic() < end_s:
+            await asyncio.sleep(0.1)
+            touches = [
+                touch for name in ("palm", "thumb", "middle") for touch in app.view.patch(name).touches
+            ]
+            forces = [touch.shear_n for touch in touches if touch.depth_m > PRESSED_M]
+            sheared = sum(force is not None and abs(force[0]) + abs(force[1]) > 0.5 for force in forces)
+            if app.view.patch("index").condition == "lost" and sheared == 3:
+                break
+        await asyncio.sleep(0.3)
+        return app.export_screenshot(title="skinnode monitor")
+
+
+def without_addresses(svg: str) -> str:
+    """The picture with the fonts of whoever looks at it, in place of some from elsewhere."""
+    svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"font-family: (Fira Code|arial)", "font-family: DejaVu Sans Mono, Menlo, Consolas", svg)
+    return re.sub(r"<!--.*?-->", "", svg)
+
+
+def main() -> None:
+    hand = demo_hand(4, seed=1)
+    solver = hand.solver.model_copy(update={"method": "posterior"})
+    hand = hand.model_copy(update={"name": "hand", "solver": solver})
+    with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
+        svg = asyncio.run(look(source, fleet))
+    PICTURE.write_text(without_addresses(svg), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

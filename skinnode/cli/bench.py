@@ -204,11 +204,7 @@ def pipeline(
     )
     typer.echo(bench.LEGEND)
     _print_machine(figures)
-    for row in figures["must"]:
-        got = "-" if row["got"] is None else f"{row['got']:.2f}"
-        typer.echo(
-            f"{row['what']:52}{got:>9}  asked {row['asked']:g}: {'' if row['reached'] else 'NOT '}reached"
-        )
+    _print_must(figures["must"])
     _write(json, figures)
     if plot is not None:
         from skinnode.cli._plot_pipeline import draw
@@ -216,6 +212,40 @@ def pipeline(
         draw(plot, figures)
     if not all(row["reached"] for row in figures["must"]):
         raise typer.Exit(1)
+
+
+@app.command()
+def soak(
+    json: JsonFile = None,
+    minutes: Annotated[float, typer.Option(min=0.1, help="How long.")] = 10.0,
+    seed: Annotated[int, typer.Option(help="Of the faults: the same seed, the same rounds.")] = 1,
+) -> None:
+    """A simulated hand under random faults: no growth in memory, threads or file descriptors, all sums exact.
+    Exit 1 if not."""
+    from skinnode.cli import _bench_soak as bench
+
+    _prepare(json)
+    figures = bench.run(minutes, seed, typer.echo)
+    typer.echo(
+        f"{figures['rounds']} rounds, {figures['frames']} frames, {figures['scans']} scans, "
+        f"{figures['fields']} fields, {figures['rejoins']} rejoins, "
+        f"slowest stream back after {figures['slowest_back_s']:.2f} s"
+    )
+    counts = ", ".join(f"{name} {count}" for name, count in figures["injected"].items() if count)
+    typer.echo(f"injected: {counts}")
+    for text in figures["discrepancies"]:
+        typer.echo(f"  {text}")
+    _print_must(figures["must"])
+    _write(json, figures)
+    if not all(row["reached"] for row in figures["must"]):
+        raise typer.Exit(1)
+
+
+def _print_must(must: list[dict[str, Any]]) -> None:
+    for row in must:
+        got = "-" if row["got"] is None else f"{row['got']:.2f}".removesuffix(".00")
+        verdict = "reached" if row["reached"] else "NOT reached"
+        typer.echo(f"{row['what']:56}{got:>9}  asked {row['asked']:g}: {verdict}")
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:

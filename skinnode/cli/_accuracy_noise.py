@@ -150,9 +150,11 @@ class Bound:
 
 @dataclass
 class Forces:
-    """Contacts found against the truth; forces as shares of the true one, centroids in metres."""
+    """Contacts found against the truth; forces, where any contact was found, as shares of the true one,
+    centroids in metres."""
 
     found_right: int = 0
+    found_none: int = 0
     scenes: int = 0
     _normal: list[tuple[float, float, float]] = field(default_factory=list)
     _shear: list[tuple[float, float, float]] = field(default_factory=list)
@@ -163,6 +165,9 @@ class Forces:
         contacts, truth = frame.contacts, taken.force_n[-1]
         self.scenes += 1
         self.found_right += len(contacts) == len(taken.presses)
+        if not contacts:
+            self.found_none += 1
+            return
         normal = sum(contact.normal_force_n for contact in contacts)
         normal_std = math.sqrt(sum(contact.normal_force_std_n**2 for contact in contacts))
         self._normal.append((normal + truth[2], normal_std, -truth[2]))
@@ -177,8 +182,13 @@ class Forces:
 
     def row(self) -> dict[str, Any]:
         """RMS errors and deviations, and the shares within 95 % intervals."""
-        figures: dict[str, Any] = {"contacts_right": self.found_right / self.scenes}
+        figures: dict[str, Any] = {
+            "contacts_right": self.found_right / self.scenes,
+            "contacts_none": self.found_none / self.scenes,
+        }
         for name, values in (("normal", self._normal), ("shear", self._shear)):
+            if not values:
+                continue
             error, std, size = np.array(values).T
             figures[f"{name}_error"] = float(np.sqrt(np.mean((error / size) ** 2)))
             figures[f"{name}_reported"] = float(np.sqrt(np.mean((std / size) ** 2)))

@@ -170,7 +170,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  forces and contacts of the posterior in these scenes: RMS error (reported), share in 95 %")
+    echo("  forces and contacts of the posterior where it found any: RMS error (reported), share in 95 %")
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"
@@ -182,8 +182,10 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
                 f"  {name} {_text(row[f'{name}_error'])} ({_text(row[f'{name}_reported'])})"
                 f" {row[f'{name}_coverage']:.0%}"
                 for name in ("normal", "shear")
+                if f"{name}_error" in row
             )
             right = f"{row['contacts_right']:.0%} with the right number of contacts"
+            right += f", {row['contacts_none']:.0%} with none"
             echo(f"  {where:16}{row['sigma']:7.0e}{parts}{place}  {right}")
 
 

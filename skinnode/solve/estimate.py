@@ -123,6 +123,9 @@ class Estimator:
         self._b = kernels.buffers(wires, equations, coordinates, free.size, nuisances)
         self._rows = min(equations, free.size + nuisances)
         self._reach = NEAR * float(problem.clearance.min())
+        self._enough = math.inf  # RMS of a correction that is small against the deviation
+        self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
+        kernels.potentials(np.arange(wires), problem.rest, problem.lower, *self._at_rest)
         self._correction = np.zeros(wires * free.size + nuisances)
         self._every = np.arange(wires)
         self._uniform = np.ascontiguousarray(prior.covariance[np.ix_(every, every)])
@@ -166,6 +169,7 @@ class Estimator:
         """Nothing is known of the field at hand."""
         self.std[:] = np.inf
         self.core[:] = np.inf
+        self._enough = math.inf
         self._factored = None
 
     def spread(self, scale2: float) -> None:
@@ -262,13 +266,17 @@ class Estimator:
         self._square(data, self._every, self.moved if moved is None else moved, self.g)
         return self._b.r.copy()
 
-    def surprise(self, data: Data, moved: Float) -> tuple[Float, Float, Float]:
-        """How badly a displacement explains the frame: (U,) χ² of each wire, (U,) by how many deviations a
-        single coordinate is off at most, and (U, f) by how much each would be, were it the only one, pitches.
+    def surprise(self, data: Data, moved: Float | None) -> tuple[Float, Float, Float]:
+        """How badly a displacement, None for that at rest, explains the frame: (U,) χ² of each wire, (U,) by
+        how many deviations a single coordinate is off at most, and (U, f) by how much each would be, were it
+        the only one, pitches.
 
         χ² alone overlooks what moves one electrode by 7 deviations.
         """
-        self._linearise(data, moved)
+        if moved is None:
+            self._linearise_at_rest(data)
+        else:
+            self._linearise(data, moved)
         total, top = np.empty((2, len(self.moved)))
         move = np.empty((len(top), self._free.size))
         kernels.surprises(self._free, data.h, self.g, self._b.jt, self._b.r, total, top, move)
@@ -327,19 +335,18 @@ class Estimator:
         wires, f = len(self.moved), self._free.size
         a = self._problem.a_rest
         plain = Data(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
-        self._linearise(plain, np.zeros_like(self.moved))
+        self._linearise_at_rest(plain)
         slopes = self._b.jt[:, self._free]  # (U, f, K)
         own = self._uniform.reshape(wires, f, wires, f)[np.arange(wires), :, np.arange(wires)]
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, data: Data, members: Index) -> float:
         """s² at which the resistances would differ from those at rest as much as they do."""
-        self._linearise(data, np.zeros_like(self.moved))
+        self._linearise_at_rest(data)
         trace = self._assemble(data, members, 1.0, np.zeros_like(self.moved))
         excess = float((self._b.r[members] ** 2).sum()) - float(np.count_nonzero(data.weight[members]))
         return excess / trace if trace > 0 else 0.0
 
-    @property
     def gamma(self) -> float:
         """Number of directions in the space of the data that the data determine, not the prior."""
         if self._gamma is None:
@@ -351,7 +358,7 @@ class Estimator:
     def evidence_scale(self, weight: float, scale2: float) -> float:
         """The next s² of MacKay's fixed point (Neural Computation 4, 415, 1992), under a prior worth
         ``weight`` directions at ``scale2``."""
-        return (self.roughness(self.moved) + weight * scale2) / (self.gamma + weight)
+        return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
 
     def roughness(self, moved: Float) -> float:
         """uᵀ C⁻¹ u, pitch²: the square of the scale that a displacement asks for, times the unknowns."""
@@ -388,6 +395,12 @@ class Estimator:
         x = self._problem.rest + moved
         kernels.linearise(members, x, self._problem.lower, data.a, data.weight, b.r, b.jt)
         self.evaluations += members.size
+
+    def _linearise_at_rest(self, data: Data) -> None:
+        """The same for all wires at rest, where F and J are known."""
+        b = self._b
+        b.r[:], b.jt[:] = self._at_rest
+        kernels.weigh(self._every, data.a, data.weight, b.r, b.jt)
 
     def _assemble(self, data: Data, members: Index, scale2: float, moved: Float) -> float:
         return kernels.assemble(members, self._free, self._covariance, scale2, data.h, data.d, moved, self._b)
@@ -443,13 +456,12 @@ class Estimator:
         b.whitened[:m] = b.gain[:m]
         columns = b.whitened.shape[1]
         solve_lower(b.innovation, b.whitened, m, columns)
-        v = b.whitened[:m]
-        prior = self.scale2 * np.diagonal(self._covariance)
-        variance = np.maximum(prior - np.einsum("mj,mj->j", v, v), 0.0)
         kernels.noise_variance(m, data.d, b, self.noise_variance)
-        unseen = np.maximum(variance - self.noise_variance, 0.0)  # what the prior alone speaks of
-        self.std[:] = np.sqrt(self.noise_variance + PRIOR_DOUBT * unseen).reshape(self.std.shape)
-        self.core[:] = np.sqrt(self.noise_variance + SMOOTH_SHARE * unseen).reshape(self.std.shape)
+        kernels.deviations(
+            m, self._covariance, self.scale2, self.noise_variance, PRIOR_DOUBT, SMOOTH_SHARE, self.std,
+            self.core, b,
+        )  # fmt: skip
+        self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
 
     def _settle(self, data: Data) -> bool:
         """Chord steps to the maximum; where they do not settle, the better of the fields before and after."""
@@ -463,7 +475,6 @@ class Estimator:
     def _chord(self, data: Data) -> bool:
         """Chord steps until the correction is small against the deviation."""
         b, wires = self._b, len(self.moved)
-        enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
         before = math.inf
         for _ in range(CHORDS):
             self._linearise(data, self.moved, self.members)
@@ -476,7 +487,7 @@ class Estimator:
                 return False
             self.moved[:, self._free] += step[: self.std.size].reshape(wires, -1)
             self.g += step[self.std.size :]
-            if size <= enough:
+            if size <= self._enough:
                 return True
             if size > CHORD_RATE * before:
                 return False

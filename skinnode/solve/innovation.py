@@ -102,10 +102,24 @@ def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: 
 @njit
 def linearise(members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
     """r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    potentials(members, x, lower, r, jt)
+    weigh(members, a, weight, r, jt)
+
+
+@njit
+def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> None:
+    """F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    for i in range(members.size):
+        u = members[i]
+        potential_jacobian(x[u], lower, f[u], jt[u])
+
+
+@njit
+def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
+    """In place of F and its Jacobian, r = w (a F − 1) and its own."""
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
-        potential_jacobian(x[u], lower, r_u, jt_u)
         for k in range(r_u.size):
             r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
         for j in range(jt_u.shape[0]):
@@ -323,6 +337,27 @@ def noise_variance(m: int, d: Float, b: Buffers, out: Float) -> None:
                     b.gradient[j] += value * row[j]
         for j in range(n):
             out[j] += d[q] * b.gradient[j] * b.gradient[j]
+
+
+@njit
+def deviations(
+    m: int, c: Float, s2: float, noise: Float, doubt: float, share: float, std: Float, core: Float, b: Buffers
+) -> None:
+    """Deviations (U, f) from the variance of the posterior, s² C − Vᵀ V, V being at hand: what is ``noise``
+    (U f,) counts whole, the rest, which the prior alone speaks of, ``doubt`` times in ``std`` and ``share``
+    times in ``core``."""
+    n, f = noise.size, std.shape[1]
+    told = b.gradient
+    for j in range(n):
+        told[j] = 0.0
+    for k in range(m):
+        row = b.whitened[k]
+        for j in range(n):
+            told[j] += row[j] * row[j]
+    for j in range(n):
+        unseen = max(max(s2 * c[j, j] - told[j], 0.0) - noise[j], 0.0)
+        std[j // f, j % f] = math.sqrt(noise[j] + doubt * unseen)
+        core[j // f, j % f] = math.sqrt(noise[j] + share * unseen)
 
 
 @njit

@@ -163,7 +163,7 @@ class Posterior:
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
-        self._estimator.gamma  # noqa: B018  # asked for where nothing touches
+        self._estimator.gamma()  # asked for where nothing touches
         if self._contacts is not None:
             self._contacts.warm_up(self._estimator)
 
@@ -290,10 +290,10 @@ class Posterior:
         return not stirred.any()
 
     def _stirred(
-        self, data: Data, moved: Float, noises: float | Float = 1.0
+        self, data: Data, moved: Float | None, noises: float | Float = 1.0
     ) -> tuple[NDArray[np.bool_], Float, Float]:
-        """(U,) wires whose residuals are beyond noise of variance ``noises``; (U, f) how far each coordinate
-        seems to have moved, were it the only one; (U,) χ²."""
+        """(U,) wires whose residuals, at rest for None, are beyond noise of variance ``noises``; (U, f) how
+        far each coordinate seems to have moved, were it the only one; (U,) χ²."""
         total, sharpest, move = self._estimator.surprise(data, moved)
         limit = self._quiet[data.count]
         stirred = (total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises))
@@ -301,8 +301,7 @@ class Posterior:
 
     def _touched(self, data: Data) -> Index:
         """Wires whose resistances are not those at rest; one in the last solve stays a little longer."""
-        at_rest = np.zeros_like(self._trusted)
-        touched, _, total = self._stirred(data, at_rest)
+        touched, _, total = self._stirred(data, None)
         stay = np.zeros(len(total), bool)
         stay[self._members] = True
         touched |= stay & (total > data.count)
@@ -463,7 +462,7 @@ class Posterior:
         """The factor on the noise at which the residuals are what they should be (MacKay)."""
         total = float((self._estimator.residuals(data)[members] ** 2).sum())
         count = float(np.count_nonzero(data.weight[members]))
-        left = max(count - self._estimator.gamma, 0.0)
+        left = max(count - self._estimator.gamma(), 0.0)
         return math.sqrt((self._factor**2 * total + NOISE_WORTH) / (left + NOISE_WORTH))
 
     def _give_up(self, status: Status) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -204,7 +204,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with responsive_threads(), _ended_by_sigterm(), Fleet(hand) as fleet:
-        with Host.from_config(hand) as host, short_pauses():
+        with short_pauses(), Host.from_config(hand) as host:  # it collects before the first SYNC
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
             progress = _Progress(console, hand, list(watches.values()), seconds)

@@ -64,7 +64,7 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
     from skinnode.pauses import short_pauses
 
     try:
-        with Host.from_config(plan, cancelled=told.is_set) as running, short_pauses():
+        with short_pauses(), Host.from_config(plan, cancelled=told.is_set) as running:
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)

@@ -163,6 +163,10 @@ def _show(source: Source, told: threading.Event, seconds: float | None, output: 
     app.run(mouse=False)  # the terminal's own: text can be selected and copied
     if app.failure is not None:
         raise app.failure
+    if app.return_code:  # a defect of the screen; what it was is on the terminal
+        raise typer.Exit(2)
+    if app.terminal_is_deaf:  # nobody could read what was wrong
+        raise typer.Exit(1 if app.faults.lines else 0)
     return app.faults.lines
 
 

@@ -93,7 +93,7 @@ class MonitorApp(App[None]):
         self._zoomed = self._paused = False
         self._arrows = True
         self._message: tuple[float, str, Level] = (0.0, "", "good")
-        self._history = History(source.hand)
+        self._history = History(source.hand, live=source.live)
         self._baselines: Mapping[str, int] = {}
         self._lines: deque[LogLine] = deque(maxlen=_LOG_LINES)
         self._scale = Scale()
@@ -117,6 +117,11 @@ class MonitorApp(App[None]):
         logging.getLogger().removeHandler(self._records)
 
     @property
+    def terminal_is_deaf(self) -> bool:
+        """After the end: whether the terminal took not even the last of what was written."""
+        return isinstance(self._driver, PatientDriver) and self._driver.deaf
+
+    @property
     def view(self) -> View:
         """What is shown. There is something from the first turn on."""
         assert self._view is not None
@@ -137,8 +142,7 @@ class MonitorApp(App[None]):
         if gone or late or self._told() or self.failure is not None:
             self.exit()
             return
-        if not (isinstance(driver, PatientDriver) and driver.busy):
-            self._draw()
+        self._draw()
         cpu_s = time.thread_time()
         spent_s, self._cpu_s = cpu_s - self._cpu_s, cpu_s
         self.set_timer(min(SLOWEST_S, max(PERIOD_S, spent_s / SHARE)), self._turn)
@@ -158,6 +162,14 @@ class MonitorApp(App[None]):
             self._scale.look(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
+        """Show how things are, unless the terminal has not taken the last picture yet: the next turn will."""
+        driver = self._driver
+        if isinstance(driver, PatientDriver):
+            if driver.busy:
+                return
+            if driver.torn:
+                driver.torn = False
+                self.screen.refresh()
         view, ui, full_m, log = self._view, self._ui(), self._scale.full_m, tuple(self._lines)
         if view is not None:
             self.canvas.show(lambda width, height: screen(view, ui, log, full_m, self._look, width, height))

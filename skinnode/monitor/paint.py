@@ -58,7 +58,7 @@ def _header(view: View, ui: Ui, look: Look, width: int) -> Line:
     seconds = int(ui.elapsed_s)
     left = [
         Segment(" ", bar),
-        Segment(ui.title, look.key),
+        Segment(ui.title if len(ui.title) < 25 else f"{ui.title[:23]}…", look.key),
         Segment(f"  {seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}", bar),
     ]
     wrong = sum(patch.level == "bad" for patch in view.patches) + sum(

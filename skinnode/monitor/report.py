@@ -81,7 +81,7 @@ def watch(
     what was wrong meanwhile goes into ``faults``. Raises the SkinError that ended the source."""
     begun_s = due_s = time.monotonic()
     due_s += LINE_S
-    history = History(source.hand)
+    history = History(source.hand, live=source.live)
     ending, pending = False, list[str]()
     while not ending:
         ending = told.wait(LOOK_S) or source.over

@@ -165,7 +165,7 @@ class ReplaySource:
     live = False
 
     def __init__(self, run: Replay) -> None:
-        self.hand, self.title = run.hand, f"{run.log.path.name}, of {run.started}"
+        self.hand, self.title = run.hand, run.log.path.name
         self._run = run
         self._failure: SkinError | None = None
         self._running = ExitStack()

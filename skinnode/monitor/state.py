@@ -116,8 +116,8 @@ class LogLine:
 class History:
     """The snapshots of the last seconds."""
 
-    def __init__(self, hand: HandConfig) -> None:
-        self._hand = hand
+    def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
+        self._hand, self._live = hand, live
         self._kept: deque[Snapshot] = deque()
 
     def add(self, snapshot: Snapshot) -> View:
@@ -130,14 +130,15 @@ class History:
         kept.append(snapshot)
         while len(kept) > 2 and kept[1].t_ns < snapshot.t_ns - HISTORY_NS:
             kept.popleft()
-        return view_of(self._hand, kept)
+        return view_of(self._hand, kept, live=self._live)
 
 
-def view_of(hand: HandConfig, history: Sequence[Snapshot]) -> View:
-    """The view of the newest snapshot; rates are since the oldest, latencies of all."""
+def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True) -> View:
+    """The view of the newest snapshot; rates are since the oldest, latencies of all, where they are those of
+    a host that is ``live``."""
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
-    patches = tuple(_patch_view(patch, history, elapsed_s) for patch in hand.patches)
+    patches = tuple(_patch_view(patch, history, elapsed_s, live) for patch in hand.patches)
     buses = tuple(
         _bus_view(hand, now.bus_health[bus.name], now.buses[bus.name], before.buses[bus.name], elapsed_s)
         for bus in hand.buses
@@ -156,7 +157,7 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot]) -> View:
     )
 
 
-def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float) -> PatchView:
+def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float, live: bool) -> PatchView:
     now, before, name = history[-1], history[0], patch.name
     health, lane, field = now.health[name], now.lanes[name], now.fields[name]
     condition, level, words = judge_patch(health, lane, before.lanes[name])
@@ -167,7 +168,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
         depth_m = max(0.0, surface.deepest_m)
         std_m = float(field.displacement_std_m[..., 2].flat[int(known.argmax())])
         depth_std_m = std_m if np.isfinite(std_m) else None
-    latencies = _latencies_s(history, name)
+    latencies = _latencies_s(history, name) if live else []
     return PatchView(
         name=name,
         node_id=patch.node_id,

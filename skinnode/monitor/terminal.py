@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import queue
 import threading
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from textual.drivers.linux_driver import LinuxDriver
@@ -45,6 +47,16 @@ class PatientDriver(LinuxDriver):
         super().__init__(app, **options)
         self._output = _Output(1)
         self._file: Any = self._output
+        self.torn = False
+        """Something was not written since too much waited; the picture has to be drawn anew."""
+
+    def write(self, data: str) -> None:
+        """Never waits: what finds the line full is thrown away."""
+        writer = self._writer_thread
+        if writer is None or writer._queue.full():
+            self.torn = True
+        else:
+            writer.write(data)
 
     @property
     def busy(self) -> bool:
@@ -57,6 +69,12 @@ class PatientDriver(LinuxDriver):
         """Whether the terminal does not exist any more."""
         return self._output.gone.is_set()
 
+    @property
+    def deaf(self) -> bool:
+        """Whether what is written now would wait for a terminal that stalls, or find none."""
+        writer = self._writer_thread
+        return self.gone or (writer is not None and writer.is_alive())
+
     def _run_input_thread(self) -> None:
         try:
             self.run_input_thread()
@@ -67,6 +85,6 @@ class PatientDriver(LinuxDriver):
         """End the writing thread; one that waits for a stalled terminal is left to end with the process."""
         writer = self._writer_thread
         if writer is not None:
-            if not writer._queue.full():
-                writer._queue.put(None)
+            with suppress(queue.Full):
+                writer._queue.put_nowait(None)
             writer.join(_LAST_WORDS_S)

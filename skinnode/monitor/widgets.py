@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from textual.app import ComposeResult
 from textual.binding import BindingType
+from textual.events import Key
 from textual.geometry import Region
 from textual.screen import ModalScreen
 from textual.strip import Strip
@@ -78,6 +79,7 @@ class Dialog(ModalScreen[bool]):
     def __init__(self, text: str, *, question: bool) -> None:
         super().__init__()
         self._text, self._question = text, question
+        self._answered = False
 
     @property
     def text(self) -> str:
@@ -87,6 +89,8 @@ class Dialog(ModalScreen[bool]):
     def compose(self) -> ComposeResult:
         yield Static(self._text, markup=False)
 
-    def on_key(self, event: object) -> None:
-        key = getattr(event, "key", "")
-        self.dismiss(self._question and key in ("y", "enter"))
+    def on_key(self, event: Key) -> None:
+        event.stop()
+        if not self._answered:  # keys that were typed ahead find it on its way out
+            self._answered = True
+            self.dismiss(self._question and event.key in ("y", "enter"))

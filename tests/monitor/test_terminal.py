@@ -145,9 +145,26 @@ def test_a_terminal_that_stalls_holds_up_neither_the_host_nor_the_end(
         time.sleep(1.0)
         after = [report.scans_sent for report in fleet.report()]
         assert all(new >= old + 5 for old, new in zip(before, after, strict=True)), (before, after)
+        screen.type("?x" * 60)  # each wants to draw
+        time.sleep(0.5)
         screen.process.send_signal(signal.SIGTERM)
         assert screen.process.wait(PATIENCE_S) in (0, 1)  # nodes may have skipped scans on a busy machine
         assert states(fleet) == {NmtState.PRE_OPERATIONAL}
+
+
+def test_a_terminal_that_stalled_gets_a_whole_picture(tmp_path: Path, crossing_hand: HandConfig) -> None:
+    with Fleet(crossing_hand), terminal([*PROGRAM, str(write_hand(tmp_path, crossing_hand))]) as screen:
+        assert screen.read_until("operational", "quit")
+        screen.type("?x" * 150)  # more pictures than the line takes
+        time.sleep(2.0)
+        screen.type("z")
+        assert screen.read_until("node 5, can0")
+        screen.said = b""
+        screen.type("z")
+        assert screen.read_until(" 2 p1 ", "operational")
+        screen.type("q")
+        screen.read_to_the_end()
+        assert screen.process.wait(PATIENCE_S) == 0
 
 
 def test_no_color_is_respected(tmp_path: Path, crossing_hand: HandConfig) -> None:

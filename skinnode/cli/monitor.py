@@ -70,7 +70,6 @@ def monitor(
     if not output.is_dir():
         raise ConfigError("--output", str(output), "an existing folder")
     from skinnode.host import BringUpCancelled
-    from skinnode.pauses import responsive_threads, short_pauses
     from skinnode.signals import until_told
 
     with until_told() as told, ExitStack() as stack:
@@ -81,8 +80,7 @@ def monitor(
                 source = _running(stack, _plan(hand, interface, channel, simulate), told, simulate, as_json)
         except BringUpCancelled:
             return
-        with responsive_threads(), short_pauses():
-            faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, output)
+        faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, output)
     for fault in faults:
         print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
     if faults:
@@ -131,6 +129,10 @@ def _running(
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
     from skinnode.monitor.source import HostSource
+    from skinnode.pauses import responsive_threads, short_pauses
+
+    if not quiet:
+        import skinnode.monitor.app  # noqa: F401  # while nothing has a deadline yet
 
     with progress(quiet) as tell:
         tell("compiling the kernels, once" if is_cold() else "preparing the solvers")
@@ -141,6 +143,8 @@ def _running(
 
             stack.enter_context(simulated(plan))
         tell(f"bringing up {len(plan.patches)} patches")
+        stack.enter_context(responsive_threads())
+        stack.enter_context(short_pauses())  # it collects before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=told.is_set))
     return stack.enter_context(HostSource(host))
 

@@ -26,10 +26,10 @@ def run(*arguments: str, program: list[str] = PROGRAM) -> subprocess.CompletedPr
 
 def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
     with Fleet(crossing_hand):
-        done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "4")
+        done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "3")
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(lines) == 4
+    assert len(lines) == 3
     newest = lines[-1]
     assert {patch["condition"] for patch in newest["patches"].values()} == {"operational"}
     assert newest["patches"]["p0"]["rate_hz"] == pytest.approx(2.5, abs=0.6)

@@ -89,11 +89,9 @@ def states(fleet: Fleet) -> set[NmtState]:
     return {report.nmt_state for report in fleet.report()}
 
 
-def test_keys_and_a_clean_end(tmp_path: Path, crossing_hand: HandConfig) -> None:
-    with (
-        Fleet(crossing_hand) as fleet,
-        terminal([*PROGRAM, str(write_hand(tmp_path, crossing_hand))]) as screen,
-    ):
+def test_keys_without_colours_and_a_clean_end(tmp_path: Path, crossing_hand: HandConfig) -> None:
+    command = [*PROGRAM, str(write_hand(tmp_path, crossing_hand))]
+    with Fleet(crossing_hand) as fleet, terminal(command, NO_COLOR="1") as screen:
         assert screen.read_until("\x1b[?1049h", "p0", "p1", "operational", "quit"), screen.said[-2000:]
         screen.type("q")
         screen.read_to_the_end()
@@ -102,6 +100,19 @@ def test_keys_and_a_clean_end(tmp_path: Path, crossing_hand: HandConfig) -> None
         assert b"\x1b[?25h" in screen.said  # and the cursor
         assert b"\x1b[?1000h" not in screen.said  # the mouse was left to the terminal
         assert states(fleet) == {NmtState.PRE_OPERATIONAL}
+    colours = {str(number).encode() for number in (*range(30, 39), *range(40, 49), *range(90, 98))}
+    assert parameters(screen.said) & colours == set()
+
+
+def parameters(said: bytes) -> set[bytes]:
+    """Of all sequences that set colours and the like."""
+    sequences = (part.partition(b"m") for part in said.split(b"\x1b[")[1:])
+    return {
+        parameter
+        for numbers, end, _ in sequences
+        if end and numbers.replace(b";", b"").isdigit()
+        for parameter in numbers.split(b";")
+    }
 
 
 def test_a_fault_of_the_session_is_its_exit_status(tmp_path: Path, crossing_hand: HandConfig) -> None:
@@ -165,21 +176,3 @@ def test_a_terminal_that_stalled_gets_a_whole_picture(tmp_path: Path, crossing_h
         screen.type("q")
         screen.read_to_the_end()
         assert screen.process.wait(PATIENCE_S) == 0
-
-
-def test_no_color_is_respected(tmp_path: Path, crossing_hand: HandConfig) -> None:
-    with (
-        Fleet(crossing_hand),
-        terminal([*PROGRAM, str(write_hand(tmp_path, crossing_hand))], NO_COLOR="1") as screen,
-    ):
-        assert screen.read_until("operational", "quit")
-        screen.type("q")
-        screen.read_to_the_end()
-    sequences = {
-        parameter
-        for sequence in screen.said.split(b"\x1b[")[1:]
-        if b"m" in sequence and sequence.partition(b"m")[0].replace(b";", b"").isdigit()
-        for parameter in sequence.partition(b"m")[0].split(b";")
-    }
-    colours = {str(number).encode() for number in (*range(30, 39), *range(40, 49), *range(90, 98))}
-    assert sequences & colours == set()

@@ -9,8 +9,8 @@ sooner), so with the usual range of 240 scans a frame may be 237 periods old.
 
 **Two scans under one counter**, from a node that did not count on or from two nodes with one node-ID, show
 in a frame that comes twice with other content. Nobody can tell then whose the rest is: such a scan is thrown
-away whole. So is a scan with frames missing whose others lie more than two periods apart: it began with a
-frame that had the counter of a scan to come, and that scan's own frame of that place comes after the timeout.
+away whole. So is a scan with frames missing whose chunks lie more than two periods apart: it began with one
+that had the counter of a scan to come, and that scan's own chunk of that place comes after the timeout.
 Two halves of which no frame overlaps cannot be told from one scan.
 
 **Order of counters.** Up to half the counter range ahead is newer, the rest is late and dropped. After a
@@ -172,6 +172,7 @@ class ScanAssembler:
         self._sent = _NEVER
         self._summary: Summary | None = None
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
+        self._t_chunk_ns = self._t_summary_ns = 0  # of the frame before the summary, and of the summary
 
         # what is known about every chunk after the last scan, and whether the open scan follows it
         self._held: list[bytes | None] = [None] * self._n
@@ -224,7 +225,7 @@ class ScanAssembler:
             self._open(summary.scan, t_ns)
         self._summary = summary
         self._sent = summary.chunks
-        self._t_last_ns = t_ns
+        self._t_chunk_ns, self._t_summary_ns, self._t_last_ns = self._t_last_ns, t_ns, t_ns
         if closed is None and self._received >= self._sent:
             return self._close()
         return closed
@@ -372,7 +373,9 @@ class ScanAssembler:
         self._counter = _NONE_OPEN
         summary = self._summary
         whole = summary is not None and self._received >= summary.chunks
-        if self._mixed or (not whole and self._t_last_ns - self._t_first_ns > self._longest_ns):
+        summary_is_last = summary is not None and self._t_last_ns == self._t_summary_ns
+        t_chunk_ns = self._t_chunk_ns if summary_is_last else self._t_last_ns
+        if self._mixed or (not whole and t_chunk_ns - self._t_first_ns > self._longest_ns):
             self._thrown += 1
             self._held = [None] * self._n
             return None

@@ -104,8 +104,9 @@ def receive(
 
     def poll(t_ns: int) -> None:
         while polled and (deadline := assembler.next_deadline_ns()) is not None and deadline <= t_ns:
+            thrown = assembler.stats.scans_mixed
             published.append(assembler.poll(deadline))
-            assert published[-1] is not None, "a deadline without a scan"
+            assert published[-1] is not None or assembler.stats.scans_mixed > thrown, "a deadline in vain"
 
     for frame in frames:
         poll(frame.t_ns)
@@ -214,6 +215,10 @@ def test_no_scan_is_ever_mixed_from_two(world: tuple[ModelNode, list[Frame]], po
         sum(scan.complete for scan in published),
         sum(not scan.complete for scan in published),
     )
+    came: dict[int, list[int]] = {}
+    for frame in frames:
+        came.setdefault(frame.sample, []).append(frame.t_ns)
+    assert stats.scans_mixed <= sum(max(times) - min(times) > 2 * PERIOD for times in came.values())
 
 
 # --- a channel in order: what must come out is known exactly

@@ -37,7 +37,7 @@ MOST_NOT_RUN = 6
 WIDEST = 104
 """Columns of code that a page shows without scrolling."""
 
-SLOWED = {"first-ten-minutes.md"}
+SLOWED = {"first-ten-minutes.md", "monitor.md"}
 """Pages whose simulated hand scans three times less often, so that a busy machine keeps up."""
 
 _PRINTED = (PRINTS, PRINTS_EXACTLY)

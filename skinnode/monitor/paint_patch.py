@@ -197,7 +197,7 @@ def facts(patch: PatchView, look: Look, width: int) -> list[Line]:
     state = "unknown" if health.nmt_state is None else NMT_STATES.get(health.nmt_state, str(health.nmt_state))
     age = "" if health.heartbeat_age_s is None else f", heard {_span(health.heartbeat_age_s)} ago"
     fact("NMT", f"{state}{age}")
-    fact("boots", f"{health.boot_ups} heard, taken up again {health.rejoins} times")
+    fact("boots", f"{health.boot_ups} heard, {health.rejoins} rejoins")
     last = f", last 0x{health.last_emergency:04X} {health.emergency_text}" if health.last_emergency else ""
     fact("EMCY", f"{health.emergencies}{last}", look.note if health.emergencies else look.text)
     wires = ", ".join(f"{fault.side} {fault.number} {fault.state}" for fault in health.wires)

@@ -139,10 +139,15 @@ def _examine(
 
 
 def _info(line: Line, node_id: int) -> tuple[NodeInfo | None, str]:
-    try:
-        return read_info(line, node_id), ""
-    except NodeError as error:
-        return None, str(error)
+    """Asked a second time where that fails: a host that runs may have asked the node at the same time, and a
+    server has room for one transfer."""
+    failure = ""
+    for _ in range(2):
+        try:
+            return read_info(line, node_id), ""
+        except NodeError as error:
+            failure = str(error)
+    return None, failure
 
 
 def _profile(line: Line, node_id: int) -> PatchProfile | None:

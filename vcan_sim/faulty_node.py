@@ -220,12 +220,15 @@ class FaultyNode(PatchNode):
             case "late":
                 self._late.append((data[_CHUNK_COUNTER_BYTE], data))
             case "short":
-                self._pass(chunk_id, data[:-1], spoilt=True)
+                if not self._pass(chunk_id, data[:-1], spoilt=True):
+                    return  # silenced, whatever it would have been
             case "remote":
-                self._pass(chunk_id, b"", remote=True)
+                if not self._pass(chunk_id, b"", remote=True):
+                    return
             case "miscounted":
                 wrong = _with_byte(data, _CHUNK_COUNTER_BYTE, self._another(self._counter))
-                self._pass(chunk_id, wrong, spoilt=True)
+                if not self._pass(chunk_id, wrong, spoilt=True):
+                    return
         setattr(injected, fault, getattr(injected, fault) + 1)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
             self._spoilt = True

@@ -170,11 +170,16 @@ class BusLink(Dealer):
 
     def _turn(self) -> bool:
         """One batch of frames to their handlers; whether there was any."""
-        batch = self._receiver.get_batch(_WAIT_S)
+        receiver = self._receiver
+        batch, seen_ns = receiver.get_batch(_WAIT_S), self.t_dealt_ns
+        if not batch:
+            seen_ns = receiver.seen_ns
+            batch = receiver.get_batch(0.0)
         while self._jobs:
             self._jobs.popleft()()
         self.deal(batch)
-        # While frames wait, the time is that of the newest one dealt out: nothing is late because we are.
-        self.t_dealt_ns = batch[-1].t_ns if batch else time.monotonic_ns()
+        # While frames wait, here or in the interface, time is that of the newest one dealt out: nothing is
+        # late because we are.
+        self.t_dealt_ns = batch[-1].t_ns if batch else max(seen_ns, self.t_dealt_ns)
         self.poll(self.t_dealt_ns)
         return bool(batch)

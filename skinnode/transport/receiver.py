@@ -16,8 +16,8 @@ from skinnode.transport.port import CanPort
 CAPACITY_FRAMES: Final = 16384
 """Two seconds of a full bus at 1 Mbit/s (8,000 frames/s): longer than any pause a host survives otherwise."""
 
-_POLL_S: Final = 0.1
-"""How long the thread waits before it looks whether it should end."""
+_POLL_S: Final = 0.02
+"""How long the thread waits for a frame before it says that there is none, and sees whether it should end."""
 
 
 GATHER_S: Final = 1e-3
@@ -43,6 +43,8 @@ class Receiver:
         self._queue: queue.SimpleQueue[list[Frame] | None] = queue.SimpleQueue()  # None: the bus failed
         self._left: list[Frame] = []  # of a batch that was longer than asked for
         self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the thread's
+        self.seen_ns = 0
+        """Whatever came before is queued, or was dropped; monotonic."""
         self._error: BusError | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"receive {port.config.name}", daemon=True)
@@ -101,13 +103,21 @@ class Receiver:
             while not stopped():
                 frames = receive(_POLL_S)
                 if not frames:
-                    continue
+                    now_ns = time.monotonic_ns()
+                    frames = receive(
+                        0.0
+                    )  # this thread may have been away since it was told that there is none
+                    if not frames:
+                        self.seen_ns = now_ns
+                        continue
                 room = self._capacity - self.queued
                 if len(frames) > room:
                     self._dropped += len(frames) - room
                     frames = frames[:room]
                 self._put += len(frames)
                 put(frames)
+                if frames:
+                    self.seen_ns = frames[-1].t_ns
                 if pause_s:
                     time.sleep(pause_s)
         except BusError as error:

@@ -91,3 +91,41 @@ def test_on_a_bus(any_bus: BusConfig) -> None:
         assert [frame.can_id for frame in frames] == list(range(200))
         receiver.close()
         receiver.close()
+
+
+def test_it_knows_up_to_when_it_has_seen_everything() -> None:
+    port = Script(10)
+    begin_ns = time.monotonic_ns()
+    with Receiver(port) as receiver:
+        assert port.played.wait(5)
+        end_s = time.monotonic() + 5
+        while receiver.seen_ns < begin_ns and time.monotonic() < end_s:
+            time.sleep(0.005)
+        assert begin_ns < receiver.seen_ns <= time.monotonic_ns()
+        assert receiver.queued == 10
+
+
+def test_frames_that_wait_are_not_yet_seen(any_bus: BusConfig) -> None:
+    """However long the thread is held up: while a frame waits, nothing later has been seen."""
+    with CanPort(any_bus) as ours, CanPort(any_bus) as theirs:
+        held, go = threading.Event(), threading.Event()
+        receive = theirs.recv_batch
+
+        def hold(timeout_s: float, most: int = 256) -> list[Frame]:
+            frames = receive(timeout_s)
+            if not frames and not go.is_set() and timeout_s:
+                held.set()
+                go.wait(10)  # it was told that there is nothing, and is away for a while
+            return frames
+
+        theirs.recv_batch = hold  # type: ignore[method-assign]
+        with Receiver(theirs) as receiver:
+            assert held.wait(5)
+            ours.send(1, b"")
+            time.sleep(0.05)
+            sent_ns = time.monotonic_ns()
+            assert receiver.seen_ns < sent_ns
+            go.set()
+            (frame,) = receiver.get_batch(5.0)
+            assert frame.can_id == 1
+            assert receiver.seen_ns < sent_ns or receiver.queued == 0

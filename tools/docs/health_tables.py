@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable
 from typing import Final
 
@@ -20,7 +21,11 @@ _PLAIN: Final = {
 
 def conditions() -> str:
     docs = {**_PLAIN, **md.member_docs(Condition)}
-    return md.table(("condition", "when"), ((str(c), docs[c.name]) for c in Condition))
+    return md.table(("condition", "when"), ((str(c), _without_reference(docs[c.name])) for c in Condition))
+
+
+def _without_reference(text: str) -> str:
+    return re.sub(r": see `\w+`", "", text)
 
 
 def faults() -> str:

@@ -15,7 +15,7 @@ from skinnode.node.emcy import EmcyCode
 from skinnode.node.rejected import Rejected
 from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale, SummaryFlag, encode, pack_command, pack_scan, pack_summary
-from skinnode.wire.dictionary import Entry, Object
+from skinnode.wire.dictionary import Entry, Object, highest
 from skinnode.wire.emergency import error_text
 from skinnode.wire.profile import REFERENCE_PROFILES, PatchProfile, eds_name
 from skinnode.wire.timing import fd_worst_case_bits, worst_case_bits
@@ -23,6 +23,9 @@ from skinnode.wire.timing import fd_worst_case_bits, worst_case_bits
 PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
+_HIGHEST: Final = highest(0, 0).name
+"""Sub-index 0 of nearly every object; it says what the rows below it show."""
+_PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
 """Entries alike that are still listed one by one."""
 
@@ -49,7 +52,7 @@ def cob_ids() -> str:
         (
             (
                 name,
-                md.c_hex(base, 3) + (" + node-ID" if own != base else ""),
+                md.c_hex(base, 3) + (_PLUS_NODE_ID if own != base else ""),
                 md.c_hex(own, 3),
                 way,
                 str(size),
@@ -221,18 +224,23 @@ def _dictionary(objects: Iterable[Object]) -> str:
         first, last = run[0], run[-1]
         many = len(run) > 1
         index = md.c_hex(first.index) + (f" – {last.index:04X}" if many else "")
-        name = f"{first.name} … {last.name.rpartition(' ')[2]}" if many else first.name
+        name = _and_on(first.name, last.name) if many else first.name
         if len(first.entries) == 1:
             rows.append((f"**{index}**", "0", f"**{name}**", *_columns(first.entries[0])))
             continue
         rows.append((f"**{index}**", "", f"**{name}**", first.type.name.lower(), "", "", ""))
-        for group in _alike(first.entries):
+        for group in _alike(e for e in first.entries if e.name != _HIGHEST):
             subs = str(group[0].subindex)
             label = group[0].name
             if len(group) > 1:
-                subs, label = f"{subs} – {group[-1].subindex}", f"{label} … {group[-1].name}"
+                subs, label = f"{subs}–{group[-1].subindex}", _and_on(label, group[-1].name)
             rows.append(("", subs, label, *_columns(group[0])))
     return md.table(("index", "sub", "name", "type", "access", "default", "PDO"), rows)
+
+
+def _and_on(first: str, last: str) -> str:
+    """Names that differ in their last word."""
+    return f"{first} … {last.rpartition(' ')[2]}"
 
 
 def _alike(entries: Iterable[Entry]) -> list[list[Entry]]:
@@ -259,7 +267,7 @@ def _default(entry: Entry) -> str:
     if value is None:
         return ""
     if isinstance(value, int) and (entry.name.startswith("COB-ID") or value > 0xFFFF):
-        return md.c_hex(value, 3) + (" + node-ID" if entry.plus_node_id else "")
+        return md.c_hex(value, 3) + (_PLUS_NODE_ID if entry.plus_node_id else "")
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

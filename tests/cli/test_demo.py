@@ -64,6 +64,7 @@ def unhurried_hand() -> HandConfig:
     return hand.model_copy(update={"sync": hand.sync.model_copy(update={"period_ms": 100})})
 
 
+@pytest.mark.real_time
 def test_a_lost_frame_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     send, sent = CanPort.send, [0]
 
@@ -80,6 +81,7 @@ def test_a_lost_frame_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any("torn" in fault for fault in report.faults)
 
 
+@pytest.mark.real_time
 def test_an_error_above_its_uncertainty_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """A gain error that appears after the baseline was taken: the solver cannot know it."""
     init = Fleet.__init__

@@ -11,7 +11,6 @@ from contextlib import ExitStack, closing
 from typing import Any
 
 import pytest
-from _pytest.runner import runtestprotocol
 
 from skinnode.model.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
@@ -21,26 +20,7 @@ from skinnode.transport import CanPort, Frame
 from skinnode.wire.profile import PatchProfile
 from vcan_sim.fleet import Fleet
 
-from .stalls import STALL_S, TRIES, StallWatch
-
 SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Tests marked ``real_time`` that fail are run again if the machine stood still meanwhile."""
-    if item.get_closest_marker("real_time") is None:
-        return None
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for _ in range(TRIES):
-        with StallWatch() as watch:
-            reports = runtestprotocol(item, log=False, nextitem=nextitem)
-        if watch.worst_s < STALL_S or not any(report.failed for report in reports):
-            break
-    for report in reports:
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
 
 
 @pytest.fixture(autouse=True)

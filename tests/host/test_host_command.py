@@ -116,6 +116,7 @@ def heartbeats(bus: BusConfig) -> dict[int, int]:
         }
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_two_processes_on_one_bus(shared: tuple[Path, BusConfig], number: int) -> None:
     path, bus = shared

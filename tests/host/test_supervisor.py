@@ -192,6 +192,7 @@ def test_a_tare_is_followed_and_no_scan_is_decoded_with_the_wrong_baseline(
         assert stats.rivals["can0"].sdo_requests == 1
 
 
+@pytest.mark.real_time
 @pytest.mark.vcan
 def test_an_interface_that_goes_down_and_comes_up_again(
     make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]

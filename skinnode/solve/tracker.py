@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.elastic import Rubber
-from skinnode.model.frames import FieldFrame
+from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
 from skinnode.solve.branch import (
@@ -46,6 +46,9 @@ NONLINEAR: Final = 0.003
 then as doubtful as near a fold."""
 LARGE: Final = 0.03
 """Displacement, in clearances, from which on its roughness is looked at: folds lie at larger ones still."""
+PAUSE: Final = 16
+"""Frames in which the posterior is not asked again, after it did not answer by the deadline: to ask in vain
+with every frame takes 2 ms of the time of patches that wait for the same thread."""
 ROUGH: Final = 1.2
 """Roughness of a displacement over its size, in the units of :class:`Smoothness`, above which it is put to
 the posterior. Presses have 0.5 to 1 and up to 1.7 where they move one electrode, wrong roots 1 to 2."""
@@ -128,6 +131,7 @@ class Tracker:
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
         self._large_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
+        self._pause = 0  # frames until the posterior is asked again
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # what its confirmation left open of a wire
         self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
@@ -142,6 +146,7 @@ class Tracker:
             self._confirmed = None
             self._apart[:] = 0.0
             self._last_m[:] = 0.0
+            self._pause = 0
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -163,12 +168,18 @@ class Tracker:
         field = self._exact.update(frame_ohm, valid, relative_noise)
         lost, unsure = self._doubtful(field)
         if (lost | unsure).any():
-            if unsure.any():
-                self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
-            noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
-            self._posterior.stop_at(start + self._seconds)
-            guide = self._posterior.update(frame_ohm, valid, noise)
+            if self._pause:
+                guide = _no_answer(field)
+            else:
+                if unsure.any():
+                    self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
+                noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
+                self._posterior.stop_at(start + self._seconds)
+                guide = self._posterior.update(frame_ohm, valid, noise)
+                if Status.DEADLINE in guide.status:
+                    self._pause = PAUSE
             field = self._refer(field, lost | unsure, guide)
+        self._pause = max(0, self._pause - 1)
         field = self._keep_apart(field, ~(lost | unsure))
         self._last_m = field.displacement_m
         return field
@@ -269,6 +280,18 @@ class Tracker:
             force_n=force,
             by_prior=replaced,
         )
+
+
+def _no_answer(field: FieldFrame) -> FieldFrame:
+    """What the posterior says that was not asked for want of time."""
+    unknown = np.full_like(field.displacement_std_m, np.inf)
+    return dataclasses.replace(
+        field,
+        status=(Status.DEADLINE,) * len(field.status),
+        displacement_std_m=unknown,
+        core_std_m=unknown,
+        stats=SolveStats(0, 0, 0, 0.0),
+    )
 
 
 def _choose(

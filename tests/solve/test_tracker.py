@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -258,3 +259,31 @@ def test_what_a_confirmation_left_open_stays_while_a_wire_is_held():
     assert own.any()
     wide, still = (field.displacement_std_m[own].max(axis=(1, 2)) for field in (first, again))
     assert (still > 0.5 * wide).all()
+
+
+def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout, monkeypatch):
+    """A wire in doubt all the while stays untrusted, whether the posterior was asked or not."""
+    tracker = sk.Tracker(layout, method="exact", deadline_us=1e7)
+    ask, asked, answers = tracker._posterior.update, [], False
+
+    def update(*arguments: object) -> sk.FieldFrame:
+        asked.append(number)
+        field = ask(*arguments)
+        return field if answers else dataclasses.replace(field, status=(sk.Status.DEADLINE,) * 4)
+
+    def doubtful(field: sk.FieldFrame) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(4, bool), np.array([True, False, False, False])
+
+    monkeypatch.setattr(tracker._posterior, "update", update)
+    monkeypatch.setattr(tracker, "_doubtful", doubtful)
+    moved = hertz_press(layout, 0.1, centre_m=(6e-3, 6e-3))
+    for number in range(40):
+        answers = number >= 32
+        field = tracker.update(frame_ohm(layout, moved))
+        assert field.status[1:] == (sk.Status.CONVERGED,) * 3
+        if not answers:
+            assert field.status[0] is sk.Status.ILL_CONDITIONED
+            assert np.isinf(field.displacement_std_m[0]).all()
+    assert asked == [0, 16, *range(32, 40)]
+    assert field.trusted
+    np.testing.assert_allclose(field.displacement_m, moved, atol=1e-3 * layout.height_m)

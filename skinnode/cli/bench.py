@@ -9,7 +9,7 @@ import typer
 
 from skinnode.errors import ConfigError
 
-app = typer.Typer(help="Measure solver and node on this machine.", no_args_is_help=True)
+app = typer.Typer(help="Measure solver, node and host on this machine.", no_args_is_help=True)
 
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to FILE as well.")

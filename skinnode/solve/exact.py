@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.forward import jacobian
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
-from skinnode.model.status import Status
+from skinnode.model.status import Status, as_statuses
 from skinnode.solve import operators as op
 from skinnode.solve import wires
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
@@ -247,7 +247,7 @@ class ExactTracker:
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=(solver.std * self.layout.pitch_m).reshape(displacement.shape),
-            status=tuple(map(Status, status.tolist())),
+            status=as_statuses(status.tolist()),
             residual=residual,
             stats=SolveStats(self._evaluations, self._evaluations, self._steps, perf_counter() - start),
             force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
@@ -281,7 +281,9 @@ class ExactTracker:
             sure = max(1, int((frame.until - perf_counter()) / WIRE_S))
             chosen, waiting = waiting[:sure], waiting[sure:]
             turns[chosen] = True
-            self._call(np.where(np.isin(np.arange(len(todo)), chosen), todo, wires.LEAVE), frame)
+            share = np.full_like(todo, wires.LEAVE)
+            share[chosen] = todo[chosen]
+            self._call(share, frame)
         return turns
 
     def _call(

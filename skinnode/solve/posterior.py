@@ -20,7 +20,7 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
-from skinnode.model.status import Status
+from skinnode.model.status import Status, as_statuses
 from skinnode.solve.branch import REFEREE_NOISE, folded_wires
 from skinnode.solve.contacts import ContactFinder
 from skinnode.solve.estimate import Data, Estimator, Index
@@ -491,7 +491,7 @@ class Posterior:
             displacement_m=displacement,
             displacement_std_m=(std * pitch).reshape(displacement.shape),
             core_std_m=(core * pitch).reshape(displacement.shape),
-            status=tuple(map(Status, status.tolist())),
+            status=as_statuses(status.tolist()),
             residual=np.where(used.any(axis=1), rms, np.inf),
             stats=SolveStats(
                 estimator.evaluations, estimator.evaluations, estimator.factorisations, perf_counter() - start

@@ -27,7 +27,8 @@ def check(
     """Validate a hand file and work out what it needs of its buses.
 
     For each bus: the load of the plan with every frame at its longest and with random data, the worst-case
-    time from SYNC to the end of each patch's summary, and that against the SYNC period. Nothing is opened.
+    time from SYNC to the end of each patch's summary, and that against the SYNC period; and how long each
+    frame of `others` waits at worst. Nothing is opened.
     Exit status 1 if a bus needs more than its max_load, 2 if the file cannot be used.
     """
     from skinnode.errors import BusLoadError
@@ -80,6 +81,7 @@ def _facts(plan: BusPlan) -> dict[str, Any]:
                 "frames_per_s": frame.frames_per_s,
                 "load": frame.load,
                 "typical_load": frame.typical_load,
+                "worst_response_s": frame.response_s,
             }
             for frame in plan.frames
         ],
@@ -100,6 +102,8 @@ def _print(config: HandConfig, plans: tuple[BusPlan, ...]) -> None:
         console.print(_headline(plan), markup=False)
         console.print(_scan_table(plan))
         console.print(_frame_table(plan))
+        if plan.others:
+            console.print(_other_table(plan))
         for line in _remarks(plan):
             console.print(line, markup=False)
 
@@ -145,6 +149,15 @@ def _frame_table(plan: BusPlan) -> Table:
     table = _table("frames", "a second", "load at worst", "typical")
     for kind, (rate, load, typical) in kinds.items():
         table.add_row(kind, f"{rate:.1f}", f"{load:.2%}", f"{typical:.2%}")
+    return table
+
+
+def _other_table(plan: BusPlan) -> Table:
+    """How long each frame of others may be kept from the bus by all that has a lower identifier."""
+    table = _table("others", "bytes", "every ms", "queued to passed ms")
+    for frame in plan.others:
+        worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"
+        table.add_row(f"0x{frame.can_id:03X}", str(frame.length), f"{frame.period_s * 1e3:g}", worst)
     return table
 
 

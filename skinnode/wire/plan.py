@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -59,6 +59,8 @@ class PlannedFrame:
     """Time on the bus with random data."""
     scans: bool = False
     """Whether there is one for each SYNC."""
+    response_s: float | None = None
+    """From when it is queued until it has passed, at worst; None where there is no bound."""
 
     @property
     def frames_per_s(self) -> float:
@@ -112,6 +114,12 @@ class BusPlan:
         return sum(frame.typical_load for frame in self.frames)
 
     @property
+    def others(self) -> tuple[PlannedFrame, ...]:
+        """Those of the frames that others send, as the hand file names them."""
+        named = {other.can_id for other in self.bus.others}
+        return tuple(frame for frame in self.frames if frame.can_id in named)
+
+    @property
     def shortest_period_ms(self) -> int | None:
         """The shortest SYNC period with which the plan fits; None where none would do."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
@@ -133,8 +141,13 @@ def require_room(hand: HandConfig, plan: BusPlan) -> None:
     bus, needed = plan.bus, plan.load
     if needed <= bus.max_load:
         return
-    period_ms = plan.shortest_period_ms
-    cure = "fewer patches" if period_ms is None else f"sync.period_ms = {period_ms} or fewer patches"
+    cures, period_ms = [], plan.shortest_period_ms
+    if period_ms is not None:
+        guest = bus.role == "guest"
+        cures.append(f"a master's SYNC every {period_ms} ms" if guest else f"sync.period_ms = {period_ms}")
+    if len(plan.scans) > 1:
+        cures.append("fewer patches")
+    cure = " or ".join(cures) or "a faster bus"
     key = f"buses[{[each.name for each in hand.buses].index(bus.name)}]"
     raise BusLoadError(
         f"{key} ({bus.name})",
@@ -194,6 +207,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
         ours[other.can_id] = frame.name
     frames.sort(key=lambda frame: frame.can_id)
     answers = _responses_s(tuple(frames), bus)
+    frames = [replace(frame, response_s=answers[frame.can_id]) for frame in frames]
     scans = [_scan_time(patch, profiles[patch.name], hand, answers) for patch in patches]
     return BusPlan(bus, hand.sync.period_s, tuple(frames), tuple(scans))
 

@@ -54,6 +54,22 @@ def test_tables_for_a_person() -> None:
     assert any(line.split()[:4] == ["palm", "14", "100", "59.4"] for line in lines)
 
 
+def test_how_long_frames_of_others_wait(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(
+        '[[buses]]\nname = "can0"\nothers = [{ can_id = 0x070, length = 6, period_ms = 8 }]\n'
+        '[[patches]]\nname = "p"\nnode_id = 1\n'
+    )
+    lines = command("check", str(path)).stdout.splitlines()
+    assert any(line.split() == ["0x070", "6", "8", "0.25"] for line in lines)
+    (frame,) = [
+        frame
+        for frame in json.loads(command("check", str(path), "--json").stdout)["buses"][0]["frames"]
+        if frame["can_id"] == 0x070
+    ]
+    assert frame["worst_response_s"] == pytest.approx(250e-6, abs=1e-8)
+
+
 def overloaded(folder: Path) -> Path:
     path = folder / "hand.toml"
     patches = "".join(f'[[patches]]\nname = "p{i}"\nnode_id = {i}\n' for i in range(1, 6))

@@ -117,6 +117,28 @@ def test_a_bus_that_others_fill() -> None:
         check_plan(parse_hand(minimal(others=others)))
 
 
+def test_what_would_do_is_what_may_be_changed() -> None:
+    one = minimal(bitrate_bps=250_000) | {"sync": {"period_ms": 20}}
+    one["patches"] = one["patches"][:1]
+    with pytest.raises(BusLoadError, match=r"\(max_load\); sync.period_ms = \d+ would do$"):
+        check_plan(parse_hand(one))
+    one["buses"][0] |= {"role": "guest", "guest_sends": "sdo"}
+    with pytest.raises(BusLoadError, match=r"\(max_load\); a master's SYNC every \d+ ms would do$"):
+        check_plan(parse_hand(one))
+
+
+def test_how_long_others_wait() -> None:
+    first = {"can_id": 0x070, "length": 6, "period_ms": 8.0}
+    beside = only_plan(minimal(others=[first, {"can_id": 0x7FF, "length": 1, "period_ms": 80.0}]))
+    before, after = (frame.response_s for frame in beside.others)
+    # 0x070 waits for one frame of 8 bytes that has begun, 135 bits, and takes 47 + 48 and 20 stuff bits
+    assert before == pytest.approx(250e-6, abs=1e-8)
+    # 0x7FF waits at least for one frame of each other kind, two of each patch with 135 bits
+    assert after is not None
+    assert after > 8 * 135e-6
+    assert only_plan(minimal()).others == ()
+
+
 def test_others_delay_our_scans() -> None:
     alone = only_plan(minimal())
     shared = only_plan(minimal(others=[{"can_id": 0x101, "length": 8, "period_ms": 1.0}]))

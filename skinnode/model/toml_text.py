@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -29,6 +29,12 @@ _STRING: Final = (
 _VALUE: Final = re.compile(rf"{_STRING}|[^,\[\]{{}}#\n]+", re.DOTALL)
 _KEY: Final = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|[A-Za-z0-9_-]+')
 _LONGEST_LINE: Final = 60
+_DEEPEST: Final = 32
+"""Parts of a key; a hand file has six."""
+_LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # an integer of TOML 1.0
+_INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
+_TOO_LONG: Final = Shown("a longer integer")
+_TOO_DEEP: Final = f"tables and arrays in up to {_DEEPEST} others"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +57,7 @@ class Document:
 
 def read_toml(path: Path, what: str) -> Document:
     """Read a TOML file; ``what`` names it in errors. Raises ConfigError, in one line, for a file that cannot
-    be read or is not TOML."""
+    be read, is not TOML, nests deeper than anything of ours, or has integers that TOML does not promise."""
     try:
         text = path.read_bytes().decode()
     except OSError as error:
@@ -64,7 +70,34 @@ def read_toml(path: Path, what: str) -> Document:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise _syntax_error(str(path), text, str(error)) from None
-    return Document(str(path), table, places(text))
+    except RecursionError:
+        raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path)) from None
+    except ValueError:  # of more decimal digits than Python takes for a number
+        raise ConfigError(what, _TOO_LONG, _INTEGERS, where=str(path)) from None
+    leaves = list(_leaves(table))
+    if any(len(key) > _DEEPEST for key, _ in leaves):
+        raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
+    document = Document(str(path), table, places(text))
+    for key, value in leaves:
+        if isinstance(value, int) and not _LEAST <= value <= _MOST:
+            raise ConfigError(str(key[-1]), _TOO_LONG, _INTEGERS, where=document.where(key))
+    return document
+
+
+def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
+    """Whatever holds nothing else, with its key; that of what is nested too deeply ends where it is."""
+    todo: list[tuple[KeyPath, Any]] = [((), table)]
+    while todo:
+        key, value = todo.pop()
+        inner: Iterable[tuple[int | str, Any]] = ()
+        if isinstance(value, dict):
+            inner = value.items()
+        elif isinstance(value, list):
+            inner = enumerate(value)
+        if inner and len(key) <= _DEEPEST:
+            todo += [((*key, part), item) for part, item in inner]
+        else:
+            yield key, value
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:

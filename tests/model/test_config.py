@@ -295,6 +295,40 @@ def test_not_text(tmp_path: Path) -> None:
     assert str(caught.value) == f"{path}: byte 8: got b'\\xff', allowed: UTF-8"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = " + "[" * 3000 + "]" * 3000,
+        "x = " + "[" * 100 + "]" * 100,
+        "x = " + "{a = " * 100 + "1" + "}" * 100,
+        ".".join(["a"] * 5000) + " = 1",
+        "[" + ".".join(["a"] * 5000) + "]",
+    ],
+    ids=["arrays beyond the parser", "arrays", "inline tables", "dotted key", "header"],
+)
+def test_nesting_has_an_end(text: str, tmp_path: Path) -> None:
+    path = write(tmp_path, text + "\n")
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value) == (
+        f"{path}: hand file: got deeper nesting, allowed: tables and arrays in up to 32 others"
+    )
+
+
+@pytest.mark.parametrize(
+    ("number", "place"),
+    [("9" * 5000, ": hand file"), ("0x" + "F" * 5000, ":5:1: node_id"), (str(1 << 63), ":5:1: node_id")],
+    ids=["beyond Python", "hexadecimal", "2^63"],
+)
+def test_integers_have_64_bits(number: str, place: str, tmp_path: Path) -> None:
+    path = write(tmp_path, HEAD.replace("node_id = 1", f"node_id = {number}"))
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value) == (
+        f"{path}{place}: got a longer integer, allowed: integers from -2^63 to 2^63 - 1"
+    )
+
+
 def test_no_such_file(tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
     with pytest.raises(ConfigError) as caught:

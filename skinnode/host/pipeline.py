@@ -24,7 +24,7 @@ from skinnode.host.sync import Tick
 from skinnode.host.workers import Inline, Workers
 from skinnode.model.config import Partial, PatchConfig, SolverConfig
 from skinnode.model.forward import resistance_ohm
-from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
+from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
 from skinnode.solve.tracker import Tracker
 from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
 from skinnode.wire.codec import SummaryFlag, decode
@@ -72,12 +72,14 @@ class Solver:
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, frame: ResistanceFrame) -> FieldFrame:
-        """Field of a frame, stamped. The noise is that of the front end and of the codes together."""
+        """Field of a frame, stamped, its arrays read-only. The noise is that of the front end and of the
+        codes together."""
         analogue = self.facts.config.relative_noise
         noise = np.hypot(analogue, self._quantisation_ohm / frame.resistance_ohm)
         field: FieldFrame = self._tracker.update(
             frame.resistance_ohm, frame.valid, np.where(frame.valid, noise, 1.0)
         )
+        field = replace(sealed(field), contacts=tuple(sealed(contact) for contact in field.contacts))
         return replace(field, stamp=replace(frame.stamp, t_solved_ns=self._clock()))
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, fields, replace
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,3 +118,18 @@ class FieldFrame:
     def trusted(self) -> bool:
         """True when every wire converged."""
         return all(status is Status.CONVERGED for status in self.status)
+
+
+_Record = TypeVar("_Record", Contact, FieldFrame)
+
+
+def sealed(record: _Record) -> _Record:
+    """The same with arrays that cannot be written: what many are given, none may change. They are views, and
+    the solver goes on with its own."""
+    views = {}
+    for entry in fields(record):
+        value = getattr(record, entry.name)
+        if isinstance(value, np.ndarray):
+            views[entry.name] = view = value.view()
+            view.setflags(write=False)
+    return replace(record, **views)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -197,3 +199,22 @@ def test_a_failure_of_the_host_ends_callbacks(publisher: Publisher) -> None:
     callback = FieldCallback(lambda one: None, publisher.subscribe(10, None, None))
     publisher.fail(BusError("gone"))
     assert eventually(lambda: callback.ended)
+
+
+def arrays_of(record: object) -> list[np.ndarray]:
+    values = [getattr(record, entry.name) for entry in dataclasses.fields(record)]
+    return [value for value in values if isinstance(value, np.ndarray)]
+
+
+def test_no_subscriber_can_change_what_the_others_have(make_hand: Callable[..., HandConfig]) -> None:
+    hand = make_hand(1, solver={"method": "posterior"})
+    with Fleet(hand), Host.from_config(hand) as host:
+        for _, one in zip(range(400), host.fields(timeout_s=10.0), strict=False):
+            arrays = [array for record in (one, *one.contacts) for array in arrays_of(record)]
+            assert len(arrays) >= 3 + 4 * len(one.contacts)
+            for array in arrays:
+                with pytest.raises(ValueError, match="read-only"):
+                    array.fill(7)
+            if one.contacts:
+                return
+    pytest.fail("no contact in 400 fields")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +126,7 @@ _Record = TypeVar("_Record", Contact, FieldFrame)
 def sealed(record: _Record) -> _Record:
     """The same with arrays that cannot be written: what many are given, none may change. They are views, and
     the solver goes on with its own."""
-    views = {}
+    views: dict[str, Any] = {}
     for entry in fields(record):
         value = getattr(record, entry.name)
         if isinstance(value, np.ndarray):

@@ -19,6 +19,14 @@ Float = NDArray[np.float64]
 PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
+MOST_ELECTRODES: Final = 1024
+"""Upper electrodes of a patch, such as 32 × 32: a covariance of their 3072 coordinates takes 75 MB, and the
+posterior holds several."""
+
+MOST_PAIRS: Final = 1 << 22
+"""Pairs of an upper and a lower electrode: the distances between them take 100 MB, and each evaluation of all
+wires computes that many."""
+
 _HASH_RESOLUTION_M: Final = 1e-9
 """Two layouts whose electrodes agree to a nanometre are the same layout."""
 
@@ -49,6 +57,19 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
     return array
 
 
+def _require_size(upper_wires: int, upper_electrodes: int, lower_wires: int, lower_electrodes: int) -> None:
+    """Raises ValueError for more than can be solved."""
+    upper, lower = upper_wires * upper_electrodes, lower_wires * lower_electrodes
+    if upper > MOST_ELECTRODES:
+        name, got = "upper_wires × upper_electrodes", f"{upper_wires} × {upper_electrodes}"
+        raise ValueError(f"{name}: got {got}, must be at most {MOST_ELECTRODES}")
+    if upper * lower > MOST_PAIRS:
+        raise ValueError(
+            f"lower_wires × lower_electrodes: got {lower_wires} × {lower_electrodes}, must be at most "
+            f"{MOST_PAIRS // upper} beside {upper} upper electrodes"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class PatchLayout:
     """Electrodes of a patch at rest.
@@ -59,8 +80,8 @@ class PatchLayout:
         resistivity_ohm_per_m: resistance of the rubber per metre between two electrodes, the paper's g.
         name: a preset's name or anything else.
 
-    Raises ValueError for wrong shapes, NaN, a resistivity that is not positive, or an upper electrode on
-    top of a lower one.
+    Raises ValueError for wrong shapes, NaN, a resistivity that is not positive, an upper electrode on top of
+    a lower one, or more than :data:`MOST_ELECTRODES` or :data:`MOST_PAIRS`.
     """
 
     upper_m: Float
@@ -75,6 +96,7 @@ class PatchLayout:
             raise ValueError(
                 f"resistivity_ohm_per_m: got {self.resistivity_ohm_per_m}, must be positive and finite"
             )
+        _require_size(*upper.shape[:2], *lower.shape[:2])
         gaps = upper.reshape(-1, 1, 3) - lower.reshape(1, -1, 3)
         closest = float(np.sqrt(np.min(np.einsum("abi,abi->ab", gaps, gaps))))
         if closest < _HASH_RESOLUTION_M:
@@ -131,6 +153,7 @@ class PatchLayout:
         for label, count in counts.items():
             if count < 1:
                 raise ValueError(f"{label}: got {count}, must be at least 1")
+        _require_size(**counts)
         upper = np.empty((upper_wires, upper_electrodes, 3))
         upper[..., 0] = np.arange(upper_electrodes)
         upper[..., 1] = np.arange(upper_wires)[:, None]

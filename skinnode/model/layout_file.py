@@ -51,8 +51,12 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
     try:
         return PatchLayout(table["upper_m"], table["lower_m"], float(resistivity.item()), path.stem)
     except ValueError as error:
-        key, _, what = str(error).partition(": ")
-        got, _, allowed = what.partition(", must be ")
-        raise ConfigError(
-            key, Shown(got.removeprefix("got ")), allowed or "a possible geometry", where=str(path)
-        ) from None
+        raise impossible(error, where=str(path)) from None
+
+
+def impossible(error: ValueError, table: str = "", where: str = "") -> ConfigError:
+    """What :class:`PatchLayout` says of a key, as an error of the ``table`` in which that is."""
+    key, _, what = str(error).partition(": ")
+    got, _, allowed = what.partition(", must be ")
+    key = f"{table}.{key}" if table else key
+    return ConfigError(key, Shown(got.removeprefix("got ")), allowed or "a possible geometry", where=where)

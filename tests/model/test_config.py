@@ -329,6 +329,33 @@ def test_integers_have_64_bits(number: str, place: str, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("counts", "line"),
+    [
+        (
+            (254, 254, 254, 254),
+            "upper_wires × upper_electrodes: got 254 × 254, allowed: at most 1024",
+        ),
+        (
+            (32, 32, 96, 254),
+            "lower_wires × lower_electrodes: got 96 × 254, allowed: at most 4096 beside 1024 upper electrodes",
+        ),
+    ],
+)
+@pytest.mark.parametrize("in_a_file", [False, True])
+def test_patches_beyond_any_memory(
+    counts: tuple[int, ...], line: str, in_a_file: bool, tmp_path: Path
+) -> None:
+    names = "upper_wires", "upper_electrodes", "lower_wires", "lower_electrodes"
+    keys = "".join(f"{name} = {count}\n" for name, count in zip(names, counts, strict=True))
+    (tmp_path / "layout.toml").write_text(keys)
+    path = write(tmp_path, f"{HEAD}[patches.layout]\n" + ('file = "layout.toml"\n' if in_a_file else keys))
+    where = f"{tmp_path / 'layout.toml'}: " if in_a_file else f"{path}:6:1: patches[0].layout."
+    with pytest.raises(ConfigError) as caught:
+        load_hand(path)
+    assert str(caught.value).endswith(where + line + ")" * in_a_file)
+
+
 def test_no_such_file(tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
     with pytest.raises(ConfigError) as caught:

@@ -100,6 +100,7 @@ def test_scale_of_a_wire_with_one_electrode_is_its_clearance():
             (np.ones((1, 1, 3)), np.zeros((1, 1, 3)), -1.0),
             "resistivity_ohm_per_m: got -1.0, must be positive",
         ),
+        ((np.ones((25, 41, 3)), np.zeros((1, 1, 3))), "upper_electrodes: got 25 × 41, must be at most 1024"),
         ((["a"], np.zeros((1, 1, 3))), "upper_m: not an array of real numbers"),
     ],
 )
@@ -115,6 +116,7 @@ def test_bad_geometry_is_named(arguments, complaint):
         ({"pitch_m": 0.0}, "pitch_m: got 0.0, must be positive"),
         ({"height_m": float("nan")}, "height_m: got nan"),
         ({"upper_wires": 0}, "upper_wires: got 0, must be at least 1"),
+        ({"lower_wires": 10**6, "lower_electrodes": 10**6}, "must be at most 41943 beside 100 upper"),
     ],
 )
 def test_bad_presets_are_named(options, complaint):

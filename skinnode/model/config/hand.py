@@ -15,6 +15,7 @@ from skinnode.model.config.patches import PatchConfig
 from skinnode.model.config.running import SolverConfig, StreamConfig
 from skinnode.model.config.simulation import SimulationConfig
 from skinnode.model.config.table import Allowed, Name, Table
+from skinnode.model.layout_file import impossible
 from skinnode.model.toml_text import Document, read_toml
 
 
@@ -145,7 +146,7 @@ def _check_geometry(key: str, patch: PatchConfig) -> None:
     except ValueError as error:
         if patch.layout.file is not None:
             raise ConfigError(f"{key}.layout.file", str(patch.layout.file), f"a layout ({error})") from None
-        raise ConfigError(f"{key}.layout", patch.layout.preset, str(error)) from None
+        raise impossible(error, f"{key}.layout") from None
     gains, wires = patch.calibration.upper_gain, layout.shape[0]
     if gains is not None and len(gains) != wires:
         allowed = f"{wires} numbers, one for each upper wire"

@@ -23,7 +23,7 @@ from skinnode.model.config.table import (
 )
 from skinnode.model.elastic import Rubber
 from skinnode.model.layout import PatchLayout
-from skinnode.model.layout_file import from_electrodes, has_electrodes, read_npz
+from skinnode.model.layout_file import from_electrodes, has_electrodes, impossible, read_npz
 from skinnode.model.pose import Pose
 from skinnode.model.toml_text import read_toml
 
@@ -215,5 +215,4 @@ def load_layout(path: Path | str) -> PatchLayout:
     except ValidationError as error:
         raise first_error(error, LayoutConfig, document.where) from None
     except ValueError as error:
-        preset = document.table.get("preset", "staggered")
-        raise ConfigError("layout", preset, str(error), where=str(path)) from None
+        raise impossible(error, where=str(path)) from None

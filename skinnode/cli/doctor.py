@@ -73,9 +73,11 @@ def doctor(
 def _as_json(facts: list[BusFacts], findings: list[Finding]) -> dict[str, object]:
     from dataclasses import asdict
 
+    from skinnode.doctor.checks import not_judged
+
     return {
         "findings": [asdict(finding) for finding in findings],
-        "not_judged": [line for known in facts for line in _not_judged(known)],
+        "not_judged": [line for known in facts for line in not_judged(known)],
         "buses": [
             {
                 "name": known.name,
@@ -97,25 +99,12 @@ def _as_json(facts: list[BusFacts], findings: list[Finding]) -> dict[str, object
     }
 
 
-def _not_judged(bus: BusFacts) -> list[str]:
-    """What could not be looked at, and why."""
-    from skinnode.doctor.skin import LEAST_SCANS
-
-    if bus.failure:
-        return [f"{bus.name}: nothing but the interface"]
-    return [
-        f"{patch.name}: noise, steps and drift: {'no' if patch.scans is None else patch.scans.scans} scans "
-        f"came, {LEAST_SCANS} needed" + ("" if bus.running else "; it does not run: --active starts it")
-        for patch in bus.patches
-        if patch.found is not None and (patch.scans is None or patch.scans.scans < LEAST_SCANS)
-    ]
-
-
 def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
     from rich.markup import escape
     from rich.padding import Padding
 
     from skinnode.cli._console import console
+    from skinnode.doctor.checks import not_judged
 
     out = console()
     for known in facts:
@@ -133,7 +122,7 @@ def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
         out.print(f"\n[{colour}]{finding.sure:>8}[/{colour}]  [bold]{what}[/bold]")
         out.print(Padding(escape(finding.evidence), (0, 0, 0, 10)))
         out.print(Padding(f"→ {escape(finding.advice)}", (0, 0, 0, 10)))
-    lines = [line for known in facts for line in _not_judged(known)]
+    lines = [line for known in facts for line in not_judged(known)]
     if lines:
         out.print("\nnot judged:")
         for line in lines:

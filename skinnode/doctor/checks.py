@@ -29,3 +29,24 @@ def diagnose(facts: BusFacts) -> list[Finding]:
         for check in checks
         for finding in sorted(check(facts), key=lambda found: _SURENESS[found.sure])
     ]
+
+
+def not_judged(facts: BusFacts) -> list[str]:
+    """What could not be looked at, and why, a line each."""
+    if facts.failure:
+        return [f"{facts.name}: nothing but the interface"]
+    lines = []
+    for patch in facts.patches:
+        scans = 0 if patch.scans is None else patch.scans.scans
+        if patch.found is not None and scans < skin.LEAST_SCANS:
+            lines.append(
+                f"{patch.name}: noise, steps and drift: {scans or 'no'} scans came, {skin.LEAST_SCANS} needed"
+                + ("" if facts.running else "; it does not run: --active starts it")
+            )
+        elif patch.scans is not None and skin.may_be_frozen(patch.scans):
+            lines.append(
+                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the noise told, "
+                f"{patch.scans.told_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch it while the "
+                "doctor listens; if this comes again, the converter has stopped"
+            )
+    return lines

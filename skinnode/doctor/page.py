@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from skinnode.doctor.checks import not_judged
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts
 from skinnode.doctor.skin import LEAST_SCANS, analyse
 from skinnode.model.layout import Float
@@ -37,6 +38,7 @@ def as_html(buses: Sequence[BusFacts], findings: Sequence[Finding], title: str) 
         f"<h1>{_text(title)}: {len(findings)} findings</h1><p>{_text(when)}</p>",
         *(_finding(finding) for finding in findings),
         *([] if findings else ["<p>Nothing is wrong with what was looked at.</p>"]),
+        *(f"<p>Not judged: {_text(line)}</p>" for bus in buses for line in not_judged(bus)),
     ]
     for bus in buses:
         parts.append(_bus(bus))

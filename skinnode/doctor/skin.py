@@ -217,9 +217,8 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             f"its clock stands still over {len(device)} scans",
             "reset the node; its sampling has stopped",
         )
-    known = np.isfinite(scans.ratio).all(axis=0)
-    still = known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
-    if scans.told_noise > scans.step and known.any() and still.sum() > _MANY * known.sum():
+    known, still = _still(scans)
+    if _shows(scans) and known.any() and still.sum() > _MANY * known.sum():
         yield Finding(
             "wires",
             patch.name,
@@ -229,6 +228,24 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             f"though a noise of {scans.told_noise:.0e} is told and a code is {scans.step:.0e}",
             "the converter has stopped: power the patch off and on",
         )
+
+
+def may_be_frozen(scans: ScanFacts) -> bool:
+    """Whether a converter gave the same codes in all of LEAST_SCANS or more, of which nothing follows: what
+    noise it has, as is told, does not show in every code."""
+    known, still = _still(scans)
+    return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
+
+
+def _shows(scans: ScanFacts) -> bool:
+    """Whether the noise told changes every code soon."""
+    return scans.told_noise > scans.step
+
+
+def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
+    """Crossings that were always measured; those of them that never changed."""
+    known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
+    return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 
 
 def check_baseline(bus: BusFacts) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.doctor.checks import diagnose
+from skinnode.doctor.checks import diagnose, not_judged
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.model.config import PatchConfig
 from skinnode.technician.heard import Emergency
@@ -146,8 +146,16 @@ def test_a_jump_that_stays() -> None:
 def test_frozen_values_and_a_frozen_node() -> None:
     frozen = np.broadcast_to(quiet_ratio()[:1], (50, 4, 12))
     assert skin(frozen).what == "the values are frozen"
-    # Of a converter quieter than a code, values that stand still say nothing.
-    assert diagnose(bus_of(replace(WELL, scans=scans_of(frozen, told_noise=3e-6)))) == []
+    # Of a converter quieter than a code, values that stand still say nothing, and that is said.
+    quiet = bus_of(replace(WELL, scans=scans_of(frozen, told_noise=3e-6)))
+    assert diagnose(quiet) == []
+    (line,) = not_judged(quiet)
+    assert line.startswith("thumb: frozen or only quiet: no code changed in 50 scans")
+    assert "touch it" in line
+    assert not_judged(bus_of(replace(WELL, scans=scans_of(frozen)))) == []  # that is a finding
+    flickers = frozen.copy()
+    flickers[30, 2, 5] += STEP
+    assert not_judged(bus_of(replace(WELL, scans=scans_of(flickers, told_noise=3e-6)))) == []
     finding = skin(quiet_ratio(), device_us=np.full(50, 4711))
     assert "the same scan again" in finding.what
     assert finding.sure is Sure.CERTAIN
@@ -197,4 +205,6 @@ def test_scans_that_run_into_the_next() -> None:
 
 def test_few_scans_are_not_judged() -> None:
     ratio = quiet_ratio()[:10] * 1.05 + 100 * STEP
-    assert diagnose(bus_of(replace(WELL, scans=scans_of(ratio)))) == []
+    bus = bus_of(replace(WELL, scans=scans_of(ratio)))
+    assert diagnose(bus) == []
+    assert not_judged(bus) == ["thumb: noise, steps and drift: 10 scans came, 20 needed"]

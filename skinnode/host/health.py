@@ -145,6 +145,7 @@ class NodeMonitor:
         self._t_scan_ns: int | None = None
         self._t_restart_ns: int | None = None
         self._boot_ups = self._emergencies = self._error_register = 0
+        self._registers_said = 0
         self._last_emergency: int | None = None
         self._emergency_text = ""
         self.running = False
@@ -176,6 +177,7 @@ class NodeMonitor:
         state = data[0] & 0x7F  # bit 7 is the toggle bit of node guarding
         if state == BOOT_UP:
             self._boot_ups += 1
+            self._on_register(0)  # as after any reset; an error that is still there is told anew
             if self.running:
                 self._t_restart_ns = t_ns
                 self._restarts.append(t_ns)
@@ -191,10 +193,30 @@ class NodeMonitor:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
             return
         code = int.from_bytes(data[:2], "little")
-        self._error_register = data[2]
+        self._on_register(data[2])
         if code:
             self._emergencies += 1
             self._last_emergency, self._emergency_text = code, error_text(code, data[3:])
+
+    @property
+    def error_register(self) -> int:
+        """As the node said last."""
+        return self._error_register
+
+    @property
+    def registers_said(self) -> int:
+        """How often it said so."""
+        return self._registers_said
+
+    def on_register_read(self, register: int, said: int) -> None:
+        """The answer to who asked for the error register when it had been said ``said`` times: void if an
+        emergency or a boot-up came since, which may be newer."""
+        if said == self._registers_said:
+            self._on_register(register)
+
+    def _on_register(self, register: int) -> None:
+        self._error_register = register
+        self._registers_said += 1
 
     def said_since(self, state: int, t_ns: int) -> bool:
         """Whether the newest heartbeat came after ``t_ns`` and carried ``state``."""

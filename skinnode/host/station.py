@@ -110,6 +110,13 @@ class Station:
         self.facts = facts.with_baseline(baseline_ohm)
         return Solver(self.facts, self._hand.solver)
 
+    def renew_register(self) -> None:
+        """Ask the node for its error register: the emergency that takes an error back may have been lost.
+        Raises as :class:`RemoteOd`."""
+        said = self.monitor.registers_said
+        register = self._remote.read(od.ERROR_REGISTER, 0, "u8")
+        self.link.call(lambda: self.monitor.on_register_read(register, said))
+
     def tare(self) -> None:
         """Tell the node to take what it feels now for its baseline. Any thread. Raises as
         :meth:`Host.tare`."""

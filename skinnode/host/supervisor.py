@@ -58,7 +58,7 @@ _RETRY_NS: Final = 1_000_000_000
 _LEAST_NS: Final = 300_000_000
 """Least time from one bring-up of a node to the next, for nodes that restart in a loop."""
 _DOUBT_NS: Final = 2_000_000_000
-"""Least time between two readings of a baseline that may have changed unseen."""
+"""Least time between two readings of a baseline, or an error register, that may have changed unseen."""
 
 
 class Phase(enum.StrEnum):
@@ -100,8 +100,8 @@ class _Node:
     station: Station
     phase: Phase
     since_ns: int
-    job: Future[_Joined] | None = None
-    """The one that talks to the node."""
+    job: Future[_Joined | None] | None = None
+    """The one that talks to the node; without a result where it only asks for the error register."""
     searching: Future[bool] | None = None
     abandon: threading.Event = field(default_factory=threading.Event)
     """Tells the job to stop where it is."""
@@ -109,6 +109,7 @@ class _Node:
     probe_ns: int = 0
     search_ns: int = 0
     read_ns: int = 0
+    register_ns: int = 0
     rejoins: int = 0
     failures: int = 0
     baselines: int = 0
@@ -242,7 +243,7 @@ class Supervisor:
             return
         station, abandon = node.station, threading.Event()
 
-        def bring_up() -> _Joined:
+        def bring_up() -> _Joined | None:
             withholdings = station.withhold()
             return _Joined(station.bring_up(JOIN_DEADLINE_S, abandon.is_set), withholdings)
 
@@ -264,7 +265,8 @@ class Supervisor:
         node.job = None
         try:
             joined = job.result()
-            assert joined.solver is not None  # of a bring-up
+            assert joined is not None  # of a bring-up
+            assert joined.solver is not None
             station.start(joined.solver, joined.withholdings)
         except (BusError, ConfigError) as error:
             refused = isinstance(error, (NodeError, ConfigError)) and not isinstance(error, NodeTimeout)
@@ -339,6 +341,7 @@ class Supervisor:
             return
         changed = lane.withholding
         if not (changed or lane.doubtful) or now_ns < node.read_ns:
+            self._watch_register(node, now_ns)
             return
         if station.is_silent:
             if changed:
@@ -347,13 +350,29 @@ class Supervisor:
         lane.doubtful = False
         abandon = node.abandon = threading.Event()
 
-        def read() -> _Joined:
+        def read() -> _Joined | None:
             withholdings = station.withhold() if changed else lane.withholdings
             return _Joined(station.renew_baseline(JOIN_DEADLINE_S, abandon.is_set), withholdings)
 
         node.job = self._pool.submit(read)
 
-    def _take_baseline(self, node: _Node, job: Future[_Joined], now_ns: int) -> None:
+    def _watch_register(self, node: _Node, now_ns: int) -> None:
+        """Ask a node with an error for its error register: the emergency that ended it may have been lost."""
+        station = node.station
+        if not station.monitor.error_register or station.is_silent or now_ns < node.register_ns:
+            return
+
+        def read() -> _Joined | None:
+            with contextlib.suppress(BusError, ConfigError):  # asked again
+                station.renew_register()
+            return None
+
+        node.register_ns = now_ns + _DOUBT_NS
+        node.job = self._pool.submit(read)
+
+    def _take_baseline(self, node: _Node, job: Future[_Joined | None], now_ns: int) -> None:
+        if job.exception() is None and job.result() is None:  # it was the error register
+            return
         station, lane = node.station, node.station.lane
         node.read_ns = now_ns + (_LEAST_NS if lane.withholding else _DOUBT_NS)
         try:
@@ -364,6 +383,7 @@ class Supervisor:
             return
         except Abandoned:
             return
+        assert read is not None  # see above
         solver = read.solver
         if solver is not None:
             node.baselines += 1

@@ -74,8 +74,10 @@ class EmcyProducer:
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def happened(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """An error that is over as soon as it is told. ``detail`` is up to five bytes."""
+        """An error that is over as soon as it is told: it comes and goes, and both are told. ``detail`` is up
+        to five bytes."""
         self._tell(code, self.register | code.register_bit | 1, detail, t_ns)
+        self._tell_over(code, t_ns)
 
     def present(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
         """An error that lasts until :meth:`over`; told again only if ``detail`` says something new. ``who``
@@ -87,7 +89,7 @@ class EmcyProducer:
     def over(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
         """A lasting error has gone; nothing happens if it was not there."""
         if self._present.pop((code, who), None) is not None:
-            self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
+            self._tell_over(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
         """Whether the state of the node lets messages out; they wait otherwise."""
@@ -117,6 +119,10 @@ class EmcyProducer:
         self._remember(code, detail)
         self._queue(_message(code, register, detail), t_ns)
 
+    def _tell_over(self, code: EmcyCode, t_ns: int) -> None:
+        """An error reason is gone; the register holds what is left."""
+        self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
+
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
         # The upper half of an entry is ours: the first two bytes of the detail.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
@@ -137,7 +143,8 @@ class EmcyProducer:
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """How many emergencies gave way; the first two bytes are those of the application's lost scans."""
+        """How many emergencies gave way; the first two bytes are those of the application's lost scans. Those
+        that wait follow, and the last of them has the register as it is."""
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
         return _message(EmcyCode.CAN_OVERRUN, self.register | EmcyCode.CAN_OVERRUN.register_bit | 1, detail)

@@ -131,7 +131,8 @@ def test_bus_off_and_recovery(running: Suffers) -> None:
     assert eventually(lambda: running.condition() is Condition.LOST)
     running.fleet.bus_off("can0", off=False)
     running.is_back()
-    assert eventually(lambda: running.host.health("p0").last_emergency == 0x8140)
+    assert eventually(lambda: running.condition() is Condition.OPERATIONAL, BACK_S)
+    assert running.host.health("p0").last_emergency == 0x8140
 
 
 def test_silent_and_deaf_node(running: Suffers) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -191,8 +192,41 @@ def test_bus_off_and_recovery(make_hand: Callable[..., HandConfig]) -> None:
         assert running.hears("p1", "lost")
         fleet.bus_off("can0", off=False)
         assert running.well_again()
-        assert eventually(lambda: host.health("p0").last_emergency == 0x8140)
+        assert eventually(lambda: running.condition() is Condition.OPERATIONAL, BACK_S)
+        assert host.health("p0").last_emergency == 0x8140
     assert discrepancies(host.stats()) == []
+
+
+def test_fleet_that_is_started_anew_below_a_host(
+    make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its nodes hear SYNC with a counter before they are told that there is one."""
+    monkeypatch.setattr("skinnode.host.health.RESTART_MEMORY_NS", 10_000_000)
+    hand = make_hand(patches=1)
+    with ExitStack() as power:
+        fleet = power.enter_context(Fleet(hand))
+        with Host.from_config(hand) as host:
+            running = Hand(fleet, host)
+            assert running.well_again()
+            power.close()
+            assert running.hears("p0", "lost")
+            running.fleet = power.enter_context(Fleet(hand))
+            assert running.well_again()
+            assert eventually(lambda: running.condition() is Condition.OPERATIONAL, BACK_S)
+            assert host.health("p0").last_emergency == 0x8240
+            assert host.health("p0").error_register == 0
+
+
+def test_end_of_an_error_that_is_lost(make_hand: Callable[..., HandConfig]) -> None:
+    """The host asks."""
+    hand = make_hand(patches=1)
+    with Fleet(hand) as fleet, Host.from_config(hand) as host:
+        running = Hand(fleet, host)
+        assert running.well_again()
+        with CanPort(hand.buses[0]) as stranger:
+            stranger.send(0x085, bytes.fromhex("00 50 81 00 03 01 00 00"))
+        assert eventually(lambda: host.health("p0").emergencies == 1)
+        assert eventually(lambda: host.health("p0").error_register == 0)
 
 
 def test_second_node_with_the_same_id(

@@ -70,6 +70,23 @@ def test_emergency_makes_faulty_until_it_is_over(monitor: NodeMonitor) -> None:
     assert (health.emergencies, health.last_emergency, health.error_register) == (1, 0x5000, 0)
 
 
+def test_boot_up_ends_all_errors(monitor: NodeMonitor) -> None:
+    """Those that are still there are told anew."""
+    monitor.on_emergency(bytes.fromhex("00 50 81 00 03 01 00 00"), 0)
+    monitor.on_heartbeat(b"\x00", 1 * MS)
+    assert monitor.health(2 * MS, 0.25, 0.08).error_register == 0
+
+
+def test_register_that_was_asked_for_is_older_than_what_came_meanwhile(monitor: NodeMonitor) -> None:
+    monitor.on_emergency(bytes.fromhex("00 50 81 00 03 01 00 00"), 0)
+    said = monitor.registers_said
+    monitor.on_emergency(bytes.fromhex("20 81 91 00 00 00 00 00"), 1 * MS)
+    monitor.on_register_read(0x81, said)
+    assert monitor.error_register == 0x91
+    monitor.on_register_read(0x00, monitor.registers_said)
+    assert monitor.error_register == 0
+
+
 def test_toggle_bit_of_node_guarding_is_not_state(monitor: NodeMonitor) -> None:
     monitor.on_heartbeat(b"\x85", 0)
     assert monitor.health(0, 0.25, 0.08).nmt_state == 5

@@ -54,11 +54,14 @@ def test_shorted_lower_wire(operational) -> None:
     assert desk.read(0x2031, 2) == 1 << 5
 
 
+SYNC_IS_OVER = (0x084, "00 00 00 40 82 00 00 00")
+
+
 def test_sync_of_the_wrong_length(operational) -> None:
     desk = operational
-    assert desk.frame(0x80) == [(0x084, "40 82 11 00 01 00 00 00")]
-    assert desk.frame(0x80, "01 02") == [(0x084, "40 82 11 02 01 00 00 00")]
-    assert desk.read(0x1001, 0) == 0  # over as soon as told
+    assert desk.frame(0x80) == [(0x084, "40 82 11 00 01 00 00 00"), SYNC_IS_OVER]
+    assert desk.frame(0x80, "01 02") == [(0x084, "40 82 11 02 01 00 00 00"), SYNC_IS_OVER]
+    assert desk.read(0x1001, 0) == 0  # as the last message said
     assert desk.read(0x1003, 0) == 2
 
 
@@ -66,9 +69,9 @@ def test_sync_of_one_wrong_length_is_told_once(operational) -> None:
     """A node that was reset hears the SYNC of its master with a counter it knows nothing of, for ever."""
     desk = operational
     told = [desk.frame(0x80) for _ in range(5)]
-    assert told == [[(0x084, "40 82 11 00 01 00 00 00")], [], [], [], []]
+    assert told == [[(0x084, "40 82 11 00 01 00 00 00"), SYNC_IS_OVER], [], [], [], []]
     desk.frame(0x80, "01")
-    assert desk.frame(0x80) == [(0x084, "40 82 11 00 01 00 00 00")]
+    assert desk.frame(0x80) == [(0x084, "40 82 11 00 01 00 00 00"), SYNC_IS_OVER]
 
 
 def test_history_is_the_newest_first_and_can_be_cleared(operational) -> None:
@@ -91,11 +94,8 @@ def test_inhibit_time(operational) -> None:
     for length in (0, 2, 3):
         desk.node.on_frame(0x80, bytes(length), desk.t_ns)
     desk.run(50)
-    assert [t_ns - start_ns for can_id, _, t_ns in desk.sent if can_id == 0x084] == [
-        0,
-        10_000_000,
-        20_000_000,
-    ]
+    sent_ns = [t_ns - start_ns for can_id, _, t_ns in desk.sent if can_id == 0x084]
+    assert sent_ns == [0, 10_000_000, 20_000_000, 30_000_000, 40_000_000, 50_000_000]
 
 
 def test_disabled_by_its_cob_id(operational) -> None:
@@ -128,7 +128,9 @@ def test_emergency_of_a_stopped_node_waits(operational) -> None:
     assert desk.node.nmt_state is NmtState.STOPPED
     desk.run(2000)
     assert desk.take() == []
-    assert desk.frame(0, "80 00") == [(0x084, "30 81 11 7f 00 00 00 00")]
+    assert desk.frame(0, "80 00") == [SYNC_IS_OVER]
+    desk.run(1000)
+    assert desk.take() == [(0x084, "30 81 11 7f 00 00 00 00")]
 
 
 def set_cob_id(desk, value: int) -> str:
@@ -150,7 +152,7 @@ def test_cob_id_changes_only_while_it_is_invalid(operational) -> None:
     assert set_cob_id(desk, 0x086) == ACCEPTED
     assert set_cob_id(desk, 0x087) == INVALID
     assert desk.read(0x1014, 0) == 0x086
-    assert desk.frame(0x80) == [(0x086, "40 82 11 00 01 00 00 00")]
+    assert desk.frame(0x80) == [(0x086, "40 82 11 00 01 00 00 00"), (0x086, SYNC_IS_OVER[1])]
 
 
 @pytest.mark.parametrize(
@@ -223,6 +225,11 @@ class TestLastingErrors:
         emcy.over(EmcyCode.HARDWARE, 2)
         assert told[1:] == ["084 00 50 81 02 00 00 00 00", "084 00 00 00 00 50 00 00 00"]
 
+    def test_what_is_over_at_once_leaves_the_others(self, emcy: EmcyProducer, told: list[str]) -> None:
+        emcy.present(EmcyCode.HARDWARE, b"", 0)
+        emcy.happened(EmcyCode.BUS_OFF_RECOVERED, b"", 1)
+        assert told[1:] == ["084 40 81 91 00 00 00 00 00", "084 00 00 81 40 81 00 00 00"]
+
     def test_register_holds_what_is_left(self, emcy: EmcyProducer, told: list[str]) -> None:
         emcy.present(EmcyCode.HARDWARE, b"", 0)
         emcy.present(EmcyCode.HEARTBEAT, b"\x05", 1, 5)
@@ -259,19 +266,20 @@ def test_inhibit_time_that_is_shortened_lets_go_at_once(operational) -> None:
     assert desk.frame(0x80, "01 02") == []
     desk.write(0x1015, 0, 0, 2)
     desk.run(0)
-    assert desk.take() == [(0x084, "40 82 11 02 01 00 00 00")]
+    assert desk.take() == [SYNC_IS_OVER, (0x084, "40 82 11 02 01 00 00 00"), SYNC_IS_OVER]
 
 
 def test_more_emergencies_than_can_wait_are_counted(operational) -> None:
     desk = operational
     desk.write(0x1015, 0, 10, 2)  # 1 ms
-    for number in range(20):
+    for number in range(10):
         desk.node.on_frame(0x80, bytes(2 + number % 2), desk.t_ns)
     desk.run(30)
     told = [data for _, data in desk.take()]
     assert told[0] == "40 82 11 02 01 00 00 00"
-    assert told[1] == "10 81 11 00 00 03 00 00"  # one was told, 16 waited, 3 gave way
-    assert told[2:] == [f"40 82 11 {2 + number % 2:02x} 01 00 00 00" for number in range(4, 20)]
+    assert told[1] == "10 81 11 00 00 03 00 00"  # of 20 one was told, 16 waited, 3 gave way
+    assert told[2::2] == [f"40 82 11 {2 + number % 2:02x} 01 00 00 00" for number in range(2, 10)]
+    assert told[3::2] == [SYNC_IS_OVER[1]] * 8  # so the last one has the register as it is
     assert desk.read(0x1003, 1) == 0x8110  # the newest: it was said after all those were known
 
 
@@ -283,7 +291,7 @@ def test_emergency_that_the_bus_refuses_is_told_later(operational) -> None:
         desk.run(0)
     desk.bus_refuses = False
     desk.run(0)
-    assert desk.take() == [(0x084, "40 82 11 00 01 00 00 00")]
+    assert desk.take() == [(0x084, "40 82 11 00 01 00 00 00"), SYNC_IS_OVER]
 
 
 def test_controller_that_becomes_error_passive(operational) -> None:
@@ -308,6 +316,6 @@ def test_bus_off(operational, behaviour: int, state: NmtState) -> None:
     assert desk.node.nmt_state is state
     assert desk.take() == []  # there is no bus to tell it on
     desk.node.on_bus(BusState.ACTIVE, desk.t_ns)
-    recovered = [(0x084, "40 81 11 00 00 00 00 00")]
+    recovered = [(0x084, "40 81 11 00 00 00 00 00"), (0x084, "00 00 00 40 81 00 00 00")]
     assert desk.take() == ([] if state is NmtState.STOPPED else recovered)
     assert (desk.frame(0, "80 00") == recovered) is (state is NmtState.STOPPED)

@@ -139,7 +139,7 @@ def test_monitored_node_that_starts_anew(operational) -> None:
     monitoring(desk, 127)
     desk.frame(0x77F, "05")
     desk.run(50)
-    assert desk.frame(0x77F, "00") == [(0x084, "30 81 11 7f 01 00 00 00")]
+    assert desk.frame(0x77F, "00") == [(0x084, "30 81 11 7f 01 00 00 00"), RESOLVED]
     assert desk.read(0x1001, 0) == 0
     desk.run(99)
     assert desk.take() == []

@@ -106,7 +106,8 @@ def test_services_of_a_state(desk, state: str, sdo: bool, pdo: bool, emcy: bool)
     desk.frame(0, INTO[state])
     answer = [(0x584, "43 00 10 00 00 00 00 00")]
     assert desk.frame(0x604, "40 00 10 00 00 00 00 00") == (answer if sdo else [])
-    told = [(0x084, "40 82 11 01 00 00 00 00")]  # a SYNC with a byte too many
+    # a SYNC with a byte too many, and over it is
+    told = [(0x084, "40 82 11 01 00 00 00 00"), (0x084, "00 00 00 40 82 00 00 00")]
     assert desk.frame(0x80, "01") == (told if emcy else [])
     desk.node.on_frame(0x80, b"", desk.t_ns)
     desk.run(100)

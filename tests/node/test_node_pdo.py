@@ -160,7 +160,7 @@ class TestCanFd:
         fd.start()
         assert fd.frame(0x404, "00 " * 8 + "01 00 00 00") == []
         assert fd.read(0x2020, 1) == 1
-        assert [data[:5] for _, data in fd.frame(0x404, "00 " * 16)] == ["20 82"]
+        assert [data[:5] for _, data in fd.frame(0x404, "00 " * 16)] == ["20 82", "00 00"]
         assert [data[:5] for _, data in fd.frame(0x404, "00 " * 8)] == ["10 82"]
 
 

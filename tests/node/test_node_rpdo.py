@@ -119,10 +119,14 @@ def test_two_rpdos_may_share_a_cob_id(rpdo2) -> None:
     assert emergencies(desk.frame(PDO, "01")) == ["10 82 11 03 01 04 00 00"]
     assert mode(desk) == 1
     frames = desk.frame(PDO, "74 61 72 65")  # too long for the first, and no mode either
-    assert emergencies(frames) == ["20 82 11 02 04 01 00 00", "00 00 00 10 82 00 00 00"]
+    over = ["00 00 11 20 82 00 00 00", "00 00 00 10 82 00 00 00"]  # the register holds what is left
+    assert emergencies(frames) == ["20 82 11 02 04 01 00 00", *over]
     assert mode(desk) == 1
     desk.frame(0x80, "01")
     assert desk.read(0x2100, 1) == round(0.75 * 65532)
+
+
+NOT_TOO_LONG = "00 00 00 20 82 00 00 00"
 
 
 class TestLength:
@@ -148,12 +152,12 @@ class TestLength:
 
     def test_too_long_is_processed_and_told_once(self, rpdo2) -> None:
         desk = rpdo2(kind=255)
-        assert emergencies(desk.frame(PDO, "01 ff")) == ["20 82 11 02 02 01 00 00"]
+        assert emergencies(desk.frame(PDO, "01 ff")) == ["20 82 11 02 02 01 00 00", NOT_TOO_LONG]
         assert mode(desk) == 1
         assert emergencies(desk.frame(PDO, "00 ff")) == []
         assert mode(desk) == 0
         assert emergencies(desk.frame(PDO, "00")) == []
-        assert emergencies(desk.frame(PDO, "00 00 00")) == ["20 82 11 02 03 01 00 00"]
+        assert emergencies(desk.frame(PDO, "00 00 00")) == ["20 82 11 02 03 01 00 00", NOT_TOO_LONG]
         assert desk.read(0x1001, 0) == 0  # it does no harm
 
     def test_changing_the_pdo_ends_its_error(self, rpdo2) -> None:

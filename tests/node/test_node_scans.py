@@ -431,7 +431,8 @@ class TestCommandPdo:
 
     def test_too_long_is_processed_and_told(self, operational) -> None:
         desk = operational
-        assert desk.frame(0x204, "00 00 00 00 00 01 ff ff") == [(EMCY, "20 82 11 01 08 06 00 00")]
+        told = ["20 82 11 01 08 06 00 00", "00 00 00 20 82 00 00 00"]
+        assert desk.frame(0x204, "00 00 00 00 00 01 ff ff") == [(EMCY, data) for data in told]
         assert desk.read(0x2020, 1) == 1
 
     def test_is_ignored_outside_operational(self, desk) -> None:

@@ -42,6 +42,10 @@ def cycle(desk) -> list[tuple[int, str]]:
     return desk.take()
 
 
+OVER = "00 00 00 00 63 00 00 00"
+"""Follows what the memory had to tell: the node goes on without it."""
+
+
 def emergencies(frames: list[tuple[int, str]]) -> list[str]:
     return [data for can_id, data in frames if can_id == 0x084]
 
@@ -189,7 +193,7 @@ class TestPdos:
         assert kept is not None
         values = {**kept.communication.values, (0x1A00, 2): struct.pack("<I", 0x1008_0020)}
         memory.save(replace(kept, communication=Parameters(4, values)))
-        assert emergencies(cycle(desk)) == ["00 63 81 04 00 1a 00 00"]
+        assert emergencies(cycle(desk)) == ["00 63 81 04 00 1a 00 00", OVER]
         after = snapshot(desk)
         assert {key: after[key] for key in after if key[0] == 0x1A00} == {
             key: before[key] for key in before if key[0] == 0x1A00
@@ -264,7 +268,7 @@ def test_value_that_is_not_allowed_any_more(
     memory.save(replace(kept, communication=Parameters(4, {key: value, (0x1017, 0): b"\x64\x00"})))
     frames = cycle(desk)
     assert frames[0] == (0x704, "00")  # the boot-up message comes first
-    assert emergencies(frames) == [f"00 63 81 04 {told} 00"]
+    assert emergencies(frames) == [f"00 63 81 04 {told} 00", OVER]
     assert desk.node.memory_problem == f"0x{key[0]:04X}:{key[1]} as it was kept is not allowed"
     assert desk.read(0x1017, 0) == 100
     assert desk.read(0x1019, 0) == 0
@@ -278,7 +282,7 @@ def test_what_is_refused_leaves_its_neighbours_alone(desk, memory: Breakable) ->
     assert kept is not None
     twice = struct.pack("<I", 0x007F_0064)  # one node monitored twice
     memory.save(replace(kept, communication=Parameters(4, {(0x1016, 1): twice, (0x1016, 2): twice})))
-    assert emergencies(cycle(desk)) == ["00 63 81 04 16 10 02 00"]
+    assert emergencies(cycle(desk)) == ["00 63 81 04 16 10 02 00", OVER]
     assert [desk.read(0x1016, subindex) for subindex in (1, 2)] == [0x007F_0064, 0]
 
 
@@ -346,7 +350,7 @@ class TestBaseline:
         memory.broken = True
         desk.source.ohm = desk.source.ohm / 2
         frames = desk.frame(0x604, "23 21 20 04 74 61 72 65")
-        assert emergencies(frames) == ["00 63 81 05 00 00 00 00"]
+        assert emergencies(frames) == ["00 63 81 05 00 00 00 00", OVER]
         assert (0x584, "60 21 20 04 00 00 00 00") in frames  # the tare itself was done
 
     @pytest.mark.parametrize("rows", [((1.0,) * 6,), ((1.0,) * 6, (1.0,)), ((float("nan"),) * 6,) * 2])
@@ -357,7 +361,7 @@ class TestBaseline:
         before, desk.source.reads = desk.read(0x2200, 1), 0
         node = type(desk)(desk.layout, memory=memory)
         node.power_on()
-        assert emergencies(node.take()) == ["00 63 81 04 01 23 00 00"]
+        assert emergencies(node.take()) == ["00 63 81 04 01 23 00 00", OVER]
         assert node.read(0x2200, 1) == before
         assert node.source.reads == 16
 
@@ -454,7 +458,7 @@ class TestFilesOfNoUse:
         again = self.start(type(desk), desk.layout, path)
         frames = again.take()
         assert frames[0] == (0x704, "00")
-        assert emergencies(frames) == ["00 63 81 02 00 00 00 00"]
+        assert emergencies(frames) == ["00 63 81 02 00 00 00 00", OVER]
         assert again.read(0x2020, 2) == 2
         assert again.read(0x1003, 1) == 0x0002_6300
         # Its tare went to a new file; what could be read of the old one is still there for people.
@@ -469,12 +473,17 @@ class TestFilesOfNoUse:
         desk_type = type(make())
         moved = type(layout)(layout.upper_m * 1.01, layout.lower_m, layout.resistivity_ohm_per_m)
         foreign = self.start(desk_type, moved, path)
-        assert emergencies(foreign.take()) == ["00 63 81 03 00 00 00 00"]
+        assert emergencies(foreign.take()) == ["00 63 81 03 00 00 00 00", OVER]
         assert foreign.read(0x2020, 2) == 2
         (aside,) = tmp_path.glob("n.unused-*")
         assert aside.read_bytes() == good
 
     def test_that_cannot_be_read(self, make: Callable, layout, tmp_path: Path) -> None:
         desk = self.start(type(make()), layout, tmp_path)  # a folder
-        assert emergencies(desk.take()) == ["00 63 81 01 00 00 00 00", "00 63 81 05 00 00 00 00"]
+        assert emergencies(desk.take()) == [
+            "00 63 81 01 00 00 00 00",
+            OVER,
+            "00 63 81 05 00 00 00 00",
+            OVER,
+        ]
         assert desk.sdo("23 10 10 01 73 61 76 65") == f"80 10 10 01 {HARDWARE}"

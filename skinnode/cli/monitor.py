@@ -52,7 +52,7 @@ def monitor(
         bool, typer.Option("--json", help="No screen: a JSON object a second, for programs.")
     ] = False,
 ) -> None:
-    """Show a hand on the terminal: touch, contacts, health, rates, load, events.
+    """Show a hand on the terminal: height and shear, touches, health, rates, load, events.
 
     It runs the hand as `skinnode host` does, but waits for missing patches. Keys:
     1-9 choose a patch, z shows it alone, t tares it, r records, space holds the

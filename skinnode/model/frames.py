@@ -99,7 +99,9 @@ class FieldFrame:
     """(U,) wires whose own equations did not do: of an exact field those estimated with the prior, of a
     posterior those without any. ``trusted`` may rest on the prior alone there."""
     contacts: tuple[Contact, ...] = ()
-    """Found by the posterior, the strongest first."""
+    """What presses, the strongest first, where ``method`` is ``posterior``. Of an exact field always empty:
+    ``auto`` gives such where noise and layout allow it, so ask for the posterior where contacts are needed
+    (``solver.method`` of hand.toml, ``method`` of Tracker)."""
     gain: Float | None = None
     """(U,) estimated gain error of the resistances of each wire, where a drift is estimated."""
     noise_factor: float = 1.0

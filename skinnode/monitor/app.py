@@ -44,7 +44,7 @@ HELP: Final = """\
  a                 arrows of shear on the maps, or not
  q, ctrl-c         quit
 
- Bright is deep; the bar beside "contacts" says how deep. Arrows show
+ Bright is deep; the bar beside "touches" says how deep. Arrows show
  shear, to the right along the upper wires, upwards across them. A
  map without colours is an old one: its patch sends nothing now."""
 

@@ -1,4 +1,4 @@
-"""The screen as lines of text: header, buses, patches, contacts and log, of any size."""
+"""The screen as lines of text: header, buses, patches, touches and log, of any size."""
 
 from __future__ import annotations
 
@@ -115,13 +115,13 @@ def _keys(ui: Ui, look: Look, width: int) -> Line:
     return pad(line, width, look, look.bar)
 
 
-# --- contacts and log
+# --- touches and log
 
 
 def _lower(
     view: View, ui: Ui, log: Sequence[LogLine], full_m: float, look: Look, width: int, height: int
 ) -> list[Line]:
-    """Contacts and events: below each other, or beside where there is room. Where there is a lot, the figures
+    """Touches and events: below each other, or beside where there is room. Where there is a lot, the figures
     of the patch that is chosen as well."""
     chosen = view.patch(ui.selected)
     patches = (chosen,) if ui.zoomed else view.patches
@@ -131,12 +131,12 @@ def _lower(
         figures = [] if ui.zoomed else [[], *facts(chosen, look, left - 2)]
         share = height - len(figures) if height - len(figures) >= 7 else height
         below = [[Segment(" ", look.text), *line] for line in figures[: height - share]]
-        lines = [*_contacts(patches, scale, look, left - 2, share), *below]
+        lines = [*_touches(patches, scale, look, left - 2, share), *below]
         blocks = [(lines, left), (_log(log, look, width - left, height), width - left)]
         return beside(blocks, height, look)
     share = min(4, max(2, height // 2))
     lines = [
-        *_contacts(patches, scale, look, width, share),
+        *_touches(patches, scale, look, width, share),
         *_log(log, look, width, height - share),
     ]
     return [pad(line, width, look) for line in lines]
@@ -150,11 +150,11 @@ def _rule(title: str, tail: Line, look: Look, width: int) -> Line:
     )
 
 
-def _contacts(patches: Sequence[PatchView], scale: Line, look: Look, width: int, height: int) -> list[Line]:
+def _touches(patches: Sequence[PatchView], scale: Line, look: Look, width: int, height: int) -> list[Line]:
     rows = [(patch, touch) for patch in patches if patch.condition not in GONE for touch in patch.touches]
     rows.sort(key=lambda row: -(row[1].force_n or 1e3 * row[1].depth_m))
     hidden = len(rows) - (height - 1)
-    title = "contacts" + (f" ({hidden} more)" if hidden > 0 else "")
+    title = "touches" + (f" ({hidden} more)" if hidden > 0 else "")
     lines = [_rule(title, scale, look, width)]
     name = min(14, max((len(patch.name) for patch in patches), default=0))
     lines += [pad(_touch_line(patch, touch, look, name), width, look) for patch, touch in rows[: height - 1]]

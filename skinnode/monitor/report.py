@@ -141,7 +141,7 @@ def _patch_json(patch: PatchView) -> dict[str, Any]:
         "depth_m": patch.depth_m,
         "depth_std_m": patch.depth_std_m,
         "shear_m": list(patch.shear_m),
-        "contacts": [_touch_json(touch) for touch in patch.touches],
+        "touches": [_touch_json(touch) for touch in patch.touches],
     }
 
 

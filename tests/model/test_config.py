@@ -64,6 +64,8 @@ def test_example_says_the_defaults() -> None:
     buses = [{"name": "can0", "interface": "udp_multicast", "channel": "239.74.163.2"}]
     patches = [{"name": patch.name, "node_id": patch.node_id} for patch in hand.patches]
     spare = parse_hand({"name": hand.name, "buses": buses, "patches": patches})
+    assert (hand.solver.method, spare.solver.method) == ("posterior", "auto")  # as its comment says
+    hand = hand.model_copy(update={"solver": hand.solver.model_copy(update={"method": "auto"})})
     spare_patches = [patch.model_copy(update={"eds": None}) for patch in hand.patches]
     assert [patch.layout.build().layout_hash for patch in spare.patches] == [
         patch.layout.build().layout_hash for patch in hand.patches

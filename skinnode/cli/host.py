@@ -37,8 +37,8 @@ def host(
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
     Ctrl-C ends it; the nodes are left pre-operational. Exit status 1 if a patch was not operational at the
-    end, or a scan was torn or a frame lost; 2 if the hand could not be run, or if a node sent frames that are
-    not what their identifier promises.
+    end, a scan was torn or a frame lost, or an interface failed meanwhile; 2 if the hand could not be run, or
+    if a node sent frames that are not what their identifier promises.
     """
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
@@ -82,21 +82,18 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
 
 def _faults(running: Host) -> list[str]:
     """What was not as it should be, one line each."""
+    from skinnode.host.accounting import losses_of_bus, losses_of_lane
+
     stats = running.stats()
-    found = [f"{name}: {bus.dropped} frames dropped" for name, bus in stats.buses.items() if bus.dropped]
+    found = [
+        f"{name}: {count} {what}" for name, bus in stats.buses.items() for count, what in losses_of_bus(bus)
+    ]
     for name, lane in stats.patches.items():
         condition = running.health(name).condition
         begun = lane.offered > 0 or stats.sync.sent > _FIRST_SCANS
         if condition != "operational" and begun:
             found.append(f"{name}: {condition} at the end")
-        counts = lane.assembler
-        for count, what in (
-            (counts.scans_torn, "scans torn"),
-            (counts.scans_missed, "scans missed"),
-            (counts.chunks_lost, "chunks lost"),
-        ):
-            if count:
-                found.append(f"{name}: {count} {what}")
+        found += [f"{name}: {count} {what}" for count, what in losses_of_lane(lane)]
     return found
 
 

@@ -25,8 +25,8 @@ def replay(
 ) -> None:
     """Decode and solve a recording of `skinnode record`, with the same results as live, bit by bit.
 
-    Exit status 1 if the recording is damaged or lacks frames, or a scan was torn; 2 if it cannot be read at
-    all.
+    Exit status 1 if the recording is damaged, was not ended or lacks frames, or if what it holds lacks some:
+    a scan torn or missed, a chunk or a summary lost. 2 if it cannot be read at all.
     """
     from skinnode.record import replay as play
     from skinnode.signals import until_told
@@ -90,17 +90,20 @@ def _patches(run: Replay, deepest_m: dict[str, float]) -> dict[str, dict[str, An
 
 
 def _faults(run: Replay) -> list[str]:
+    from skinnode.host.accounting import losses_of_lane
+
     found = [f"{run.log.path.name} {damage}" for damage in run.log.damages]
     if run.log.damaged > len(found):
         found.append(f"{run.log.damaged - len(found)} more places like these")
+    if run.incomplete is not None:
+        found.append(f"{run.log.path.name} {run.incomplete}")
     found += run.complaints
     if run.dropped:
         found.append(f"{run.dropped} frames were not recorded: the disk was too slow")
     if run.strange:
         found.append(f"{run.strange} frames on channels that no bus of the hand has")
     for name, lane in run.patch_stats().items():
-        if lane.assembler.scans_torn:
-            found.append(f"{name}: {lane.assembler.scans_torn} scans torn")
+        found += [f"{name}: {count} {what}" for count, what in losses_of_lane(lane)]
         if not lane.offered:
             found.append(f"{name}: no scan that could be decoded")
     return found

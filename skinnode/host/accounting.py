@@ -37,6 +37,30 @@ def discrepancies(stats: HostStats) -> list[str]:
     return found
 
 
+def losses_of_bus(bus: BusStats) -> list[tuple[int, str]]:
+    """What of a bus did not come in, and how much of it; nothing where nothing was lost."""
+    counts = (
+        (bus.dropped, "frames dropped"),
+        (bus.kernel_dropped, "frames dropped by the kernel"),
+        (bus.outages, "outages of the interface"),
+        (bus.bus_offs, "times bus-off"),
+    )
+    return [(count, what) for count, what in counts if count]
+
+
+def losses_of_lane(lane: LaneStats) -> list[tuple[int, str]]:
+    """The same of a patch."""
+    counted = lane.assembler
+    counts = (
+        (counted.scans_torn, "scans torn"),
+        (counted.scans_missed, "scans missed"),
+        (counted.scans_mixed, "scans thrown away as mixed"),
+        (counted.chunks_lost, "chunks lost"),
+        (counted.summaries_lost, "summaries lost"),
+    )
+    return [(count, what) for count, what in counts if count]
+
+
 def frames_counted(assembler: AssemblerStats) -> int:
     """Chunks and summaries of which the assembler says what became of them."""
     return (

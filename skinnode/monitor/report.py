@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, Final
 
+from skinnode.host.accounting import losses_of_lane
 from skinnode.host.health import Condition, PatchHealth
 from skinnode.monitor.source import Source
 from skinnode.monitor.state import History, PatchView, View
@@ -45,14 +46,8 @@ class FaultBook:
                 self._add(patch.name, patch.condition, patch.condition)
             for key, text in _lasting(patch.health):
                 self._add(patch.name, key, text)
-            counts = patch.lane.assembler
-            for what, count in (
-                ("scans torn", counts.scans_torn),
-                ("scans missed", counts.scans_missed),
-                ("chunks lost", counts.chunks_lost),
-            ):
-                if count:
-                    self._add(patch.name, what, f"{count} {what}")
+            for count, what in losses_of_lane(patch.lane):
+                self._add(patch.name, what, f"{count} {what}")
         for bus in view.buses:
             if bus.level == "bad":
                 for word in bus.words:

@@ -14,7 +14,8 @@ bus it happened, ``t_ns`` when (monotonic clock of the host).
 ``polled``     a scan that lacked something was ended by the clock
 ``overtaken``  ``scan`` of ``patch`` was skipped for a newer one
 ``dropped``    ``frames`` that were not written, because the disk was too slow
-``ended``      the recording was ended; without it, its process was killed or the disk full
+``ended``      the recording was ended, with ``frames`` in the log; without it, its process was killed or the
+               disk full
 =============  ==============================================================================
 """
 
@@ -37,6 +38,12 @@ from skinnode.wire.profile import PatchProfile
 
 FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
+
+COMPLAINTS_KEPT: Final = 100
+"""Lines that cannot be read and are named; more are only counted."""
+
+_MOST: Final = 2**63 - 1
+_OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +89,16 @@ def facts_table(facts: NodeFacts) -> dict[str, Any]:
 
 
 def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> NodeFacts:
-    """The other way. Raises KeyError, TypeError or ValueError for a table that is none."""
+    """The other way. Raises KeyError, TypeError, OverflowError or ValueError for a table that is none."""
     profile = PatchProfile.from_config(patch, bus)
     baseline = np.array(table["baseline_ohm"], dtype=np.float64)
     if baseline.shape != (profile.rows, profile.columns):
         raise ValueError(
             f"baseline_ohm: got shape {baseline.shape}, must be ({profile.rows}, {profile.columns})"
         )
+    good = np.isfinite(baseline) & (baseline > 0)
+    if not good.all():
+        raise ValueError(f"baseline_ohm: got {baseline[~good][0]:g}, must be positive")
     own = table["layout"]
     if own is None:
         layout = patch.layout.build()
@@ -118,7 +128,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         header = Header(
             parse_hand(first["hand"], where=str(path)),
             str(first["started"]),
-            int(first["wall_minus_mono_ns"]),
+            _whole(first["wall_minus_mono_ns"], least=-_MOST),
         )
     except ConfigError:
         raise
@@ -127,16 +137,44 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         raise ConfigError("line 1", shown, "the header of a recording's journal", where=str(path)) from None
     events: list[dict[str, Any]] = []
     complaints: list[str] = []
+    bad = 0
     for number, line in enumerate(lines[1:], 2):
         if not line.strip():
             continue
         try:
-            event = json.loads(line)
-            if not (isinstance(event["bus"], str) and isinstance(event["event"], str)):
-                raise ValueError
-            event["at"], event["t_ns"] = int(event["at"]), int(event["t_ns"])
-            events.append(event)
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            what = "cut off" if number == len(lines) else "no event"
-            complaints.append(f"{path.name} line {number}: {what}")
+            events.append({**_event(line, header.hand), "line": number})
+        except (ValueError, KeyError, TypeError, RecursionError):
+            bad += 1
+            if bad <= COMPLAINTS_KEPT:
+                what = "cut off" if number == len(lines) else "no event"
+                complaints.append(f"{path.name} line {number}: {what}")
+    if bad > COMPLAINTS_KEPT:
+        complaints.append(f"{bad - COMPLAINTS_KEPT} more lines like these")
     return header, events, complaints
+
+
+def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
+    """The event on a line. Raises KeyError, TypeError, RecursionError or ValueError where there is none."""
+    event: dict[str, Any] = json.loads(line)
+    _whole(event["at"])
+    _whole(event["t_ns"])
+    if not isinstance(event["bus"], str):
+        raise TypeError
+    match event["event"]:
+        case "dropped":
+            _whole(event["frames"])
+        case "ended":
+            _whole(event.get("frames", 0))  # recordings of the first versions did not count
+        case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
+            if kind == "overtaken":
+                _whole(event["scan"])
+        case _:
+            raise ValueError
+    return event
+
+
+def _whole(value: object, least: int = 0) -> int:
+    """Raises ValueError for what is no integer of 64 bits from ``least`` on."""
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
+        raise ValueError
+    return value

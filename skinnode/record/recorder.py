@@ -162,7 +162,7 @@ class Recorder:
                 to_disk = now_s >= sync_s + SYNC_S
                 self._try(lambda to_disk=to_disk: self._flush(to_disk=to_disk))  # type: ignore[misc]
                 flush_s, sync_s = now_s, now_s if to_disk else sync_s
-        self._try(lambda: self._write_event("", time.monotonic_ns(), "ended"))
+        self._try(lambda: self._write_event("", time.monotonic_ns(), "ended", frames=self._log.frames))
         with suppress(OSError):
             self._journal.close()
         self._log.close()

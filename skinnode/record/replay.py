@@ -66,9 +66,17 @@ class Replay:
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
         """The log; its ``damaged`` and ``damages`` say what of it could not be read."""
-        self.ended = any(event["event"] == "ended" for event in events)
+        ends = [event for event in events if event["event"] == "ended"]
+        self.ended = bool(ends)
         """Whether the recording was ended rather than killed."""
-        self.dropped = sum(int(e.get("frames", 0)) for e in events if e["event"] == "dropped")
+        self._recorded: int | None = ends[0].get("frames") if ends else None
+        self._read = 0
+        self._first_ns: int | None = None
+        self._journal = path.with_suffix(SUFFIX).name
+        self.incomplete: str | None = None
+        """After an iteration to the end: how the log is not all that was recorded, in one line; None where
+        it is."""
+        self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Frames that the recorder could not write."""
         self._now_ns = 0
         self._stopped = False
@@ -95,6 +103,9 @@ class Replay:
             if self._stopped:
                 break
             self._now_ns = frame.t_ns
+            self._read += 1
+            if self._first_ns is None:
+                self._first_ns = frame.t_ns
             bus = self._by_channel.get(channel)
             if bus is None:
                 self.strange += 1
@@ -103,10 +114,20 @@ class Replay:
             while (field := fields.get(0.0)) is not None:
                 yield field
         self.log.close()
+        if not self._stopped:
+            self.incomplete = self._lack()
         for bus in self._buses.values():
             bus.finish()
         while (field := fields.get(0.0)) is not None:
             yield field
+
+    def _lack(self) -> str | None:
+        if not self.ended:
+            span_s = (self._now_ns - (self._first_ns or 0)) * 1e-9
+            return "was not ended: " + (f"reads up to {span_s:.1f} s" if self._read else "has no frame")
+        if self._recorded is None or self._read == self._recorded:
+            return None
+        return f"has {self._read} frames of the {self._recorded} that were recorded"
 
     def stop(self) -> None:
         """End the iteration soon; from any thread."""
@@ -132,6 +153,10 @@ class Replay:
         end_s = time.monotonic() + seconds
         while not self._stopped and (left_s := end_s - time.monotonic()) > 0:
             time.sleep(min(left_s, _SLICE_S))
+
+    def complain(self, event: dict[str, Any], what: str) -> None:
+        """Of an event of the journal that turned out to be none."""
+        self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
         """The time in the recording, ns of its host's monotonic clock."""
@@ -183,10 +208,10 @@ class _Bus:
             for patch in hand.patches_on(config.name)
         }
         for name, heard in self.patches.items():
-            skipped = [e.get("scan") for e in events if e["event"] == "overtaken" and e.get("patch") == name]
-            heard.lane.leave_out(frozenset(scan for scan in skipped if isinstance(scan, int)))
+            skipped = [e["scan"] for e in events if e["event"] == "overtaken" and e["patch"] == name]
+            heard.lane.leave_out(frozenset(skipped))
         self._events = deque(events)
-        self._solvers: dict[str, Solver] = {}
+        self._solvers: dict[str, Solver | None] = {}
         self._received = self._sent = 0
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
@@ -220,10 +245,7 @@ class _Bus:
         return bool(event["t_ns"] <= t_ns)
 
     def _happen(self, event: dict[str, Any]) -> None:
-        heard = self.patches.get(str(event.get("patch")))
-        if heard is None:
-            return
-        lane = heard.lane
+        lane = self.patches[event["patch"]].lane
         match event["event"]:
             case "withheld":
                 lane.withhold()
@@ -231,16 +253,19 @@ class _Bus:
                 lane.poll(event["t_ns"] + _ROUNDING_NS)
             case "resumed":
                 solver = self._solver(event)
-                if solver is not None:
+                if solver is None:
+                    lane.withhold()
+                else:
                     lane.resume(solver, lane.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> Solver | None:
+        """None where nobody knows how the scans are to be decoded."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
+            self._solvers[name] = None
             try:
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
-            except (KeyError, TypeError, ValueError) as error:
-                replay.complaints.append(f"facts of {name}: {error}")
-                return None
-            self._solvers[name] = Solver(facts, replay.hand.solver, replay.clock)
+                self._solvers[name] = Solver(facts, replay.hand.solver, replay.clock)
+            except (KeyError, TypeError, OverflowError, ValueError) as error:
+                replay.complain(event, f"no facts of {name} ({type(error).__name__}: {error})")
         return self._solvers.get(name)

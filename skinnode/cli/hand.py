@@ -24,7 +24,7 @@ def check(
     hand: Annotated[Path, typer.Argument(help="The hand to check.", metavar="HAND.toml")],
     as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
 ) -> None:
-    """Validate a hand file and work out what it needs of its buses.
+    """Validate a hand file and the files it names, and work out what it needs of its buses.
 
     For each bus: the load of the plan with every frame at its longest and with random data, the worst-case
     time from SYNC to the end of each patch's summary, and that against the SYNC period; and how long each
@@ -32,11 +32,13 @@ def check(
     Exit status 1 if a bus needs more than its max_load, 2 if the file cannot be used.
     """
     from skinnode.errors import BusLoadError
+    from skinnode.host.hand_files import check_files
     from skinnode.model.config import load_hand
     from skinnode.wire.plan import plan_of, require_room
 
     config = load_hand(hand)
     plans, refused = plan_of(config), []
+    check_files(config)
     for plan in plans:
         try:
             require_room(config, plan)

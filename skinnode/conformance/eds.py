@@ -14,7 +14,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.errors import ProfileError
+from skinnode.errors import ProfileError, Shown
+from skinnode.wire.eds import no_eds
 
 SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
@@ -148,10 +149,12 @@ def parse_eds(text: str, source: str) -> Eds:
     try:
         parser.read_string(text)
     except configparser.Error as error:
-        raise ProfileError("--eds", " ".join(str(error).split()), "an EDS (CiA 306)", where=source) from error
+        raise no_eds(error, source) from error
     sections = {name.lower(): {k: v or "" for k, v in parser.items(name)} for name in parser.sections()}
     if "deviceinfo" not in sections or "1000" not in sections:
-        raise ProfileError("--eds", "no section DeviceInfo or 1000", "an EDS (CiA 306)", where=source)
+        raise ProfileError(
+            "EDS", Shown("no section DeviceInfo or 1000"), "a file as in CiA 306", where=source
+        )
     found: list[str] = []
     entries: dict[tuple[int, int], EdsEntry] = {}
     for title in sorted(sections, key=_order):

@@ -15,7 +15,7 @@ import numpy as np
 from skinnode.doctor.capture import Capture
 from skinnode.doctor.facts import BusFacts, PatchFacts
 from skinnode.errors import BusError, NodeError, ProfileError
-from skinnode.host.bringup import check_eds
+from skinnode.host.hand_files import check_eds
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.technician.heard import Heard
 from skinnode.technician.info import NodeInfo, read_info

@@ -10,12 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from skinnode.errors import ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
+from skinnode.errors import NodeError, NodeTimeout, SdoAbort
+from skinnode.host.hand_files import load_baseline
 from skinnode.host.network import RemoteOd
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.layout import Float, PatchLayout
@@ -301,23 +301,6 @@ class Bringer:
         return baseline
 
 
-def load_baseline(path: Path, profile: PatchProfile) -> Float:
-    """(U, K) resistances of a text file, ohm, as REAL32 has them. Raises ConfigError for what is no table of
-    that many positive numbers."""
-    allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
-    try:
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
-        values = np.array(lines, dtype=np.float32).astype(np.float64)
-    except (OSError, ValueError) as error:
-        raise ConfigError("baseline", _line(error), allowed, where=str(path)) from None
-    if values.shape != (profile.rows, profile.columns):
-        raise ConfigError("baseline", values.shape, allowed, where=str(path))
-    good = np.isfinite(values) & (values > 0)
-    if not good.all():
-        raise ConfigError("baseline", float(values[~good][0]), allowed, where=str(path))
-    return values
-
-
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
     """NMT: go operational."""
     send(od.NMT_COB_ID, bytes([_NMT_START, node_id]))
@@ -328,49 +311,7 @@ def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
     send(od.NMT_COB_ID, bytes([_NMT_PRE_OPERATIONAL, node_id]))
 
 
-def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file describes the wire format that the hand file asks for.
-
-    Raises ProfileError for a file that is no EDS, and for the first object that differs or is missing.
-    """
-    import canopen
-
-    try:
-        described = canopen.import_od(str(path))
-    except Exception as error:  # the library lets its parser's errors through, whatever they are
-        raise ProfileError(
-            "EDS", path.name, f"a file as in CiA 306 ({_line(error)})", where=str(path)
-        ) from None
-    for item in profile.objects():
-        for entry in item.entries:
-            where = f"0x{entry.index:04X}:{entry.subindex}"
-            found = described.get_variable(entry.index, entry.subindex)
-            if found is None:
-                raise ProfileError(
-                    where, "no such object", f"{entry.name} of {_format(profile)}", where=str(path)
-                )
-            if found.data_type != entry.data_type:
-                allowed = f"0x{int(entry.data_type):X} ({entry.data_type.name})"
-                raise ProfileError(f"{where} data type", found.data_type, allowed, where=str(path))
-            constant = entry.access == "const" and isinstance(entry.default, int)
-            if constant and found.default is not None and found.default != entry.default:
-                raise ProfileError(
-                    f"{where} {entry.name}",
-                    found.default,
-                    f"{entry.default} in {_format(profile)}",
-                    where=str(path),
-                )
-
-
-def _format(profile: PatchProfile) -> str:
-    return f"a patch of {profile.rows}x{profile.columns} wires at {profile.code_bits} bits"
-
-
 def _mismatch(patch: PatchConfig, what: str, got: str, allowed: str) -> NodeError:
     return NodeError(
         patch.node_id, f"patch {patch.name!r} on {patch.bus}: {what}: got {got}, allowed: {allowed}"
     )
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -13,10 +13,10 @@ from typing import Final
 
 from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
-from skinnode.host.bringup import check_eds, load_baseline
 from skinnode.host.callback import Callbacks, FieldCallback
 from skinnode.host.dealer import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthWatch
+from skinnode.host.hand_files import check_files
 from skinnode.host.hand_frame import HandGatherer, HandSubscription
 from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.link import BusLink
@@ -36,7 +36,6 @@ from skinnode.model.frames import FieldFrame
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 from skinnode.wire.plan import check_plan
-from skinnode.wire.profile import PatchProfile
 
 _log = logging.getLogger(__name__)
 
@@ -163,12 +162,7 @@ class Host:
         """
         hand = hand.on(interface, channel)
         check_plan(hand)
-        for patch in hand.patches:
-            profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
-            if patch.eds is not None:
-                check_eds(patch.eds, profile)
-            if patch.baseline is not None:
-                load_baseline(patch.baseline, profile)
+        check_files(hand)
         publisher, callbacks = Publisher(tuple(patch.name for patch in hand.patches)), Callbacks()
         with contextlib.ExitStack() as stack:
             stack.callback(callbacks.join)

@@ -111,6 +111,24 @@ def test_a_file_that_cannot_be_used(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("key", ["eds", "baseline"])
+def test_files_that_a_hand_names_are_read(key: str, tmp_path: Path) -> None:
+    other = tmp_path / "other.txt"
+    other.write_text("root:x:0:0:root:/root:/bin/bash\n")
+    path = tmp_path / "hand.toml"
+    path.write_text(f'[[buses]]\nname = "can0"\n[[patches]]\nname = "p"\nnode_id = 1\n{key} = "other.txt"\n')
+    found = command("check", str(path))
+    assert isinstance(found.exception, ConfigError)
+    assert (
+        str(found.exception)
+        == {
+            "eds": f"{other}: EDS: got something else in line 1, allowed: a file as in CiA 306",
+            "baseline": f"{other}: baseline, line 1: got 'root:x:0:0:root:/root:/bin/bash', "
+            "allowed: 10 lines of 30 positive resistances in ohm",
+        }[key]
+    )
+
+
 @pytest.mark.parametrize("patches", [1, 4, 16, 127])
 def test_a_new_file_is_a_plan_that_fits(patches: int, tmp_path: Path) -> None:
     path = tmp_path / "hand.toml"

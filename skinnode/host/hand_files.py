@@ -1,0 +1,94 @@
+"""The files that a hand file names, held against the wire format that it asks for: EDS and baselines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from skinnode.errors import ConfigError, ProfileError, Shown
+from skinnode.model.config import HandConfig
+from skinnode.model.layout import Float
+from skinnode.wire.eds import no_eds
+from skinnode.wire.profile import PatchProfile
+
+_LONGEST_SHOWN = 40
+
+
+def check_files(hand: HandConfig) -> None:
+    """Read the EDS and the baseline of every patch. Raises ConfigError for the first that is none, or not of
+    the patch."""
+    for patch in hand.patches:
+        profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
+        if patch.eds is not None:
+            check_eds(patch.eds, profile)
+        if patch.baseline is not None:
+            load_baseline(patch.baseline, profile)
+
+
+def load_baseline(path: Path, profile: PatchProfile) -> Float:
+    """(U, K) resistances of a text file, ohm, as REAL32 has them. Raises ConfigError for what is no table of
+    that many positive numbers."""
+    allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ConfigError("baseline", str(path), f"a file that can be read ({error.strerror})") from None
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        row = [_ohm(word, f"baseline, line {number}", allowed, str(path)) for word in line.split()]
+        if row and len(row) != profile.columns:
+            got = Shown(f"{len(row)} numbers")
+            raise ConfigError(f"baseline, line {number}", got, allowed, where=str(path))
+        rows += [row] if row else []
+    if len(rows) != profile.rows:
+        raise ConfigError("baseline", Shown(f"{len(rows)} lines"), allowed, where=str(path))
+    return np.array(rows, dtype=np.float32).astype(np.float64)
+
+
+def _ohm(word: str, key: str, allowed: str, where: str) -> float:
+    try:
+        value = np.float32(float(word))
+    except (ValueError, OverflowError):
+        value = np.float32("nan")
+    if not (np.isfinite(value) and value > 0):
+        raise ConfigError(key, word[:_LONGEST_SHOWN], allowed, where=where)
+    return float(value)
+
+
+def check_eds(path: Path, profile: PatchProfile) -> None:
+    """Check that an EDS file describes the wire format that the hand file asks for.
+
+    Raises ProfileError for a file that is no EDS, and for the first object that differs or is missing.
+    """
+    from canopen.objectdictionary.eds import import_eds  # whatever the file is called
+
+    try:
+        described = import_eds(str(path), None)  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise ProfileError("EDS", str(path), f"a file that can be read ({error.strerror})") from None
+    except Exception as error:  # the library lets its parser's errors through, whatever they are
+        raise no_eds(error, str(path)) from None
+    for item in profile.objects():
+        for entry in item.entries:
+            where = f"0x{entry.index:04X}:{entry.subindex}"
+            found = described.get_variable(entry.index, entry.subindex)
+            if found is None:
+                raise ProfileError(
+                    where, "no such object", f"{entry.name} of {_format(profile)}", where=str(path)
+                )
+            if found.data_type != entry.data_type:
+                allowed = f"0x{int(entry.data_type):X} ({entry.data_type.name})"
+                raise ProfileError(f"{where} data type", found.data_type, allowed, where=str(path))
+            constant = entry.access == "const" and isinstance(entry.default, int)
+            if constant and found.default is not None and found.default != entry.default:
+                raise ProfileError(
+                    f"{where} {entry.name}",
+                    found.default,
+                    f"{entry.default} in {_format(profile)}",
+                    where=str(path),
+                )
+
+
+def _format(profile: PatchProfile) -> str:
+    return f"a patch of {profile.rows}x{profile.columns} wires at {profile.code_bits} bits"

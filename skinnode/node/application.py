@@ -101,6 +101,7 @@ class PatchApplication:
             self._acquisition.forget_sent()
         else:
             self.stream.stop()
+            self._catch_up(self._now())
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
@@ -160,9 +161,13 @@ class PatchApplication:
         except SourceFailed:
             chunks, flags = [], SummaryFlag.SOURCE_FAILED
         self.stream.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
-        if self._late and not self.stream.full:
-            self._late = False
-            self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
+        if not self.stream.full:
+            self._catch_up(t_ns)
+
+    def _catch_up(self, t_ns: int) -> None:
+        """There is room for the next scan, or none is owed: an overrun is over."""
+        self._late = False
+        self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
 
     def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag]:
         """Chunks to be sent of a scan taken now, and its flags. Raises SourceFailed."""

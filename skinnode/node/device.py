@@ -288,6 +288,7 @@ class CanopenDevice:
         if state is self.nmt_state:
             return
         was, self.nmt_state = self.nmt_state, state
+        self._emcy.allow(state.communicates, t_ns)  # first: what ends now may have to wait
         if not state.communicates:
             self._sdo.reset()
         if state is NmtState.OPERATIONAL:
@@ -297,7 +298,6 @@ class CanopenDevice:
         self._rpdos.enter(operational=state is NmtState.OPERATIONAL)
         self._sync.enter(communicates=state.communicates)
         self._application.enter(operational=state is NmtState.OPERATIONAL)
-        self._emcy.allow(state.communicates, t_ns)
 
     def _tell_passive(self, t_ns: int) -> None:
         if self._bus_state is BusState.PASSIVE:

@@ -204,6 +204,18 @@ def test_overrun_skips_scans_and_says_so(operational) -> None:
     assert (EMCY, "10 81 11 03 00 00 00 00") in desk.take()  # told again, the third in all
 
 
+@pytest.mark.parametrize(("command", "told_at_once"), [("80 00", True), ("02 00", False)])
+def test_overrun_is_over_when_no_scan_is_owed(operational, command: str, told_at_once: bool) -> None:
+    desk = operational
+    for counter in (1, 2, 3):
+        desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
+    assert (EMCY, "10 81 11 01 00 00 00 00") in desk.take()
+    over = [(EMCY, "00 00 00 10 81 00 00 00")]
+    assert desk.frame(0, command) == (over if told_at_once else [])
+    assert desk.frame(0, "80 00") == ([] if told_at_once else over)  # a stopped node sends none
+    assert desk.read(0x1001, 0) == 0
+
+
 def test_leaving_operational_drops_the_scan(operational) -> None:
     desk = operational
     desk.node.on_frame(0x80, b"\x01", desk.t_ns)

@@ -35,12 +35,13 @@ def simulate(
     channel: OtherChannel = None,
     seconds: Seconds = None,
     fault: Annotated[
-        str,
+        list[str] | None,
         typer.Option(
-            help="What goes wrong with every node, such as lost=0.01,restart_every_s=5,frozen.",
-            metavar="FAULTS",
+            help="What goes wrong with every node, such as lost=0.01,restart_every_s=5,frozen, or with one, "
+            "such as palm:open_upper=3. May be given again.",
+            metavar="[PATCH:]FAULTS",
         ),
-    ] = "",
+    ] = None,
 ) -> None:
     """Simulate the patches of a hand: CANopen nodes on a bus, a sphere pressing and sliding over each.
 
@@ -49,11 +50,14 @@ def simulate(
     from skinnode.model.config import load_hand
     from skinnode.pauses import short_pauses
     from skinnode.signals import until_told
-    from vcan_sim.faults import parse_faults
+    from vcan_sim.faults import faults_of
     from vcan_sim.fleet import Fleet
 
-    plan, faults = load_hand(hand).on(interface, channel), parse_faults(fault)
-    with until_told() as ended, Fleet(plan, faults=faults) as fleet, short_pauses():
+    plan = load_hand(hand).on(interface, channel)
+    simulated = Fleet(plan)
+    for patch, faults in faults_of(fault or [], [each.name for each in plan.patches]).items():
+        simulated.inject(faults, patch)
+    with until_told() as ended, simulated as fleet, short_pauses():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         _say(f"{len(plan.patches)} patches of {plan.name!r} on {where}; Ctrl-C ends")
         _watch(fleet, ended.wait, seconds)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,6 +16,14 @@ from skinnode.errors import ConfigError
 OF_CHUNKS: Final = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted")
 OF_SCANS: Final = ("torn", "summary_lost", "reset")
 _SHARES: Final = (*OF_CHUNKS, *OF_SCANS, "sync_lost", "long")
+OF_WIRES: Final = (
+    "open_upper",
+    "open_lower",
+    "shorted_upper",
+    "shorted_lower",
+    "noisy_upper",
+    "noisy_lower",
+)
 _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 
 
@@ -72,6 +81,18 @@ class Faults:
     """It says to be of another product."""
     wrong_layout: bool = False
     """It gives another layout hash."""
+    open_upper: int | None = None
+    """This upper wire is broken. Wires are counted from 0, and are sound while a node tares at power-on."""
+    open_lower: int | None = None
+    """This lower wire is broken."""
+    shorted_upper: int | None = None
+    """This upper wire touches all lower wires."""
+    shorted_lower: int | None = None
+    """This lower wire touches all upper wires."""
+    noisy_upper: int | None = None
+    """This upper wire has a bad contact: a noise of 0.3 % of each resistance."""
+    noisy_lower: int | None = None
+    """This lower wire has such a contact."""
     restart_every_s: float = 0.0
     """It resets itself this often; 0: never."""
     emcy_per_s: float = 0.0
@@ -87,6 +108,9 @@ class Faults:
             total = math.fsum(getattr(self, name) for name in names)
             if total > 1.0 + 1e-9:
                 raise ConfigError(" + ".join(names), total, "at most 1 together")
+        for name in OF_WIRES:
+            if (wire := getattr(self, name)) is not None and wire < 0:
+                raise ConfigError(name, wire, "an integer of at least 0")
         for name in _RATES:
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ConfigError(name, getattr(self, name), "a number of at least 0")
@@ -117,6 +141,8 @@ class Injected:
     """Frames that the node would have heard."""
     frozen: int = 0
     """Readings that were those of before."""
+    miswired: int = 0
+    """Readings with a wire open, shorted or noisy."""
     unplugged: int = 0
     restarts: int = 0
     """Resets by ``restart_every_s``."""
@@ -133,7 +159,20 @@ class Injected:
 NO_FAULTS: Final = Faults()
 
 
-def parse_faults(text: str) -> Faults:
+def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]:
+    """Faults of each patch from texts such as ``lost=0.01,silent``, of all, and ``palm:open_upper=3``, of it;
+    what comes later is added. Raises ConfigError as :func:`parse_faults`, and for no patch of the hand."""
+    found = dict.fromkeys(patches, NO_FAULTS)
+    for text in texts:
+        patch, colon, listed = text.rpartition(":")
+        if colon and patch not in found:
+            raise ConfigError("--fault", patch, f"a patch of the hand: {', '.join(patches)}")
+        for name in [patch] if colon else patches:
+            found[name] = parse_faults(listed, found[name])
+    return found
+
+
+def parse_faults(text: str, added_to: Faults = NO_FAULTS) -> Faults:
     """Faults from ``lost=0.01,restart_every_s=2,silent``. Raises ConfigError for a name or value that cannot
     be."""
     kinds = {field.name: type(field.default) for field in dataclasses.fields(Faults)}
@@ -146,7 +185,7 @@ def parse_faults(text: str) -> Faults:
             values[name] = _value(kinds[name], value)
         except ValueError:
             raise ConfigError(f"--fault {name}", value, _allowed(kinds[name])) from None
-    return Faults(**values)  # type: ignore[arg-type]  # each of the kind of its field
+    return dataclasses.replace(added_to, **values)  # type: ignore[arg-type]  # each of the kind of its field
 
 
 def _value(kind: type, text: str) -> int | float | bool:

@@ -17,13 +17,15 @@ from skinnode.node.nmt import NmtCommand
 from skinnode.node.source import ResistanceSource
 from skinnode.wire import indices as od
 from skinnode.wire.profile import PatchProfile
-from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS, Faults, Injected
+from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS, OF_WIRES, Faults, Injected
 
 BABBLE_COB_ID: Final = 0x3F0
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F, error register: generic and manufacturer's."""
 _MOST_AT_ONCE: Final = 32
 """Frames of a storm that are sent in one turn at most: nobody saves up for a burst."""
+WIRE_NOISE: Final = 3e-3
+"""Standard deviation of a resistance through a bad contact, relative."""
 _CHUNK_COUNTER_BYTE: Final = 1
 _SUMMARY_COUNTER_BYTE: Final = 0
 
@@ -79,8 +81,28 @@ class FaultyNode(PatchNode):
         if self.faults.frozen and self._reading is not None:
             self.injected.frozen += 1
         else:
-            self._reading = self._source.read(t_ns)
+            self._reading = self._miswired(self._source.read(t_ns))
         return self._reading
+
+    def _miswired(self, read: Float) -> Float:
+        """A reading through wires that are not all sound."""
+        faults = self.faults
+        if all(getattr(faults, name) is None for name in OF_WIRES) or self.nmt_state is NmtState.INITIALISING:
+            return read
+        self.injected.miswired += 1
+        read = read.copy()
+        for wire, ohm in ((faults.noisy_upper, read), (faults.noisy_lower, read.T)):
+            if wire is not None:
+                ohm[wire] *= 1.0 + WIRE_NOISE * self._random.standard_normal(ohm.shape[1])
+        for wire, ohm, value in (
+            (faults.shorted_upper, read, 0.0),
+            (faults.shorted_lower, read.T, 0.0),
+            (faults.open_upper, read, np.inf),
+            (faults.open_lower, read.T, np.inf),
+        ):
+            if wire is not None:
+                ohm[wire] = value
+        return read
 
     # --- what drives it
 

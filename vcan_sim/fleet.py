@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
-from skinnode.errors import BusError
+from skinnode.errors import BusError, ConfigError
 from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner
@@ -16,7 +16,7 @@ from skinnode.node.source import ResistanceSource
 from skinnode.transport import CanPort, Frame
 from skinnode.wire.indices import chunk_cob_id, summary_cob_id
 from skinnode.wire.profile import PatchProfile
-from vcan_sim.faults import NO_FAULTS, Faults, Injected
+from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
@@ -111,7 +111,9 @@ class Fleet:
         return tuple(station.report() for station in self._stations.values())
 
     def inject(self, faults: Faults, patch: str | None = None) -> None:
-        """From now on these faults and no others, on one patch or on all; the seed is that of the start."""
+        """From now on these faults and no others, on one patch or on all; the seed is that of the start.
+
+        Raises ConfigError for a wire that a patch does not have."""
         for name, station in self._stations.items():
             if patch in (None, name):
                 station.inject(faults)
@@ -177,9 +179,10 @@ class _Station:
     ) -> None:
         self.source = source
         self._converter = wire_up(source)
-        self._profile, self._config, self._faults = profile, config, faults
+        self._profile, self._config = profile, config
         self._pdo_ids = {chunk_cob_id(config.node_id), summary_cob_id(config.node_id)}
         self._node: FaultyNode | None = None
+        self.inject(faults)
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
@@ -198,6 +201,9 @@ class _Station:
         return self._node
 
     def inject(self, faults: Faults) -> None:
+        for name, wires in zip(OF_WIRES, 3 * self.source.scene.layout.shape, strict=True):
+            if (wire := getattr(faults, name)) is not None and wire >= wires:
+                raise ConfigError(f"{self._config.name}: {name}", wire, f"an integer from 0 to {wires - 1}")
         self._faults = faults
         if self._node is not None:
             self._node.faults = faults

@@ -116,7 +116,7 @@ class Scene:
     def contacts(self, t_s: float) -> tuple[HertzContact, ...]:
         """What touches the patch at scene time ``t_s``."""
         index, since = divmod(t_s - self.lead_s, self.simulation.cycle_s)
-        if index < 0:
+        if index < 0 or self.simulation.depth == 0.0:
             return ()
         contact = self.stroke(int(index)).contact(self.rubber, since)
         return () if contact is None else (contact,)

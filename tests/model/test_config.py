@@ -210,7 +210,7 @@ def test_example_says_the_defaults() -> None:
             "patches[0].calibration.upper_gain: got [1.0, 1.01], "
             "allowed: 10 numbers, one for each upper wire",
         ),
-        (["simulation", "depth"], 1.0, "simulation.depth: got 1.0, allowed: a number between 0 and 1"),
+        (["simulation", "depth"], 1.0, "simulation.depth: got 1.0, allowed: a number from 0 to below 1"),
     ],
 )
 def test_one_line_a_mistake(path: list[str | int], value: Any, line: str) -> None:

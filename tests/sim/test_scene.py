@@ -28,6 +28,12 @@ def test_rests_before_the_first_touch_and_between_strokes() -> None:
     assert play.contacts(play.lead_s + 0.5 * OPTIONS.cycle_s)
 
 
+def test_a_depth_of_nothing_is_a_hand_at_rest() -> None:
+    play = scene(options=OPTIONS.model_copy(update={"depth": 0.0}))
+    for t in play.lead_s + np.linspace(0.0, 2 * OPTIONS.cycle_s, 50):
+        np.testing.assert_array_equal(play.upper_m(t), LAYOUT.upper_m)
+
+
 @pytest.mark.parametrize("number", range(4))
 def test_a_stroke_presses_slides_and_lifts_as_configured(number: int) -> None:
     play = scene(number)

@@ -10,7 +10,7 @@ from typing import Final
 import markdown_text as md
 
 from skinnode.host.health import Condition
-from vcan_sim.faults import OF_CHUNKS, OF_SCANS, Faults
+from vcan_sim.faults import OF_CHUNKS, OF_SCANS, OF_WIRES, Faults
 
 _PLAIN: Final = {
     "NEVER_SEEN": "Nothing was heard of it since the host started.",
@@ -37,6 +37,8 @@ def faults() -> str:
         value = kinds.get(str(kind), "share of the frames")
         if name in (*OF_CHUNKS, *OF_SCANS):
             value = "share of the chunks" if name in OF_CHUNKS else "share of the scans"
+        elif name in OF_WIRES:
+            value = "number of a wire"
         elif name.endswith("_s"):
             value = "seconds" if name.startswith("restart") else "a second"
         rows.append((md.code(name), value, docs.get(name, "Does not arrive.")))

@@ -23,8 +23,8 @@ class SimulationConfig(Table):
     """Of the noise and of where each indenter presses."""
     indenter_radius_m: Length = 0.04
     """Radius of the sphere that presses."""
-    depth: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False), Allowed("a number between 0 and 1")] = 0.1
-    """Deepest indentation as a share of the height of the upper layer."""
+    depth: Ratio = 0.1
+    """Deepest indentation as a share of the height of the upper layer; 0: nothing touches the hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3
     )

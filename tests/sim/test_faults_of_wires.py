@@ -1,0 +1,91 @@
+"""Wires that are broken, shorted or noisy, of the patch that is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skinnode.errors import ConfigError
+from skinnode.model.config import parse_hand
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.node import NmtState
+from skinnode.wire.profile import PatchProfile
+from vcan_sim.faults import NO_FAULTS, Faults, faults_of
+from vcan_sim.faulty_node import WIRE_NOISE, FaultyNode
+from vcan_sim.fleet import Fleet
+
+SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
+HAND = parse_hand(
+    {
+        "buses": [{"name": "can0", "interface": "virtual"}],
+        "patches": [{"name": name, "node_id": i, "layout": SHAPE} for i, name in enumerate(("a", "b"), 1)],
+    }
+)
+REST_OHM = np.arange(1.0, 49.0).reshape(4, 12)
+
+
+class Steady:
+    def __init__(self, layout: PatchLayout) -> None:
+        assert layout.shape == REST_OHM.shape
+
+    def read(self, t_ns: int) -> Float:
+        return REST_OHM
+
+
+def node_with(faults: Faults) -> FaultyNode:
+    patch = HAND.patches[0]
+    layout = patch.layout.build()
+    return FaultyNode(
+        1,
+        layout,
+        Steady(layout),
+        emit=lambda can_id, data, *, remote=False: None,
+        on_sent=lambda can_id: None,
+        serial=1,
+        profile=PatchProfile.from_config(patch, HAND.buses[0]),
+        faults=faults,
+    )
+
+
+def test_what_the_converter_sees() -> None:
+    node = node_with(Faults(open_upper=2, shorted_lower=5, noisy_upper=0))
+    np.testing.assert_array_equal(node.read(0), REST_OHM)  # before it is up: the tare
+    node.power_on(0)
+    node.on_timer(10**9)
+    assert node.nmt_state is NmtState.PRE_OPERATIONAL
+    seen = np.array([node.read(i) for i in range(400)])
+    assert np.isinf(seen[:, 2]).all()  # a pair with both stays open
+    assert (seen[:, [0, 1, 3], 5] == 0.0).all()
+    sound = np.delete(seen, 5, axis=2)
+    np.testing.assert_array_equal(sound[:, [1, 3]] - np.delete(REST_OHM, 5, axis=1)[[1, 3]], 0.0)
+    ratio = sound[:, 0] / np.delete(REST_OHM, 5, axis=1)[0]
+    assert ratio.std() == pytest.approx(WIRE_NOISE, rel=0.06)  # 4400 values: ±1.1 %
+    assert node.injected.miswired == 400
+    node.faults = NO_FAULTS
+    np.testing.assert_array_equal(node.read(0), REST_OHM)
+
+
+def test_of_one_patch_or_of_all() -> None:
+    found = faults_of(["lost=0.5", "b:open_upper=3,silent", "b:noisy_lower=0"], ["a", "b"])
+    assert found == {
+        "a": Faults(lost=0.5),
+        "b": Faults(lost=0.5, open_upper=3, silent=True, noisy_lower=0),
+    }
+    assert faults_of([], ["a"]) == {"a": NO_FAULTS}
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("c:silent", "--fault: got 'c', allowed: a patch of the hand: a, b"),
+        ("a:open_upper=4", "a: open_upper: got 4, allowed: an integer from 0 to 3"),
+        ("a:noisy_lower=12", "a: noisy_lower: got 12, allowed: an integer from 0 to 11"),
+        ("a:open_upper=-1", "open_upper: got -1, allowed: an integer of at least 0"),
+        ("a:open_upper=x", "--fault open_upper: got 'x', allowed: an integer"),
+    ],
+)
+def test_what_cannot_be(text: str, line: str) -> None:
+    fleet = Fleet(HAND)
+    with pytest.raises(ConfigError) as caught:
+        fleet.inject(faults_of([text], ["a", "b"])["a"], "a")
+    assert str(caught.value) == line

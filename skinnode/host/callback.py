@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import threading
 from collections.abc import Callable
@@ -75,7 +76,11 @@ class Callbacks:
         self._all: list[FieldCallback] = []
 
     def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
-        """A new one, running."""
+        """A new one, running. Raises TypeError for what cannot be called, or would have to be awaited."""
+        if not callable(function):
+            raise TypeError(f"function: got {function!r}, must be a function of a field")
+        if inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(type(function).__call__):
+            raise TypeError(f"function: got async {_name(function)}, must not be (see async for)")
         self._all = [callback for callback in self._all if not callback.ended]
         callback = FieldCallback(function, fields)
         self._all.append(callback)

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.publish import check_capacity
 
 _log = logging.getLogger(__name__)
 
@@ -85,8 +86,7 @@ class Events:
 
     def subscribe(self, capacity: int) -> EventSubscription:
         """Raises ValueError for a capacity below 1."""
-        if capacity < 1:
-            raise ValueError(f"capacity: got {capacity}, must be at least 1")
+        check_capacity(capacity)
         subscription = EventSubscription(capacity)
         with self._lock:
             self._subscriptions.add(subscription)

@@ -259,7 +259,7 @@ class Host:
     ) -> FieldCallback:
         """Call ``function`` with each field from now on, on a thread of its own, until the host closes or the
         callback returned is closed. A function that blocks or raises loses its own fields, counted there.
-        Arguments as of :meth:`fields`."""
+        Arguments as of :meth:`fields`. Raises TypeError for what is no function, or an ``async`` one."""
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
 
     def latest(self, patch: str) -> FieldFrame | None:

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from skinnode.host.health import SCANS_MISSED, Condition
-from skinnode.host.publish import Subscription
+from skinnode.host.publish import Subscription, check_timeout
 from skinnode.model.frames import FieldFrame
 
 LATE: Final = "late"
@@ -109,6 +109,7 @@ class HandSubscription:
     with patches missing."""
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:
+        check_timeout(timeout_s)
         self._fields, self._gatherer, self._timeout_s = fields, gatherer, timeout_s
 
     @property
@@ -171,6 +172,7 @@ class HandSubscription:
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
         """Raises queue.Empty after ``timeout_s``."""
+        check_timeout(timeout_s)
         end_ns = _end_ns(timeout_s)
         while (frame := self._gatherer.next(time.monotonic_ns())) is None:
             try:

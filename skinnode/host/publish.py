@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import queue
+import threading
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
@@ -29,6 +30,18 @@ class _End:
 
 _Item = FieldFrame | _Failure | _End
 _END: Final = _End()
+
+
+def check_timeout(timeout_s: float | None) -> None:
+    """Raises ValueError for one that nobody can wait for."""
+    if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
+        raise ValueError(f"timeout_s: got {timeout_s!r}, must be None or 0 to {threading.TIMEOUT_MAX:.0f}")
+
+
+def check_capacity(capacity: int) -> None:
+    """Raises ValueError for one that is no number of items."""
+    if not isinstance(capacity, int) or capacity < 1:
+        raise ValueError(f"capacity: got {capacity!r}, must be at least 1, an integer")
 
 
 class Subscription:
@@ -66,10 +79,12 @@ class Subscription:
     def take(self, timeout_s: float | None) -> FieldFrame | None:
         """The next field, or None when the host has closed. Raises queue.Empty after ``timeout_s`` and the
         SkinError that stopped the host, if one did."""
+        check_timeout(timeout_s)
         return self._open(self._queue.get(timeout=timeout_s))
 
     async def take_async(self, timeout_s: float | None) -> FieldFrame | None:
         """As :meth:`take`, in an event loop."""
+        check_timeout(timeout_s)
         loop, arrived, key = asyncio.get_running_loop(), asyncio.Event(), object()
 
         def wake() -> None:
@@ -177,9 +192,10 @@ class Publisher:
         self._last: _Item | None = None
 
     def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
-        """A subscription to one patch, or to all. Raises ValueError for a capacity below 1 or no patch."""
-        if capacity < 1:
-            raise ValueError(f"capacity: got {capacity}, must be at least 1")
+        """A subscription to one patch, or to all. Raises ValueError for a capacity below 1, a timeout that is
+        none, or no patch."""
+        check_capacity(capacity)
+        check_timeout(timeout_s)
         if patch is not None and patch not in self._patches:
             raise ValueError(f"patch: got {patch!r}, must be one of {', '.join(sorted(self._patches))}")
         wanted = self._patches if patch is None else frozenset([patch])

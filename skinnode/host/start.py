@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -41,8 +42,10 @@ def bring_up_all(
     """Those that are there, ready to start. The first failure stops the others at their next transfer.
 
     Raises what the bring-up of a node raises, NodeTimeout or BusError for silence unless it is to be waited
-    for, BringUpCancelled.
+    for, BringUpCancelled; ValueError for a deadline that no clock reaches.
     """
+    if not 0 <= deadline_s < math.inf:
+        raise ValueError(f"boot_deadline_s: got {deadline_s!r}, must be finite and not negative")
     over = threading.Event()
     answered: list[PatchConfig] = []
 

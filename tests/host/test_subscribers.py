@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import functools
 import logging
 import threading
 from collections.abc import Callable
@@ -199,6 +200,42 @@ def test_a_failure_of_the_host_ends_callbacks(publisher: Publisher) -> None:
     callback = FieldCallback(lambda one: None, publisher.subscribe(10, None, None))
     publisher.fail(BusError("gone"))
     assert eventually(lambda: callback.ended)
+
+
+@pytest.mark.parametrize("boot_deadline_s", [float("nan"), float("inf"), -1.0])
+def test_a_deadline_that_never_comes_is_refused(hand: HandConfig, boot_deadline_s: float) -> None:
+    with (
+        pytest.raises(ValueError, match=r"boot_deadline_s: got .*, must be finite and not negative"),
+        Host.from_config(hand, boot_deadline_s=boot_deadline_s),
+    ):
+        pytest.fail("it runs")
+
+
+def test_what_cannot_be_waited_for_counted_or_called_is_refused_at_once(
+    hand: HandConfig, fleet: Fleet
+) -> None:
+    class Awaited:
+        async def __call__(self, one: FieldFrame) -> None: ...
+
+    async def awaited(one: FieldFrame) -> None: ...
+
+    with Host.from_config(hand) as host:
+        for timeout_s in (float("nan"), float("inf"), -1.0, 1e10):
+            with pytest.raises(ValueError, match=r"timeout_s: got .*, must be None or 0 to"):
+                host.fields(timeout_s=timeout_s)
+            with pytest.raises(ValueError, match=r"timeout_s: got .*, must be None or 0 to"):
+                host.hands(timeout_s=timeout_s)
+            with pytest.raises(ValueError, match=r"timeout_s: got .*, must be None or 0 to"):
+                host.fields().get(timeout_s)
+            with pytest.raises(ValueError, match=r"timeout_s: got .*, must be None or 0 to"):
+                asyncio.run(host.fields().take_async(timeout_s))
+        for capacity in (float("nan"), 1.5, 0):
+            for subscribe in (host.fields, host.hands, host.events):
+                with pytest.raises(ValueError, match=r"capacity: got .*, must be at least 1, an integer"):
+                    subscribe(capacity=capacity)
+        for function in (3, None, awaited, Awaited(), functools.partial(awaited)):
+            with pytest.raises(TypeError, match=r"function: got .*, must"):
+                host.on_field(function)
 
 
 def arrays_of(record: object) -> list[np.ndarray]:

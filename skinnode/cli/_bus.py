@@ -55,11 +55,11 @@ def find_bus(
     from pydantic import ValidationError
 
     from skinnode.errors import ConfigError
-    from skinnode.model.config import BusConfig, load_hand
+    from skinnode.model.config import BusConfig
 
     if hand is None:
         if bus is not None:
-            raise ConfigError("--bus", bus, "nothing without --hand")
+            raise ConfigError("--bus", bus, "nothing without a hand file")
         try:
             config = BusConfig(
                 name=channel or "can0",
@@ -73,16 +73,26 @@ def find_bus(
             option = "--bitrate" if wrong["loc"][0] == "bitrate_bps" else f"--{wrong['loc'][0]}"
             raise ConfigError(option, wrong["input"], "a bit rate from 10000 to 1000000") from None
         return Place(config, None)
-    plan = load_hand(hand).on(interface, channel)
+    plan = find_hand(hand, interface, channel, bitrate, fd)
     names = [item.name for item in plan.buses]
-    for option, value in (("--bitrate", bitrate), ("--fd", fd or None)):
-        if value is not None:
-            raise ConfigError(option, value, "nothing beside --hand, which says it")
     if bus is None and len(names) > 1:
         raise ConfigError("--bus", bus, f"one of {', '.join(names)}")
     if bus is not None and bus not in names:
         raise ConfigError("--bus", bus, f"one of {', '.join(names)}")
     return Place(plan.bus(bus or names[0]), plan)
+
+
+def find_hand(
+    hand: Path, interface: str | None, channel: str | None, bitrate: int | None, fd: bool
+) -> HandConfig:
+    """The hand of that file, on another interface or channel if they are given. Raises ConfigError."""
+    from skinnode.errors import ConfigError
+    from skinnode.model.config import load_hand
+
+    for option, value in (("--bitrate", bitrate), ("--fd", fd or None)):
+        if value is not None:
+            raise ConfigError(option, value, "nothing beside a hand file, which says it")
+    return load_hand(hand).on(interface, channel)
 
 
 def find_node(node: str, place: Place) -> int:

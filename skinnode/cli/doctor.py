@@ -36,7 +36,7 @@ def doctor(
     the skin alone meanwhile. Exit status 0 if nothing was found, 1 if something
     was, 2 if it could not run.
     """
-    from skinnode.cli._bus import find_bus
+    from skinnode.cli._bus import find_bus, find_hand
     from skinnode.cli._console import print_json, progress
     from skinnode.cli._files import require_writable, write_text
     from skinnode.doctor.checks import diagnose
@@ -51,9 +51,7 @@ def doctor(
         place = find_bus(interface, channel, bitrate, fd, hand, bus)
         plan, buses = place.hand, [place.bus]
     else:
-        from skinnode.model.config import load_hand
-
-        plan = load_hand(hand).on(interface, channel)
+        plan = find_hand(hand, interface, channel, bitrate, fd)
         buses = [item for item in plan.buses if plan.patches_on(item.name)]
     with progress(as_json) as tell:
         facts = [gather(item, plan, active=active, progress=tell) for item in buses]

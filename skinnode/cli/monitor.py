@@ -35,7 +35,9 @@ def monitor(
         Path | None,
         typer.Option(help="Look at a recording of `skinnode record`.", metavar="RECORDING"),
     ] = None,
-    speed: Annotated[float, typer.Option(help="Of --replay: 2 is twice as fast.", metavar="X")] = 1.0,
+    speed: Annotated[
+        float | None, typer.Option(help="Of --replay: 2 is twice as fast; default 1.", metavar="X")
+    ] = None,
     simulate: Annotated[
         bool,
         typer.Option(
@@ -67,6 +69,7 @@ def monitor(
     if (hand is not None or simulate) == (replay is not None):
         got = NOTHING if replay is None else Shown("it and --replay")
         raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
+    _require_use(interface, channel, speed, played=replay is not None, simulated=simulate)
     if not output.is_dir():
         raise ConfigError("--output", str(output), "an existing folder")
     from skinnode.host import BringUpCancelled
@@ -75,7 +78,7 @@ def monitor(
     with until_told() as told, ExitStack() as stack:
         try:
             if replay is not None:
-                source = _recording(stack, replay, speed)
+                source = _recording(stack, replay, 1.0 if speed is None else speed)
             else:
                 source = _running(stack, _plan(hand, interface, channel, simulate), told, simulate, as_json)
         except BringUpCancelled:
@@ -85,6 +88,20 @@ def monitor(
         print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
     if faults:
         raise typer.Exit(1)
+
+
+def _require_use(
+    interface: str | None, channel: str | None, speed: float | None, *, played: bool, simulated: bool
+) -> None:
+    """Raises ConfigError for an option that what is looked at has no use for."""
+    from skinnode.errors import ConfigError
+
+    if speed is not None and not played:
+        raise ConfigError("--speed", speed, "nothing without --replay")
+    for option, value in (("--interface", interface), ("--channel", channel)):
+        if value is not None and (played or simulated):
+            allowed = f"nothing beside {'--replay' if played else '--simulate'}, which opens no bus of a hand"
+            raise ConfigError(option, value, allowed)
 
 
 def _require_screen() -> None:

@@ -65,6 +65,9 @@ def test_json_of_a_recording(tmp_path: Path) -> None:
         (["--json", "--simulate", "-o", "/nowhere"], "--output: got '/nowhere', allowed: an existing folder"),
         (["--json", "/nowhere.toml"], "nowhere.toml"),
         (["--json", "--replay", "/nowhere.log"], "nowhere"),
+        (["--json", "--replay", "/x.log", "--interface", "pcan"], "--interface: got 'pcan', allowed: noth"),
+        (["--json", "--simulate", "--channel", "can1"], "--channel: got 'can1', allowed: nothing beside"),
+        (["--json", "--simulate", "--speed", "2"], "--speed: got 2.0, allowed: nothing without --replay"),
     ],
 )
 def test_what_cannot_run_is_one_line(arguments: list[str], said: str) -> None:

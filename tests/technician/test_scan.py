@@ -119,7 +119,7 @@ def test_an_empty_bus_is_a_fault(bus: BusConfig) -> None:
     [
         (["--interface", "no-such"], "interface"),
         (["--interface", "virtual", "--bitrate", "5"], "--bitrate: got 5, allowed: a bit rate from"),
-        (["--bus", "can1"], "--bus: got 'can1', allowed: nothing without --hand"),
+        (["--bus", "can1"], "--bus: got 'can1', allowed: nothing without a hand file"),
         (["--hand", "no/such.toml"], "hand file"),
     ],
 )

@@ -60,7 +60,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "the bus is loaded above what plans allow",
             Sure.CERTAIN,
-            f"{bus.load:.0%} over the last second, {MAX_BUS_LOAD:.0%} allowed",
+            f"{bus.load:.0%} in the busiest second, {MAX_BUS_LOAD:.0%} allowed",
             "a longer sync.period_ms, send mode changed, or fewer patches on this bus",
         )
     if bus.outages:

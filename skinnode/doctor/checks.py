@@ -41,7 +41,7 @@ def not_judged(facts: BusFacts) -> list[str]:
         if patch.found is not None and scans < skin.LEAST_SCANS:
             lines.append(
                 f"{patch.name}: noise, steps and drift: {scans or 'no'} scans came, {skin.LEAST_SCANS} needed"
-                + ("" if facts.running else "; it does not run: --active starts it")
+                + ("" if facts.running or facts.active else "; it does not run: --active starts it")
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(

@@ -113,6 +113,8 @@ class BusFacts:
     """How long was listened."""
     frames: int = 0
     load: float = 0.0
+    """Share of the bus that frames took, in the busiest second in which scans were waited for; in the last
+    one where none could come."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0
@@ -128,6 +130,8 @@ class BusFacts:
     sync_counters: tuple[int, ...] = ()
     """As they came with them; 0 where there was none."""
     sync_ours: bool = False
+    active: bool = False
+    """Whether nodes that do not run were to be started."""
     role: str = "master"
     """Of the host on this bus, as the hand file says."""
     nmt_commands: int = 0

@@ -113,14 +113,14 @@ def _examine(
                 profiles[patch.node_id] = profile
         asked.append(replace(patch, found=node))
     period_s = facts.period_s or DEFAULT_PERIOD_MS * 1e-3
-    ours = _listen(line, capture, asked, profiles, period_s, active, facts.name, progress)
+    ours, load = _listen(line, capture, asked, profiles, period_s, active, facts.name, progress)
     stats = line.link.stats()
     heard = line.heard
     return replace(
         facts,
         seconds=time.monotonic() - begun_s,
         frames=stats.received,
-        load=stats.load,
+        load=max(load, stats.load),
         error_frames=heard.errors,
         dropped=stats.dropped,
         outages=stats.outages,
@@ -130,6 +130,7 @@ def _examine(
         sync_s=np.empty(0) if ours else np.array([t_ns for t_ns, _ in list(capture.syncs)]) * 1e-9,
         sync_counters=() if ours else tuple(counter for _, counter in list(capture.syncs)),
         sync_ours=ours,
+        active=active,
         nmt_commands=heard.cob_ids[od.NMT_COB_ID],
         master_beats_s=None
         if facts.master_node_id is None
@@ -166,8 +167,9 @@ def _listen(
     active: bool,
     name: str,
     progress: Progress,
-) -> bool:
-    """Take scans of the patches that run, or that are made to; whether SYNC was ours."""
+) -> tuple[bool, float]:
+    """Take scans of the patches that run, or that are made to; whether SYNC was ours, and the load of the bus
+    in the busiest second of it."""
     overflows: dict[int, int] = {}
     for node_id, profile in profiles.items():
         overflows[node_id] = _overflow(line, node_id)
@@ -178,13 +180,13 @@ def _listen(
     for node_id in start:
         line.link.send(od.NMT_COB_ID, bytes((_START, node_id)))
     if not running:
-        return False
+        return False, 0.0
     try:
         heard = len(capture.syncs)
         line.wait_until(lambda: len(capture.syncs) > heard, max(_FIRST_SYNC_S, 2.5 * period_s))
         ours = active and len(capture.syncs) == heard
         due_s, end_s = time.monotonic(), time.monotonic() + min(LONGEST_S, 2 * SCANS * period_s)
-        number = 0
+        number, load = 0, 0.0
         while min(map(capture.scans, running)) < SCANS and time.monotonic() < end_s:
             if ours:
                 number += 1
@@ -194,8 +196,9 @@ def _listen(
                 line.link.send(od.SYNC_COB_ID, bytes((counter,)) if counter else b"")
             due_s += period_s
             line.wait_until(lambda: False, max(0.0, due_s - time.monotonic()))
+            load = max(load, line.link.stats().load)
             progress(f"{name}: {min(map(capture.scans, running))} of {SCANS} scans")
-        return ours
+        return ours, load
     finally:
         for node_id in start:
             line.link.send(od.NMT_COB_ID, bytes((_PRE_OPERATIONAL, node_id)))

@@ -19,6 +19,7 @@ from skinnode.technician.line import Line
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 from skinnode.wire.profile import PatchProfile, eds_text
+from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 
 from .conftest import LAYOUT, Done, Rest, run
@@ -234,6 +235,30 @@ def test_the_report_needs_nothing_else(hand_file: HandFile, on: On, tmp_path: Pa
     assert page.tags.count("svg") == 4  # maps and timeline of each patch
     assert not [address for address in page.outside if not address.startswith(("#", "data:"))]
     assert "index: noise on lower wire 4" in report.read_text()
+
+
+def test_load_is_that_of_the_time_in_which_scans_came(
+    hand_file: HandFile, on: On, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where they ended before the doctor did: a node that restarted sends none."""
+    monkeypatch.setattr(gather, "SCANS", 60)  # waited for twice as long, 3 s
+    file = hand_file()
+    fleet = on(Fleet(load_hand(file)))
+    over = threading.Event()
+
+    def unplug() -> None:
+        while fleet.injected("thumb").pdos < 120 and not over.wait(0.01):
+            pass
+        fleet.inject(Faults(unplugged=True))
+
+    thread = threading.Thread(target=unplug)
+    thread.start()
+    done = run(["doctor", file, "--active", "--json"])
+    over.set()
+    thread.join()
+    (bus,) = done.json["buses"]
+    assert 0 < bus["patches"]["thumb"]["scans"] < 60
+    assert bus["load"] > 0.01  # our SYNC alone takes 0.3 %
 
 
 def test_a_report_that_cannot_be_written_is_known_first(hand_file: HandFile, tmp_path: Path) -> None:

@@ -207,4 +207,9 @@ def test_few_scans_are_not_judged() -> None:
     ratio = quiet_ratio()[:10] * 1.05 + 100 * STEP
     bus = bus_of(replace(WELL, scans=scans_of(ratio)))
     assert diagnose(bus) == []
-    assert not_judged(bus) == ["thumb: noise, steps and drift: 10 scans came, 20 needed"]
+    few = "thumb: noise, steps and drift: 10 scans came, 20 needed"
+    assert not_judged(bus) == [few]
+    assert WELL.found is not None
+    stopped = replace(bus.patches[0], found=replace(WELL.found, state="pre-operational"))
+    assert not_judged(replace(bus, patches=(stopped,))) == [f"{few}; it does not run: --active starts it"]
+    assert not_judged(replace(bus, patches=(stopped,), active=True)) == [few]

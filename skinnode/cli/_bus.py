@@ -62,16 +62,18 @@ def find_bus(
             raise ConfigError("--bus", bus, "nothing without a hand file")
         try:
             config = BusConfig(
-                name=channel or "can0",
-                interface=interface or "socketcan",
-                channel=channel or "can0",
+                name="can0" if channel is None else channel[:64],
+                interface="socketcan" if interface is None else interface,
+                channel="can0" if channel is None else channel,
                 bitrate_bps=1_000_000 if bitrate is None else bitrate,
                 fd=fd,
             )
         except ValidationError as error:
             wrong = error.errors()[0]
-            option = "--bitrate" if wrong["loc"][0] == "bitrate_bps" else f"--{wrong['loc'][0]}"
-            raise ConfigError(option, wrong["input"], "a bit rate from 10000 to 1000000") from None
+            if wrong["loc"][0] == "bitrate_bps":
+                raise ConfigError("--bitrate", wrong["input"], "a bit rate from 10000 to 1000000") from None
+            option = "--interface" if wrong["loc"][0] == "interface" else "--channel"
+            raise ConfigError(option, wrong["input"], "a name of printable characters") from None
         return Place(config, None)
     plan = find_hand(hand, interface, channel, bitrate, fd)
     names = [item.name for item in plan.buses]

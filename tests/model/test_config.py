@@ -77,6 +77,9 @@ def test_example_says_the_defaults() -> None:
         assert getattr(spare, part) == getattr(hand, part)
 
 
+NAME = "a text of 1 to 64 printable characters, not all of them blanks"
+
+
 @pytest.mark.parametrize(
     ("path", "value", "line"),
     [
@@ -108,6 +111,22 @@ def test_example_says_the_defaults() -> None:
             ["patches", 1, "name"],
             "thumb",
             "patches[1].name: got 'thumb', allowed: one that patches[0] does not use",
+        ),
+        *(
+            (path, name, f"{key}: got {name!r}, allowed: {NAME}")
+            for name in (
+                "",
+                "  ",
+                "a\nb",
+                "\x1b[31mred",
+                "\u202e",
+            )
+            for path, key in (
+                (["name"], "name"),
+                (["buses", 0, "name"], "buses[0].name"),
+                (["patches", 1, "name"], "patches[1].name"),
+                (["patches", 1, "link"], "patches[1].link"),
+            )
         ),
         (["patches", 0, "node_id"], 0, "patches[0].node_id: got 0, allowed: an integer from 1 to 127"),
         (["patches", 0, "node_id"], 128, "patches[0].node_id: got 128, allowed: an integer from 1 to 127"),
@@ -228,6 +247,15 @@ def test_missing_key() -> None:
         ConfigError, match=r"^patches\[0\]\.node_id: got nothing, allowed: an integer from 1 to 127$"
     ):
         parse_hand(table)
+
+
+def test_a_serial_number_is_of_one_patch() -> None:
+    table = minimal()
+    for patch in table["patches"]:
+        patch["serial"] = 1041
+    with pytest.raises(ConfigError) as caught:
+        parse_hand(table)
+    assert str(caught.value) == "patches[1].serial: got 1041, allowed: one that patches[0] does not use"
 
 
 def test_same_node_id_on_two_buses_is_fine() -> None:

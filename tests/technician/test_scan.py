@@ -119,6 +119,9 @@ def test_an_empty_bus_is_a_fault(bus: BusConfig) -> None:
     [
         (["--interface", "no-such"], "interface"),
         (["--interface", "virtual", "--bitrate", "5"], "--bitrate: got 5, allowed: a bit rate from"),
+        (["--channel", ""], "--channel: got '', allowed: a name of printable characters"),
+        (["--channel", "a\x1b"], "--channel: got 'a\\x1b', allowed: a name of printable characters"),
+        (["--interface", ""], "--interface: got '', allowed: a name of printable characters"),
         (["--bus", "can1"], "--bus: got 'can1', allowed: nothing without a hand file"),
         (["--hand", "no/such.toml"], "hand file"),
     ],

@@ -22,9 +22,9 @@ from skinnode.model.toml_text import Document, read_toml
 class HandConfig(Table):
     """A hand: its buses, its patches and what the host does with them.
 
-    Raises (as part of pydantic's ValidationError; :func:`parse_hand` unwraps it) ConfigError for names or
-    node-IDs used twice, a bus that is not there, an impossible geometry, or a role that a bus cannot have.
-    Whether the plan fits its buses is asked of :func:`skinnode.wire.plan.check_plan`.
+    Raises (as part of pydantic's ValidationError; :func:`parse_hand` unwraps it) ConfigError for names,
+    node-IDs or serial numbers used twice, a bus that is not there, an impossible geometry, or a role that a
+    bus cannot have. Whether the plan fits its buses is asked of :func:`skinnode.wire.plan.check_plan`.
     """
 
     name: Name = "hand"
@@ -85,6 +85,8 @@ class HandConfig(Table):
                 raise ConfigError(f"patches[{i}].bus", patch.bus, f"a bus of this file: {', '.join(names)}")
             _check_geometry(f"patches[{i}]", patch)
         _require_unique("patches", "node_id", [(patch.bus, patch.node_id) for patch in self.patches])
+        serials = [object() if patch.serial is None else patch.serial for patch in self.patches]
+        _require_unique("patches", "serial", serials)
         self._check_roles()
         return self
 

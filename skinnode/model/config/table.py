@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Final, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,17 @@ def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path |
     return path
 
 
-Name = Annotated[str, Field(min_length=1, max_length=64), Allowed("a text of 1 to 64 characters")]
+_NAME: Final = "a text of 1 to 64 printable characters, not all of them blanks"
+
+
+def _printable(value: str) -> str:
+    """Names are printed as they are: nothing in them may steer a terminal or end a line."""
+    if not value.isprintable() or not value.strip():
+        raise ValueError(_NAME)
+    return value
+
+
+Name = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable), Allowed(_NAME)]
 Count = Annotated[int, Field(ge=1, le=254), Allowed("an integer from 1 to 254")]
 NodeId = Annotated[int, Field(ge=1, le=127), Allowed("an integer from 1 to 127")]
 Length = Annotated[

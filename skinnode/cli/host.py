@@ -68,7 +68,7 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)
-            faults = _faults(running)
+            faults = faults_of(running)
     except BringUpCancelled:
         return 0
     masters = any(bus.role == "master" for bus in plan.buses)
@@ -80,7 +80,7 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
     return 1 if faults else 0
 
 
-def _faults(running: Host) -> list[str]:
+def faults_of(running: Host) -> list[str]:
     """What was not as it should be, one line each."""
     from skinnode.host.accounting import losses_of_bus, losses_of_lane
 
@@ -90,9 +90,11 @@ def _faults(running: Host) -> list[str]:
     ]
     for name, lane in stats.patches.items():
         condition = running.health(name).condition
-        begun = lane.offered > 0 or stats.sync.sent > _FIRST_SCANS
-        if condition != "operational" and begun:
+        due = stats.sync.sent + stats.sync.received > _FIRST_SCANS
+        if condition != "operational" and (due or lane.offered > 0):
             found.append(f"{name}: {condition} at the end")
+        elif due and not lane.solved:
+            found.append(f"{name}: no scan was solved")
         found += [f"{name}: {count} {what}" for count, what in losses_of_lane(lane)]
     return found
 

@@ -48,7 +48,8 @@ def record(
 
     Play it with `skinnode replay`; candump's tools and python-can read it too. Killed at any moment, it reads
     up to the last second. What --listen writes has no baselines, so no fields can be made of it: it is for
-    candump's tools. Exit status 1 if frames could not be written, 2 if it could not run.
+    candump's tools. Exit status 1 if frames could not be written, or for what is a fault of `skinnode host`;
+    2 if it could not run.
     """
     from skinnode.model.config import load_hand
     from skinnode.record import Recorder
@@ -57,16 +58,20 @@ def record(
     plan = load_hand(hand).on(interface, channel)
     with until_told() as told, Recorder(plan, output, kind) as recorder:
         _say(as_json, file=str(recorder.path))
-        (_listen if listen else _run)(plan, recorder, told, seconds, as_json)
+        faults = (_listen if listen else _run)(plan, recorder, told, seconds, as_json)
     stats = recorder.stats()
     _say(as_json, frames=stats.frames, dropped=stats.dropped, failure=stats.failure)
-    if stats.dropped or stats.failure:
+    for fault in faults:
+        _say(as_json, note=f"fault: {fault}")
+    if stats.dropped or stats.failure or faults:
         raise typer.Exit(1)
 
 
 def _run(
     plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
-) -> None:
+) -> list[str]:
+    """What was wrong meanwhile, a line each."""
+    from skinnode.cli.host import faults_of
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.pipeline import check_solvable
 
@@ -77,13 +82,14 @@ def _run(
             _say(as_json, note=f"{len(plan.patches)} patches operational; Ctrl-C ends")
             with running.fields(capacity=1) as fields:
                 _follow(recorder, told, seconds, as_json, lambda: fields.get(0.0))
+            return faults_of(running)
     except BringUpCancelled:
-        return
+        return []
 
 
 def _listen(
     plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
-) -> None:
+) -> list[str]:
     from skinnode.errors import SkinError
     from skinnode.host.link import BusLink
     from skinnode.host.tap import tap_link
@@ -99,6 +105,7 @@ def _listen(
         _follow(recorder, told, seconds, as_json)
     if failures:
         raise failures[0]
+    return []
 
 
 def _follow(

@@ -31,17 +31,15 @@ def replay(
     from skinnode.record import replay as play
     from skinnode.signals import until_told
 
-    run = play(recording, speed=None if fast else speed)
-    deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
     with until_told() as told:
+        run = play(recording, speed=None if fast else speed, cancelled=told.is_set)
+        deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
             assert field.stamp is not None  # the host stamps every field
             if as_json:
                 print(json.dumps(field_table(field)), flush=not fast)
             depth_m = float(-field.displacement_m[..., 2].min())
             deepest_m[field.stamp.patch] = max(deepest_m[field.stamp.patch], depth_m)
-            if told.is_set():
-                run.stop()
     faults = _faults(run)
     if as_json:
         print(json.dumps({"patches": _patches(run, deepest_m), "faults": faults}))
@@ -104,6 +102,6 @@ def _faults(run: Replay) -> list[str]:
         found.append(f"{run.strange} frames on channels that no bus of the hand has")
     for name, lane in run.patch_stats().items():
         found += [f"{name}: {count} {what}" for count, what in losses_of_lane(lane)]
-        if not lane.offered:
+        if not lane.offered and not run.stopped:
             found.append(f"{name}: no scan that could be decoded")
     return found

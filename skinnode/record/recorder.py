@@ -63,6 +63,7 @@ class Recorder:
 
     ``path`` is a file ending in .log or .blf, or a folder that is there, where it is named after the hand,
     date and time; the journal lies beside it. Raises ConfigError where one of them exists or cannot be made.
+    A ``with`` block that fails before the first frame leaves neither behind.
     When the disk fails the recording ends, one line in the log says so, and the host goes on.
 
     A recording that begins before the host does replays bit by bit; one that is begun while the host runs
@@ -135,6 +136,9 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+        if error is not None and not self._log.frames:  # nothing worth keeping, and in the way of a retry
+            self.path.unlink(missing_ok=True)
+            self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
 
     def _put(self, entry: _Entry, frames: int) -> None:
         if self._failure is not None or self._queue.qsize() >= CAPACITY:

@@ -41,23 +41,28 @@ _SLICE_S: Final = 0.1
 """How long :meth:`Replay.stop` may go unnoticed."""
 
 
-def replay(path: Path | str, *, speed: float | None = None) -> Replay:
+def _never() -> bool:
+    return False
+
+
+def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[[], bool] = _never) -> Replay:
     """The fields of a recording, as an iterable::
 
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
     ``speed``: 1 at the pace of the recording, 2 twice as fast; None as fast as they are solved. No scan is
-    skipped that was solved live, whatever the speed. Raises ConfigError for a recording that cannot be read
+    skipped that was solved live, whatever the speed. ``cancelled`` is asked all the while; when it says True
+    the iteration ends, as by :meth:`Replay.stop`. Raises ConfigError for a recording that cannot be read
     at all, and for a speed that is not positive.
     """
-    return Replay(Path(path), speed)
+    return Replay(Path(path), speed, cancelled)
 
 
 class Replay:
     """See :func:`replay`. Iterate once; the counters then say what there was."""
 
-    def __init__(self, path: Path, speed: float | None) -> None:
+    def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
         if speed is not None and not 0 < speed < float("inf"):
             raise ConfigError("speed", speed, "a positive number")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
@@ -79,7 +84,7 @@ class Replay:
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Frames that the recorder could not write."""
         self._now_ns = 0
-        self._stopped = False
+        self._stopped, self._cancelled = False, cancelled
         self._publisher = Publisher(tuple(patch.name for patch in self.hand.patches))
         self._buses = {
             bus.name: _Bus(bus, self, [event for event in events if event["bus"] == bus.name])
@@ -100,7 +105,7 @@ class Replay:
         for frame, channel, sent in self.log:
             frame = frame._replace(t_ns=frame.t_ns - self._offset_ns)
             pace.wait_for(frame.t_ns)
-            if self._stopped:
+            if self.stopped:
                 break
             self._now_ns = frame.t_ns
             self._read += 1
@@ -114,7 +119,7 @@ class Replay:
             while (field := fields.get(0.0)) is not None:
                 yield field
         self.log.close()
-        if not self._stopped:
+        if not self.stopped:
             self.incomplete = self._lack()
         for bus in self._buses.values():
             bus.finish()
@@ -132,6 +137,11 @@ class Replay:
     def stop(self) -> None:
         """End the iteration soon; from any thread."""
         self._stopped = True
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was told to end before the end of the recording."""
+        return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
         """How a patch was where the replay is. Raises KeyError for no such patch."""
@@ -151,7 +161,7 @@ class Replay:
 
     def _wait(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds
-        while not self._stopped and (left_s := end_s - time.monotonic()) > 0:
+        while not self.stopped and (left_s := end_s - time.monotonic()) > 0:
             time.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:

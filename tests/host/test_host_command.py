@@ -15,9 +15,11 @@ from pathlib import Path
 import pytest
 
 from skinnode.cli.main import main
-from skinnode.model.config import BusConfig, HandConfig
+from skinnode.model.config import BusConfig, HandConfig, load_hand
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
+from vcan_sim.faults import Faults
+from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, eventually
 
@@ -183,6 +185,18 @@ def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfi
     assert set(errors.splitlines()) <= lost
     for patch in ("thumb", "index"):
         assert f"fault: {patch}: lost at the end" in host.lines
+
+
+def test_summaries_that_are_lost_are_said_and_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_hand(tmp_path, "virtual", "lossy")
+    path.write_text(path.read_text().replace("period_ms = 200", "period_ms = 50"))
+    with Fleet(load_hand(path), faults=Faults(summary_lost=0.5)):
+        assert run(str(path), "--seconds", "2") == 1
+    faults = [line for line in capsys.readouterr().out.splitlines() if line.startswith("fault: ")]
+    for patch in ("thumb", "index"):
+        assert any(re.fullmatch(f"fault: {patch}: [0-9]+ summaries lost", line) for line in faults)
 
 
 def run(*arguments: str) -> int:

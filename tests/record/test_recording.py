@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
+from skinnode.errors import BusError
 from skinnode.host import Host
 from skinnode.model.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.frames import FieldFrame
@@ -199,3 +200,41 @@ def test_listening_writes_what_is_heard_and_sends_nothing(any_bus: BusConfig, tm
     assert heard == []
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert told[-1] == {"frames": len(numbers), "dropped": 0}
+
+
+HAND = """
+[bring_up]
+missing = "wait"
+[sync]
+period_ms = 100
+[[buses]]
+name = "can0"
+interface = "virtual"
+channel = "record"
+[[patches]]
+name = "thumb"
+node_id = 5
+layout = {{ {} }}
+""".format(", ".join(f"{key} = {value}" for key, value in SMALL.items()))
+
+
+@pytest.mark.parametrize("options", [[], ["--listen"]])
+def test_a_recording_that_cannot_begin_leaves_nothing_in_the_way(tmp_path: Path, options: list[str]) -> None:
+    hand, path = tmp_path / "hand.toml", tmp_path / "run.log"
+    hand.write_text(HAND)
+    asked = ["record", str(hand), "-o", str(path), "--seconds", "0.2", *options]
+    done = CliRunner().invoke(app, [*asked, "--interface", "nosuch"])
+    assert isinstance(done.exception, BusError)
+    assert list(tmp_path.iterdir()) == [hand]
+    CliRunner().invoke(app, asked)
+    assert path.exists()
+    assert path.with_suffix(".jsonl").exists()
+
+
+def test_a_recording_without_a_field_is_a_fault_and_stays(tmp_path: Path) -> None:
+    hand, path = tmp_path / "hand.toml", tmp_path / "run.log"
+    hand.write_text(HAND)
+    done = CliRunner().invoke(app, ["record", str(hand), "-o", str(path), "--seconds", "1"])
+    assert done.exit_code == 1
+    assert done.stdout.splitlines()[-1] == "fault: thumb: never seen at the end"
+    assert list(replay(path)) == []

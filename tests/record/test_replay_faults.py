@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +17,7 @@ import pytest
 from skinnode.cli._usage import run
 from skinnode.cli.main import app
 from skinnode.host import Host
-from skinnode.record import Recorder
+from skinnode.record import Recorder, replay
 from vcan_sim.fleet import Fleet
 
 from .test_replay import a_hand
@@ -170,3 +173,31 @@ def test_a_header_that_is_none_is_one_line(recorded: Recorded, play: Play, offse
     assert played.status == 2
     assert len(played.error.splitlines()) == 1
     assert "x.jsonl: line 1" in played.error
+
+
+def test_ctrl_c_ends_a_replay_before_its_first_scan(recorded: Recorded, tmp_path: Path) -> None:
+    path, kept = tmp_path / "x.log", signal.getsignal(signal.SIGINT)
+    path.write_bytes(b"".join(recorded.log))
+    path.with_suffix(".jsonl").write_text("\n".join(map(json.dumps, recorded.journal)))
+    over = threading.Event()
+
+    def interrupt() -> None:
+        while signal.getsignal(signal.SIGINT) is kept:
+            if over.wait(0.01):
+                return
+        os.kill(os.getpid(), signal.SIGINT)
+
+    sender = threading.Thread(target=interrupt)
+    sender.start()
+    begun_s, status = time.monotonic(), 0
+    try:
+        run(app, ["replay", str(path), "--speed", "0.001"])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    finally:
+        over.set()
+        sender.join()
+    assert status == 0
+    assert time.monotonic() - begun_s < 20.0  # it would play for half an hour
+    halted = replay(path, speed=0.001, cancelled=lambda: True)
+    assert (list(halted), halted.incomplete) == ([], None)

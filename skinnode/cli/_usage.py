@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
@@ -69,12 +69,12 @@ def usage_line(error: Any) -> str:
         perhaps = f" ({', '.join(error.possibilities)}?)" if error.possibilities else ""
         message = f"got {error.option_name!r}, allowed: the options of --help{perhaps}"
     elif param is not None and kind == "MissingParameter":
-        message = f"{_name(param)}: got nothing, allowed: {_number(param) or 'a value'}"
+        message = f"{_name(param)}: got nothing, allowed: {_values(param) or 'a value'}"
     elif param is not None and kind == "BadParameter":
         got, _, allowed = message.rpartition(": ")[2].partition(" is not ")
         if error.__cause__ is not None and hasattr(error.__cause__, "errors"):  # pydantic converts for typer
             got, allowed = repr(error.__cause__.errors()[0]["input"]), ""
-        message = f"{_name(param)}: got {got}, allowed: {allowed or _number(param)}"
+        message = f"{_name(param)}: got {got}, allowed: {allowed or _values(param)}"
     else:
         message = message[:1].lower() + message[1:]
     return f"{error.ctx.command_path}: {message}" if error.ctx is not None else message
@@ -87,10 +87,13 @@ def _name(param: Any) -> str:
     return str(param.metavar or param.name.upper())
 
 
-def _number(param: Any) -> str:
-    """Which numbers; empty for what is none. From the parameter, or from its type as click has it."""
+def _values(param: Any) -> str:
+    """Which numbers, or which words; empty for what is neither. From the parameter, or from its type as click
+    has it."""
     converter = getattr(param, "type", param)
     described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
+    if get_origin(described) is Literal:
+        return " or ".join(map(str, get_args(described)))
     name = described.__name__ if isinstance(described, type) else getattr(converter, "name", "")
     number = {"int": "an integer", "float": "a number"}.get(name.partition(" ")[0].replace("integer", "int"))
     low, high = getattr(converter, "min", None), getattr(converter, "max", None)

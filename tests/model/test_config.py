@@ -178,6 +178,14 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
             "newton",
             "solver.operator: got 'newton', allowed: gauss_newton or levenberg_marquardt or dogleg",
         ),
+        *(
+            (
+                ["buses", 0, "options"],
+                {"port": 1, key: [1]},
+                f"buses[0].options.{key}: got [1], allowed: a text, a number, true or false",
+            )
+            for key in ("a", "role")
+        ),
         (
             ["buses", 0, "options"],
             {"bitrate": 500000},

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, field_validator
 
 from skinnode.errors import ConfigError
+from skinnode.model.config.explain import short
 from skinnode.model.config.table import Allowed, Name, NodeId, Table, one_of
 
 MAX_BUS_LOAD: Final = 0.70
@@ -72,12 +73,14 @@ class BusConfig(Table):
     others: Annotated[tuple[OtherFrame, ...], Field(strict=False)] = ()
     """Frames that others send on this bus; the plan counts with them."""
 
-    @field_validator("options")
+    @field_validator("options", mode="before")
     @classmethod
-    def _none_of_ours(cls, value: dict[str, bool | int | float | str]) -> dict[str, bool | int | float | str]:
-        for key in value:
+    def _none_of_ours(cls, value: Any) -> Any:
+        for key, option in value.items() if isinstance(value, dict) else ():
             if key in _OURS:
-                raise ConfigError(key, value[key], "a key of [[buses]] says this already")
+                raise ConfigError(key, short(option), "a key of [[buses]] says this already")
+            if not isinstance(option, bool | int | float | str):
+                raise ConfigError(key, short(option), "a text, a number, true or false")
         return value
 
 

@@ -45,8 +45,9 @@ def monitor(
         ),
     ] = False,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Where the key r records to.", metavar="FOLDER")
-    ] = Path(),
+        str,  # an empty one is no folder
+        typer.Option("--output", "-o", help="Where the key r records to.", metavar="FOLDER"),
+    ] = ".",
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="End after this long; default: at q.", metavar="S")
     ] = None,
@@ -70,8 +71,8 @@ def monitor(
         got = NOTHING if replay is None else Shown("it and --replay")
         raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
     _require_use(interface, channel, speed, played=replay is not None, simulated=simulate)
-    if not output.is_dir():
-        raise ConfigError("--output", str(output), "an existing folder")
+    if not output or not Path(output).is_dir():
+        raise ConfigError("--output", output, "an existing folder")
     from skinnode.host import BringUpCancelled
     from skinnode.signals import until_told
 
@@ -83,7 +84,7 @@ def monitor(
                 source = _running(stack, _plan(hand, interface, channel, simulate), told, simulate, as_json)
         except BringUpCancelled:
             return
-        faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, output)
+        faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, Path(output))
     for fault in faults:
         print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
     if faults:

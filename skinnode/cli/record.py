@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def record(
     hand: Annotated[Path, typer.Argument(help="The hand to record.", metavar="HAND.toml")],
     output: Annotated[
-        Path,
+        str,  # an empty one is no folder
         typer.Option(
             "--output",
             "-o",

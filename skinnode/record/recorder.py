@@ -71,11 +71,11 @@ class Recorder:
     """
 
     def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
-        now, path = datetime.datetime.now().astimezone(), Path(path)
-        if path.is_dir():
+        now, asked, path = datetime.datetime.now().astimezone(), str(path), Path(path)
+        if asked and path.is_dir():
             path = name_in(path, hand, kind, now)
         elif path.suffix not in SUFFIXES:
-            raise ConfigError("recording", str(path), "an existing folder, or a file ending in .log or .blf")
+            raise ConfigError("recording", asked, "an existing folder, or a file ending in .log or .blf")
         self._channels = channels(hand)
         offset_ns = time.time_ns() - time.monotonic_ns()
         self._log = FrameLog(path, tuple(self._channels.values()))

@@ -65,6 +65,8 @@ class Replay:
     def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
         if speed is not None and not 0 < speed < float("inf"):
             raise ConfigError("speed", speed, "a positive number")
+        if not path.name:
+            raise ConfigError("recording", str(path), "a file ending in .log or .blf")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
         """What of the journal could not be read, a line each."""
         self.hand, self.started = header.hand, header.started

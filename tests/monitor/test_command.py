@@ -63,6 +63,7 @@ def test_json_of_a_recording(tmp_path: Path) -> None:
         (["--simulate"], "standard input and output: got no terminal, allowed: one, or --json"),
         (["--json"], "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate and --replay RECORDING"),
         (["--json", "--simulate", "-o", "/nowhere"], "--output: got '/nowhere', allowed: an existing folder"),
+        (["--json", "--simulate", "-o", ""], "--output: got '', allowed: an existing folder"),
         (["--json", "/nowhere.toml"], "nowhere.toml"),
         (["--json", "--replay", "/nowhere.log"], "nowhere"),
         (["--json", "--replay", "/x.log", "--interface", "pcan"], "--interface: got 'pcan', allowed: noth"),

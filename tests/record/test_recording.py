@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
-from skinnode.errors import BusError
+from skinnode.errors import BusError, ConfigError
 from skinnode.host import Host
 from skinnode.model.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.frames import FieldFrame
@@ -238,3 +238,20 @@ def test_a_recording_without_a_field_is_a_fault_and_stays(tmp_path: Path) -> Non
     assert done.exit_code == 1
     assert done.stdout.splitlines()[-1] == "fault: thumb: never seen at the end"
     assert list(replay(path)) == []
+
+
+def test_an_empty_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("hand.toml").write_text(HAND)
+    done = CliRunner().invoke(app, ["record", "hand.toml", "-o", ""])
+    assert isinstance(done.exception, ConfigError)
+    assert str(done.exception) == (
+        "recording: got '', allowed: an existing folder, or a file ending in .log or .blf"
+    )
+    assert list(tmp_path.iterdir()) == [tmp_path / "hand.toml"]
+
+
+@pytest.mark.parametrize("name", ["", ".", "/"])
+def test_what_has_no_name_is_no_recording(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"^recording: got '[./]', allowed: a file ending in .log or .blf$"):
+        replay(name)

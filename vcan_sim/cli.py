@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
+from skinnode.cli._console import counted
 from skinnode.cli._usage import Seconds, run
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def simulate(
         simulated.inject(faults, patch)
     with until_told() as ended, simulated as fleet, short_pauses():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-        _say(f"{len(plan.patches)} patches of {plan.name!r} on {where}; Ctrl-C ends")
+        _say(f"{counted(len(plan.patches), 'patch', 'patches')} of {plan.name!r} on {where}; Ctrl-C ends")
         _watch(fleet, ended.wait, seconds)
         injected = _injected(fleet) if fault else []
     _say(_summary(fleet.report()))
@@ -102,7 +103,8 @@ def _words(state: NmtState) -> str:
 
 def _summary(reports: Sequence[NodeReport]) -> str:
     scans, frames = sum(r.scans_sent for r in reports), sum(r.frames_sent for r in reports)
-    return f"sent {scans} scans in {frames} frames from {len(reports)} nodes"
+    sent, frames_in = counted(scans, "scan"), counted(frames, "frame")
+    return f"sent {sent} in {frames_in} from {counted(len(reports), 'node')}"
 
 
 def _injected(fleet: Fleet) -> list[str]:

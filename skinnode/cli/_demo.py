@@ -320,16 +320,16 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
 def print_report(console: Console, report: Report) -> None:
     """The table at the end, and one line for each fault."""
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
-    table.add_column("patch", vertical="bottom")
+    table.add_column("\npatch")
     for heading in (
         "scans sent/\nsolved/torn",
         "PDOs\nlost",
         "deepest\nµm",
-        "error\nRMS µm",
+        "error\nµm RMS",
         "reported\n± µm",
         "codes\n± µm",
         "in 95 %\ninterval",
-        "last frame to field\np50 / p99 ms",
+        "latency ms\np50 / p99",
     ):
         table.add_column(heading, justify="right")
     for row in report.patches:

@@ -69,7 +69,7 @@ def usage_line(error: Any) -> str:
         perhaps = f" ({', '.join(error.possibilities)}?)" if error.possibilities else ""
         message = f"got {error.option_name!r}, allowed: the options of --help{perhaps}"
     elif param is not None and kind == "MissingParameter":
-        message = f"{_name(param)}: got nothing, allowed: {_values(param) or 'a value'}"
+        message = f"{_name(param)}: got nothing, allowed: {_values(param) or _meant(param)}"
     elif param is not None and kind == "BadParameter":
         got, _, allowed = message.rpartition(": ")[2].partition(" is not ")
         if error.__cause__ is not None and hasattr(error.__cause__, "errors"):  # pydantic converts for typer
@@ -85,6 +85,12 @@ def _name(param: Any) -> str:
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper())
+
+
+def _meant(param: Any) -> str:
+    """The first sentence of its help."""
+    help_text = str(getattr(param, "help", None) or "a value").split(". ")[0].rstrip(".")
+    return help_text[:1].lower() + help_text[1:]
 
 
 def _values(param: Any) -> str:

@@ -101,7 +101,7 @@ def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
     from rich.markup import escape
     from rich.padding import Padding
 
-    from skinnode.cli._console import console
+    from skinnode.cli._console import console, counted
     from skinnode.doctor.checks import not_judged
 
     out = console()
@@ -110,8 +110,8 @@ def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
         scans = sum(patch.scans.scans for patch in known.patches if patch.scans is not None)
         out.print(
             f"[bold]{escape(known.name)}[/bold] ({escape(f'{known.interface} {known.channel}')}): {there} of "
-            f"{len(known.patches)} patches there, {known.frames} frames, {scans} scans in "
-            f"{known.seconds:.1f} s, load {known.load:.0%}"
+            f"{len(known.patches)} patches there, {counted(known.frames, 'frame')}, "
+            f"{counted(scans, 'scan')} in {known.seconds:.1f} s, load {known.load:.0%}"
         )
     colours = {"certain": "red", "likely": "yellow", "possible": "cyan"}
     for finding in findings:
@@ -125,5 +125,6 @@ def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
         out.print("\nnot judged:")
         for line in lines:
             out.print(Padding(escape(line), (0, 0, 0, 10)))
-    count = "1 finding" if len(findings) == 1 else f"{len(findings)} findings"
-    out.print(f"\n{count}" if findings else "\nnothing is wrong with what was looked at")
+    out.print(
+        f"\n{counted(len(findings), 'finding')}" if findings else "\nnothing is wrong with what was looked at"
+    )

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skinnode.cli._console import counted
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -94,8 +96,8 @@ def _print(config: HandConfig, plans: tuple[BusPlan, ...]) -> None:
     from rich.console import Console
 
     console = Console(highlight=False, soft_wrap=True)
-    where = "1 bus" if len(plans) == 1 else f"{len(plans)} buses"
-    patches = "1 patch" if len(config.patches) == 1 else f"{len(config.patches)} patches"
+    where = counted(len(plans), "bus", "buses")
+    patches = counted(len(config.patches), "patch", "patches")
     console.print(
         f"{config.name}: {patches} on {where}, a scan every {config.sync.period_ms} ms", markup=False
     )

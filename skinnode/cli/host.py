@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
+from skinnode.cli._console import counted
 from skinnode.cli._usage import Seconds
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
     try:
         with short_pauses(), Host.from_config(plan, cancelled=told.is_set) as running:
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-            report.note(f"{len(plan.patches)} patches of {plan.name!r} operational on {where}; Ctrl-C ends")
+            patches = counted(len(plan.patches), "patch", "patches")
+            report.note(f"{patches} of {plan.name!r} operational on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)
             faults = faults_of(running)
     except BringUpCancelled:

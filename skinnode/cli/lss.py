@@ -26,7 +26,7 @@ def list_nodes(
 ) -> None:
     """Find all nodes without a node-ID, by fastscan. Changes nothing."""
     from skinnode.cli._bus import find_bus
-    from skinnode.cli._console import console, print_json, progress, table
+    from skinnode.cli._console import console, counted, print_json, progress, table
     from skinnode.technician.line import Line
     from skinnode.technician.survey import find_unconfigured
 
@@ -45,7 +45,7 @@ def list_nodes(
                 str(item.serial_number), f"{item.vendor_id:08X}", f"{item.product_code:08X}", revision
             )
         console().print(listed)
-    typer.echo(f"{len(found)} nodes without a node-ID" + (", and more" if more else ""))
+    typer.echo(f"{counted(len(found), 'node')} without a node-ID" + (", and more" if more else ""))
 
 
 @app.command(name="set")

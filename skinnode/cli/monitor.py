@@ -112,8 +112,8 @@ def _require_screen() -> None:
     from skinnode.errors import ConfigError, Shown
 
     if find_spec("textual") is None:
-        allowed = "it (pip install 'skinnode[tui]', or sh install.sh tui), or --json"
-        raise ConfigError("skinnode monitor", Shown("no textual"), allowed)
+        allowed = "the screen after sh install.sh tui, or --json"
+        raise ConfigError("skinnode monitor", Shown("no textual to draw with"), allowed)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("standard input and output", Shown("no terminal"), "one, or --json")
 
@@ -142,7 +142,7 @@ def _running(
     stack: ExitStack, plan: HandConfig, told: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
     """A host of that hand; ``stack`` ends it. Raises as :meth:`Host.from_config`."""
-    from skinnode.cli._console import progress
+    from skinnode.cli._console import counted, progress
     from skinnode.host import Host
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
@@ -160,7 +160,7 @@ def _running(
             from skinnode.cli._simulated import simulated
 
             stack.enter_context(simulated(plan))
-        tell(f"bringing up {len(plan.patches)} patches")
+        tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
         stack.enter_context(short_pauses())  # it collects before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=told.is_set))

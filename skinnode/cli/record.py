@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
+from skinnode.cli._console import counted
 from skinnode.cli._usage import Seconds
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def _run(
         check_solvable(patch, plan.solver)
     try:
         with Host.from_config(plan, cancelled=told.is_set, tap=recorder) as running:
-            _say(as_json, note=f"{len(plan.patches)} patches operational; Ctrl-C ends")
+            _say(as_json, note=f"{counted(len(plan.patches), 'patch', 'patches')} operational; Ctrl-C ends")
             with running.fields(capacity=1) as fields:
                 _follow(recorder, told, seconds, as_json, lambda: fields.get(0.0))
             return faults_of(running)

@@ -85,7 +85,7 @@ def _as_json(found: Survey, place: Place, faults: list[str]) -> dict[str, object
 
 
 def _print(found: Survey, place: Place, faults: list[str]) -> None:
-    from skinnode.cli._console import console, table
+    from skinnode.cli._console import console, counted, table
 
     out = console()
     if found.nodes:
@@ -109,7 +109,8 @@ def _print(found: Survey, place: Place, faults: list[str]) -> None:
         )
     if found.more_unconfigured:
         out.print("more nodes without a node-ID: skinnode lss list")
-    out.print(f"{len(found.nodes)} nodes on {place.bus.interface} {place.bus.channel}, {found.seconds:.1f} s")
+    nodes = counted(len(found.nodes), "node")
+    out.print(f"{nodes} on {place.bus.interface} {place.bus.channel}, {found.seconds:.1f} s")
     for fault in faults:
         out.print(f"fault: {fault}", markup=False)
 

@@ -246,8 +246,8 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
         (
             "period_ms = 200",
             "periode_ms = 200",
-            ":8:1: sync.periode_ms: got 200, allowed: no such key (did you mean period_ms?); "
-            "the keys here are period_ms, counter_overflow",
+            ":8:1: sync.periode_ms: got a key unknown here, allowed: a key of this table "
+            "(did you mean period_ms?): period_ms, counter_overflow",
         ),
         (
             "period_ms = 200",

@@ -86,21 +86,21 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
         (
             ["patches", 1, "nodeid"],
             3,
-            "patches[1].nodeid: got 3, allowed: no such key (did you mean node_id?); the keys here are "
-            "name, node_id, bus, link, pose, eds, layout, code_bits, serial, relative_noise, baseline, "
-            "calibration",
+            "patches[1].nodeid: got a key unknown here, allowed: a key of this table "
+            "(did you mean node_id?): name, node_id, bus, link, pose, eds, layout, code_bits, "
+            "serial, relative_noise, baseline, calibration",
         ),
         (
             ["colour"],
             "red",
-            "colour: got 'red', allowed: no such key; the keys here are "
+            "colour: got a key unknown here, allowed: a key of this table: "
             "name, buses, patches, sync, bring_up, solver, stream, simulation",
         ),
         (
             ["sync", "overflow"],
             240,
-            "sync.overflow: got 240, allowed: no such key (did you mean counter_overflow?); "
-            "the keys here are period_ms, counter_overflow",
+            "sync.overflow: got a key unknown here, allowed: a key of this table "
+            "(did you mean counter_overflow?): period_ms, counter_overflow",
         ),
         (
             ["patches", 1, "node_id"],
@@ -428,5 +428,7 @@ def test_options_do_not_change() -> None:
 
 def test_a_misspelt_required_key_is_named_as_such() -> None:
     table = {"buses": [{}], "patches": [{"name": "palm", "node_idd": 3}]}
-    with pytest.raises(ConfigError, match=r"patches\[0\]\.node_idd: got 3, .* \(did you mean node_id\?\)"):
+    with pytest.raises(
+        ConfigError, match=r"patches\[0\]\.node_idd: got a key unknown here, .* \(did you mean node_id\?\)"
+    ):
         parse_hand(table)

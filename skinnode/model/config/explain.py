@@ -34,8 +34,8 @@ def first_error(
         unknown = str(location[-1])
         close = difflib.get_close_matches(unknown, keys, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
-        listed = f"no such key{hint}; the keys here are {', '.join(keys)}"
-        return ConfigError(dotted(location), short(first["input"]), listed, where=where(location))
+        listed = f"a key of this table{hint}: {', '.join(keys)}"
+        return ConfigError(dotted(location), Shown("a key unknown here"), listed, where=where(location))
     if kind == "value_error" and cause is not None:
         allowed = str(cause)
     got = NOTHING if kind == "missing" else short(first["input"])

@@ -34,11 +34,12 @@ class FaultBook:
         """A line each."""
         return list(self._found.values())
 
-    def look(self, view: View, real_ns: int) -> None:
-        """Write down what is wrong at ``real_ns``, by the clock of the monitor."""
+    def look(self, view: View, real_ns: int, *, ending: bool = False) -> None:
+        """Write down what is wrong at ``real_ns``, by the clock of the monitor; ``ending``: for the last
+        time, so that nothing is waited for any more."""
         if self._begun_ns is None:
             self._begun_ns = real_ns
-        patient = real_ns - self._begun_ns < SETTLE_NS
+        patient = not ending and real_ns - self._begun_ns < SETTLE_NS
         for patch in view.patches:
             if patch.condition == Condition.OPERATIONAL:
                 self._settled.add(patch.name)
@@ -83,7 +84,7 @@ def watch(
         now_s = time.monotonic()
         ending |= seconds is not None and now_s >= begun_s + seconds
         view = history.add(source.snapshot())
-        faults.look(view, time.monotonic_ns())
+        faults.look(view, time.monotonic_ns(), ending=ending)
         pending += [str(event) for event in source.events()]
         if ending or now_s >= due_s:
             due_s += LINE_S

@@ -37,8 +37,11 @@ def test_json_for_programs(tmp_path: Path, crossing_hand: HandConfig) -> None:
     assert 0 < newest["latency_s"] < 1
 
 
-def test_json_of_a_hand_that_is_not_there_is_a_fault(tmp_path: Path, crossing_hand: HandConfig) -> None:
-    done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", "3.2")
+@pytest.mark.parametrize("seconds", ["1", "3.2"])
+def test_json_of_a_hand_that_is_not_there_is_a_fault(
+    tmp_path: Path, crossing_hand: HandConfig, seconds: str
+) -> None:
+    done = run(str(write_hand(tmp_path, crossing_hand)), "--json", "--seconds", seconds)
     assert done.returncode == 1
     newest = json.loads(done.stdout.splitlines()[-1])
     assert {patch["condition"] for patch in newest["patches"].values()} == {"never seen"}

@@ -42,7 +42,8 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 
 
 def musts(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Every line that has to be reached: what, the figure, the limit as text, whether it is reached."""
+    """Every line that has to be reached: what, the figure, the limit as text, whether it is reached, and
+    whether it is ``absolute``, a time: that is the machine's as well, and fails nothing."""
     found = []
     for row in figures["noise"]:
         if row["method"] == "posterior" and row["height"] == 0.5 and row["sigma"] == 1e-5:
@@ -65,12 +66,13 @@ def musts(figures: dict[str, Any]) -> list[dict[str, Any]]:
             _must(
                 f"ms a frame, {row['what']}", row["us"] / 1e3, f"at most {limit / 1e3:g}", row["us"] <= limit
             )
+            | {"absolute": True}
         )
     return found
 
 
 def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
-    return {"what": what, "value": value, "limit": limit, "reached": bool(reached)}
+    return {"what": what, "value": value, "limit": limit, "reached": bool(reached), "absolute": False}
 
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:

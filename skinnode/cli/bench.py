@@ -103,7 +103,7 @@ def accuracy(
     rounds: Rounds = 31,
 ) -> None:
     """Error against time, noise and code width; coverage of the intervals; time a frame. Exit 1 if a line
-    that must be reached is not."""
+    that must be reached is not; times, which are the machine's as well, fail nothing."""
     from skinnode.cli import _bench_accuracy as bench
 
     _prepare(json, plot)
@@ -115,7 +115,7 @@ def accuracy(
         from skinnode.cli._plot_accuracy import draw
 
         draw(plot, figures)
-    if not all(row["reached"] for row in figures["must"]):
+    if not all(row["reached"] or row["absolute"] for row in figures["must"]):
         raise typer.Exit(1)
 
 

@@ -58,7 +58,7 @@ def test_a_replay_gives_the_bits_of_the_live_run(tmp_path: Path, suffix: str) ->
     assert recorder.stats().dropped == 0
     run = replay(path)
     again = {key(field): field for field in run}
-    assert (run.log.damaged, run.complaints, run.ended) == (0, [], True)
+    assert (run.log.damaged, run.complaints, run.ended, run.incomplete) == (0, [], True, None)
     assert set(again) >= set(live)
     for which, field in live.items():
         other = again[which]

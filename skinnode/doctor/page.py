@@ -24,7 +24,7 @@ table { border-collapse: collapse; width: 100% } td, th { text-align: left; padd
 .finding { border-left: .35rem solid; padding: .1rem 0 .1rem .9rem; margin: 1rem 0 }
 .finding p { margin: .15rem 0 } .certain { border-color: #b3261e } .likely { border-color: #c77700 }
 .possible { border-color: #2b6cb0 } .sure { font-variant: small-caps; color: #555 }
-svg { max-width: 100%; height: auto }
+svg { max-width: 100%; height: auto; margin-top: 1.2rem }
 """
 
 
@@ -100,11 +100,11 @@ def _maps(scans: ScanFacts) -> str:
     """Noise over what is told, and R/R0, crossing by crossing."""
     quiet = analyse(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
-    _map(figure, axes[0], quiet.noise / quiet.told, "noise / noise told", "viridis", 0.0, None)
+    _map(figure, axes[0], quiet.noise / quiet.told, "noise / noise told, grey: none", "viridis", 0.0, None)
     off = 100 * (quiet.level - 1.0)
     known = off[np.isfinite(off)]
     limit = max(0.05, float(np.abs(known).max())) if known.size else 1.0
-    _map(figure, axes[1], off, "R/R0 − 1, %", "RdBu", -limit, limit)
+    _map(figure, axes[1], off, "R/R0 − 1, %, grey: none", "RdBu", -limit, limit)
     return _svg(figure)
 
 
@@ -120,7 +120,7 @@ def _map(
 def _timeline(scans: ScanFacts) -> str:
     """When each scan came after its SYNC, and which had holes."""
     figure, (axes,) = _figure(1, 1, height_in=2.6)
-    late_ms = 1e3 * scans.latency_s
+    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # of a scan with holes: no last frame
     if np.isfinite(late_ms).any():
         axes.plot(scans.t_s, late_ms, ".-", color="#2b6cb0", lw=0.8, label="last frame after SYNC, ms")
         axes.set_ylabel("ms after SYNC")
@@ -129,9 +129,11 @@ def _timeline(scans: ScanFacts) -> str:
         axes.set_ylabel("ms since the scan before")
     for number, t_s in enumerate(scans.t_s[~scans.complete]):
         axes.axvline(t_s, color="#b3261e", lw=1, label=None if number else "scan with holes")
-    axes.set(xlabel="s", title="scans", ylim=(0, None))
+    axes.set(xlabel="s", title="scans")
+    axes.margins(y=0.1)
+    axes.set_ylim(bottom=0.0)
     if (~scans.complete).any():
-        axes.legend(frameon=False)
+        figure.legend(loc="outside lower center", ncols=2, frameon=False)
     return _svg(figure)
 
 

@@ -67,19 +67,41 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
     try:
         with short_pauses(), Host.from_config(plan, cancelled=told.is_set) as running:
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-            patches = counted(len(plan.patches), "patch", "patches")
-            report.note(f"{patches} of {plan.name!r} operational on {where}; Ctrl-C ends")
+            report.note(f"{operational(running)} on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)
             faults = faults_of(running)
     except BringUpCancelled:
         return 0
-    masters = any(bus.role == "master" for bus in plan.buses)
-    report.note("nodes are pre-operational" if masters else "nodes are left to their master")
+    report.note(left(plan))
     for fault in faults:
         report.note(f"fault: {fault}")
     if running.stats().malformed:
         return 2
     return 1 if faults else 0
+
+
+def operational(running: Host) -> str:
+    """Who runs by its heartbeat: on the bus of another master, or where one is waited for, not all need."""
+    from skinnode.host.health import OPERATIONAL
+
+    patches, name = running.hand.patches, running.hand.name
+    healths = [running.health(patch.name) for patch in patches]
+    others = [f"{h.patch} {h.condition}" for h in healths if h.nmt_state != OPERATIONAL]
+    if not others:
+        return f"{counted(len(patches), 'patch', 'patches')} of {name!r} operational"
+    up = len(patches) - len(others)
+    return (
+        f"{up} of {counted(len(patches), 'patch', 'patches')} of {name!r} operational ({', '.join(others)})"
+    )
+
+
+def left(plan: HandConfig) -> str:
+    """In what state the nodes are left."""
+    ends = {"master": "pre-operational", "guest": "left to their master"}
+    used = [bus for bus in plan.buses if plan.patches_on(bus.name)]
+    if len({bus.role for bus in used}) == 1:
+        return f"nodes are {ends[used[0].role]}"
+    return "; ".join(f"nodes on {bus.name} are {ends[bus.role]}" for bus in used)
 
 
 def faults_of(running: Host) -> list[str]:

@@ -11,11 +11,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from skinnode.cli.host import left, operational
 from skinnode.cli.main import main
-from skinnode.model.config import BusConfig, HandConfig, load_hand
+from skinnode.host import Host
+from skinnode.model.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
 from vcan_sim.faults import Faults
@@ -23,6 +26,14 @@ from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, eventually
 
+TWO_ROLES: Any = {
+    "buses": [
+        {"name": "can0", "interface": "virtual", "channel": "a"},
+        {"name": "can1", "interface": "virtual", "channel": "b", "role": "guest", "guest_sends": "sdo"},
+    ],
+    "sync": {"period_ms": 80},
+    "patches": [{"name": "palm", "node_id": 1}, {"name": "heel", "node_id": 1, "bus": "can1"}],
+}
 HOST = [sys.executable, "-W", "error", "-c", "from skinnode.cli.main import main; main()", "host"]
 SIMULATOR = [sys.executable, "-W", "error", "-c", "from vcan_sim.cli import main; main()"]
 PATIENCE_S = 60.0
@@ -297,3 +308,16 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--help") == 0
     text = capsys.readouterr().out
     assert all(option in text for option in ("--interface", "--channel", "--seconds", "--json"))
+
+
+def test_what_is_said_of_a_master_that_is_a_guest_too() -> None:
+    """Nothing that holds for one of its buses alone."""
+    assert left(parse_hand(TWO_ROLES)) == (
+        "nodes on can0 are pre-operational; nodes on can1 are left to their master"
+    )
+
+
+def test_who_is_awaited_is_not_called_operational(make_hand: Callable[..., HandConfig]) -> None:
+    hand = make_hand(bring_up={"missing": "wait"})
+    with Fleet(hand.model_copy(update={"patches": hand.patches[:1]})), Host.from_config(hand) as host:
+        assert operational(host) == f"1 of 2 patches of {hand.name!r} operational (p1 never seen)"

@@ -195,6 +195,12 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
+    for patch in patches:  # what its node takes, and answers, whether the plan has one for each node or not
+        ours |= {
+            od.command_cob_id(patch.node_id): f"commands to {patch.name}",
+            od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
+            od.sdo_request_cob_id(patch.node_id): f"SDO requests to {patch.name}",
+        }
     for number, other in enumerate(bus.others):
         key = f"buses[{i}].others[{number}].can_id"
         if other.can_id in ours:

@@ -163,6 +163,33 @@ def test_another_frame_with_an_identifier_of_ours(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("can_id", "whose"),
+    [
+        (0x080, "SYNC"),
+        (0x087, "EMCY of b"),
+        (0x207, "commands to b"),
+        (0x287, "summary of b"),
+        (0x587, "SDO answers of b"),
+        (0x607, "SDO requests to b"),
+        (0x707, "heartbeat of b"),
+        (0x77F, "heartbeat of the host"),
+    ],
+)
+def test_every_identifier_of_ours_is_ours(can_id: int, whose: str) -> None:
+    """Those of the pre-defined connection set (CiA 301 v4.2, 7.3.3) that our nodes send or take."""
+    table = minimal(heartbeat_node_id=127, others=[{"can_id": can_id, "period_ms": 50.0}])
+    table["patches"] = [{"name": "a", "node_id": 3}, {"name": "b", "node_id": 7}]
+    with pytest.raises(ConfigError, match=f"got 0x{can_id:03X}, allowed: .* not that of our {whose}, "):
+        plan_of(parse_hand(table))
+
+
+def test_services_of_all_may_be_others() -> None:
+    """NMT, TIME and LSS of the robot's master."""
+    others = [{"can_id": can_id, "period_ms": 1000.0} for can_id in (0x000, 0x100, 0x7E4, 0x7E5)]
+    plan_of(parse_hand(minimal(others=others)))
+
+
 def test_patch_too_large_for_its_chunk_index() -> None:
     table = minimal()
     table["patches"][0]["layout"] = {"upper_wires": 26}

@@ -83,6 +83,7 @@ def test_writes_and_reads_bytes(bus: BusConfig, powered: Powered) -> None:
         (["1018:256"], "INDEX: got '1018:256'"),
         (["--write", "1"], "--write: got '1', allowed: a value beside INDEX"),
         (["--diff", "no/such.eds"], "a file that can be read"),
+        (["--diff", "/dev/null"], "/dev/null: EDS: got no section DeviceInfo or 1000, allowed: a file"),
         (["--eds", "no/such.eds"], "a file that can be read"),
         (["--dcf", "no/such/folder.dcf"], "--dcf"),
     ],

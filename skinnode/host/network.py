@@ -144,6 +144,10 @@ class RemoteOd:
             raise NodeTimeout(
                 self.node_id, f"{where}: got no answer, allowed: one within {waited_s:.1f} s"
             ) from None
+        if "returned a value for" in str(failure):  # to a question that was not ours, or from another node
+            got = f"{where}: got the answer for another object, allowed: that for this one"
+            why = f"two nodes answer with node-ID {self.node_id}, or another SDO client asks it"
+            raise NodeError(self.node_id, f"{got}; {why}")
         raise NodeError(self.node_id, f"{where}: got {failure}, allowed: an answer of CiA 301") from None
 
 

@@ -160,7 +160,11 @@ def test_a_patch_pulled_out_is_named_and_the_others_go_on(hand: HandConfig, rack
 def test_a_hand_without_one_counted_sync_has_none(
     make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
 ) -> None:
-    hand = changed(make_hand(), bus={"role": "guest", "guest_sends": "sdo"}, sync={"counter_overflow": 0})
+    hand = changed(
+        make_hand(),
+        bus={"role": "guest", "guest_sends": "sdo"},
+        sync={"counter_overflow": 0, "period_ms": 25},
+    )
     rack = rack_of(hand)
     for name in ("p0", "p1"):
         rack.plug(name)

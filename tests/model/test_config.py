@@ -432,3 +432,18 @@ def test_a_misspelt_required_key_is_named_as_such() -> None:
         ConfigError, match=r"patches\[0\]\.node_idd: got a key unknown here, .* \(did you mean node_id\?\)"
     ):
         parse_hand(table)
+
+
+def test_a_guest_says_what_the_master_does() -> None:
+    """Its SYNC period is nobody's default."""
+    table: dict[str, Any] = {
+        "buses": [{"name": "can0"}, {"name": "can1", "role": "guest", "guest_sends": "sdo"}],
+        "patches": [{"name": "palm", "node_id": 1}],
+    }
+    table["buses"][1]["channel"] = "other"
+    with pytest.raises(ConfigError) as caught:
+        parse_hand(table)
+    assert str(caught.value) == (
+        "sync.period_ms: got nothing, allowed: that of the SYNC on can1, where the host is a guest"
+    )
+    assert parse_hand(table | {"sync": {"period_ms": 80}}).sync.period_ms == 80

@@ -113,6 +113,10 @@ class HandConfig(Table):
             if patch.layout.coordinates == "node":
                 allowed = f"preset: on {bus.name} the host is a guest that sends nothing"
                 raise ConfigError(f"patches[{i}].layout.coordinates", "node", allowed)
+        guests = [bus.name for bus in self.buses if bus.role == "guest"]
+        if guests and "period_ms" not in self.sync.model_fields_set:
+            allowed = f"that of the SYNC on {guests[0]}, where the host is a guest"
+            raise ConfigError("sync.period_ms", NOTHING, allowed)
 
 
 def load_hand(path: Path | str) -> HandConfig:

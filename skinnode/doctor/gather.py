@@ -3,12 +3,13 @@ hand that runs goes on as before."""
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.technician.heard import Heard
-from skinnode.technician.info import NodeInfo, read_info
+from skinnode.technician.info import read_info
 from skinnode.technician.line import Line
 from skinnode.technician.sheet import read_profile
 from skinnode.technician.survey import survey
@@ -36,6 +37,9 @@ LONGEST_S: Final = 15.0
 DEFAULT_NOISE: Final = 3e-6
 """Of the converter, where no hand file tells."""
 
+_PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
+"""Before each time a node is asked: a host reads a baseline in 0.1 to 0.3 s."""
+
 _START, _PRE_OPERATIONAL = 1, 128
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -43,6 +47,7 @@ _KNOWN_TO_ALL: Final = frozenset(
 )
 
 Progress = Callable[[str], None]
+Answer = TypeVar("Answer")
 
 
 def gather(
@@ -106,9 +111,9 @@ def _examine(
         node = nodes.get(patch.node_id)
         if node is not None and node.answers and node.is_patch:
             progress(f"{facts.name}: reading {patch.name}")
-            info, failure = _info(line, patch.node_id)
+            info, failure = _asked(functools.partial(read_info, line, patch.node_id))
             patch = replace(patch, info=info, failure=failure)
-            profile = _profile(line, patch.node_id)
+            profile, _ = _asked(functools.partial(read_profile, line.od(patch.node_id)))
             if profile is not None and info is not None:
                 profiles[patch.node_id] = profile
         asked.append(replace(patch, found=node))
@@ -139,23 +144,17 @@ def _examine(
     )
 
 
-def _info(line: Line, node_id: int) -> tuple[NodeInfo | None, str]:
-    """Asked a second time where that fails: a host that runs may have asked the node at the same time, and a
-    server has room for one transfer."""
+def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
+    """The answer, or why there is none. Asked anew where that fails: a host that runs may have asked the node
+    at the same time, and a server has room for one transfer."""
     failure = ""
-    for _ in range(2):
+    for pause_s in _PAUSES_S:
+        time.sleep(pause_s)
         try:
-            return read_info(line, node_id), ""
+            return question(), ""
         except NodeError as error:
             failure = str(error)
     return None, failure
-
-
-def _profile(line: Line, node_id: int) -> PatchProfile | None:
-    try:
-        return read_profile(line.od(node_id))
-    except NodeError:
-        return None
 
 
 def _listen(
@@ -205,10 +204,8 @@ def _listen(
 
 
 def _overflow(line: Line, node_id: int) -> int:
-    try:
-        value = int(line.od(node_id).read(od.SYNC_COUNTER_OVERFLOW, 0, "u8"))
-    except NodeError:
-        return 0
+    read = functools.partial(line.od(node_id).read, od.SYNC_COUNTER_OVERFLOW, 0, "u8")
+    value = int(_asked(read)[0] or 0)
     return value if 2 <= value <= 240 else 0
 
 

@@ -76,12 +76,15 @@ def test_one_number_names_one_instant_on_all_patches(hand: HandConfig, fleet: Fl
     assert all(len(times) == 1 for times in sync_of.values())
 
 
+@pytest.mark.real_time
 def test_field_agrees_with_the_truth_within_what_it_claims(make_hand: Callable[..., HandConfig]) -> None:
     """The simulator knows where the electrodes really are; the host knows nothing but the frames."""
     hand = make_hand(simulation={"cycle_s": 2.0})
     scores: list[float] = []
     with Fleet(hand) as fleet, Host.from_config(hand) as host:
         for field in host.fields(timeout_s=10, capacity=1000):
+            if stamp(field).device_time_us == 0:  # its summary came too late: nobody knows when it was taken
+                continue
             rest_m = hand.patch(stamp(field).patch).layout.build().upper_m
             truth_m = fleet.truth_m(stamp(field).patch, stamp(field).device_time_us) - rest_m
             if (

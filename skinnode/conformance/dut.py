@@ -135,6 +135,22 @@ class Dut:
             raise NotApplicable(f"the EDS has no object 0x{index:04X}:{subindex:02X}")
         return entry
 
+    def need_storage(self, index: int, subindex: int) -> None:
+        """NotApplicable where the device does not store (0x1010) or restore (0x1011) on command: bit 0 of the
+        value (CiA 301, 7.5.2.13 and 7.5.2.14)."""
+        self.need(index, subindex)
+        capability = self.sdo.integer(index, subindex)
+        if not capability & 1:
+            what = "saving on command" if index == STORE else "restoring"
+            entry = f"0x{index:04X}:{subindex:02X}"
+            raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
+
+    def to_defaults(self) -> None:
+        """Reset, with defaults restored where the device does that on command."""
+        if self.eds.find(RESTORE, 1) is not None and self.sdo.integer(RESTORE, 1) & 1:
+            self.restore(1)
+        self.reset()
+
     def store(self, subindex: int, signature: bytes = b"save") -> None:
         """Store parameters (0x1010). What is stored is made good after the case."""
         self.stored = True

@@ -36,15 +36,15 @@ def patch_on(
     interface: str = "virtual",
     *,
     fd: bool = False,
+    stores: bool = True,
 ) -> Iterator[PatchNode]:
     """A running patch of 2 × 6 wires; ``wrap`` may stand between it and its bus."""
     layout = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=6)
     profile = PatchProfile.from_layout(layout, bus="fd" if fd else "classic")
     with CanPort(BusConfig(interface=interface, channel=channel, fd=fd)) as bare:
         port = wrap(bare)
-        node = PatchNode(
-            NODE_ID, layout, Source(layout), send=port.send, profile=profile, memory=VolatileMemory()
-        )
+        memory = VolatileMemory() if stores else None
+        node = PatchNode(NODE_ID, layout, Source(layout), send=port.send, profile=profile, memory=memory)
         with NodeRunner(port, [node]):
             yield node
 

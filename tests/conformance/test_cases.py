@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import uuid
 from collections import Counter
 
 import pytest
 
 from skinnode.conformance import CASES, Case, Dut, Verdict, run_cases
+
+from .conftest import bench_on, patch_on
 
 NOT_APPLICABLE = {
     "SDO-04": "no object with access wo",
@@ -56,3 +59,16 @@ def test_the_cases_are_those_of_the_plan() -> None:
 
 def test_at_least_105_apply_to_a_patch() -> None:
     assert len(CASES) - len(NOT_APPLICABLE) >= 105
+
+
+def test_a_patch_without_memory_fails_only_where_its_sheet_promises_one() -> None:
+    channel = f"no-memory-{uuid.uuid4().hex[:8]}"
+    with patch_on(channel, stores=False), bench_on(channel) as dut:
+        report = run_cases(dut, [case for case in CASES if case.area in ("OD", "SYNC", "SDO", "OTHER")])
+    verdicts = {result.case.id: result for result in report.results}
+    failed = [name for name, result in verdicts.items() if result.verdict is Verdict.FAILED]
+    assert failed == ["OD-02"]
+    assert "0x1010:01" in verdicts["OD-02"].why
+    for name in ("SYNC-08", "SYNC-10"):
+        assert verdicts[name].verdict is Verdict.NOT_APPLICABLE
+        assert "bit 0" in verdicts[name].why

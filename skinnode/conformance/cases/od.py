@@ -62,9 +62,7 @@ def read_communication(dut: Dut) -> None:
 
 @case("OD-02", "Objects of 0x1000 to 0x1FFF have the defaults of the EDS", "7.5.1; CiA 306-1")
 def communication_defaults(dut: Dut) -> None:
-    if dut.eds.find(0x1011, 1) is not None:
-        dut.restore(1)
-        dut.reset()
+    dut.to_defaults()
     _compare_defaults(dut, dut.eds.between(*_COMMUNICATION))
 
 
@@ -141,9 +139,7 @@ def rest_defaults(dut: Dut) -> None:
     entries = [e for e in dut.eds.between(*_REST) if e.default and not e.flags & _REFUSE_READ]
     if not entries:
         raise NotApplicable("no object of the EDS from 0x2000 to 0x9FFF has a default")
-    if dut.eds.find(0x1011, 1) is not None:
-        dut.restore(1)
-        dut.reset()
+    dut.to_defaults()
     _compare_defaults(dut, entries)
 
 

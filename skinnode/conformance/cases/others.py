@@ -12,7 +12,6 @@ from skinnode.conformance.pdo import COB_ID, INVALID
 from skinnode.conformance.sdo import expedited
 
 _EMCY_INHIBIT, _VERIFY, _EMCY = 0x1015, 0x1020, 0x1014
-_ON_COMMAND = 1
 _WRONG_SIGNATURE = (0x0800_0020,)
 _RESTRICTED_VALUE = (0x0609_0030, 0x0609_0031, 0x0609_0032)
 
@@ -25,18 +24,6 @@ RESTRICTED = (
     range(0x701, 0x800),
 )
 """CAN-IDs of NMT, the default SDO and error control, and reserved ones."""
-
-
-def _on_command(dut: Dut, index: int, subindex: int) -> None:
-    """NotApplicable where the device does not store or restore on command."""
-    dut.need(index, subindex)
-    capability = dut.sdo.integer(index, subindex)
-    if index == STORE and not capability & _ON_COMMAND:
-        raise NotApplicable(
-            f"0x1010:{subindex:02X} = 0x{capability:08X}: bit 0, saving on command, is not set"
-        )
-    if index == RESTORE and not capability & 1:
-        raise NotApplicable(f"0x1011:{subindex:02X} = 0x{capability:08X}: bit 0, restoring, is not set")
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
@@ -62,7 +49,7 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
     """Refused, and nothing has changed: neither at once nor after a reset."""
-    _on_command(dut, index, subindex)
+    dut.need_storage(index, subindex)
     before, after = _change(dut)
     # Were it taken for right, what is stored would have to be put back.
     dut.stored = True
@@ -76,7 +63,7 @@ def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
 
 
 def _store(dut: Dut, subindex: int) -> None:
-    _on_command(dut, STORE, subindex)
+    dut.need_storage(STORE, subindex)
     _, after = _change(dut)
     dut.store(subindex)
     dut.reset()
@@ -85,7 +72,7 @@ def _store(dut: Dut, subindex: int) -> None:
 
 def _restore(dut: Dut, subindex: int) -> None:
     """Default values are valid after the next reset, and not before it."""
-    _on_command(dut, RESTORE, subindex)
+    dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
     _, after = _change(dut)
@@ -143,7 +130,7 @@ def restore_communication(dut: Dut) -> None:
 def verify(dut: Dut) -> None:
     dut.need(_VERIFY, 1)
     dut.need(_VERIFY, 2)
-    _on_command(dut, STORE, 1)
+    dut.need_storage(STORE, 1)
     date, time = 15_000, 43_200_000  # days since 1984, ms since midnight
     dut.sdo.write_integer(_VERIFY, 1, date, 4)
     dut.sdo.write_integer(_VERIFY, 2, time, 4)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.cases.sdo import NO_OBJECT, UNKNOWN_COMMAND, check, long_object
-from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, RESET_COMMUNICATION, Dut
+from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, RESET_COMMUNICATION, STORE, Dut
 from skinnode.conformance.sdo import Aborted, mux
 
 _BLOCK_SIZE, _SEQUENCE, _CRC = 0x0504_0002, 0x0504_0003, 0x0504_0004
@@ -150,7 +150,7 @@ def clients_stored(dut: Dut) -> None:
     clients = dut.eds.indices(0x1280, 0x12FF)
     if not clients:
         raise NotApplicable("the EDS has no SDO client (0x1280 to 0x12FF)")
-    dut.need(0x1010, 1)
+    dut.need_storage(STORE, 1)
     index = clients[0]
     for subindex in (1, 2):
         dut.sdo.write_integer(index, subindex, 0x8000_0000, 4)

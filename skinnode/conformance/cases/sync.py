@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from skinnode.conformance.bus import QUIET_S, Failed, describe
 from skinnode.conformance.case import NotApplicable, case
-from skinnode.conformance.dut import Dut
+from skinnode.conformance.dut import STORE, Dut
 from skinnode.conformance.pace import check_period
 from skinnode.conformance.pdo import SYNC_ID, Pdo, drain, mapped, payload_bytes, set_up, sync, tpdos
 from skinnode.conformance.sdo import Aborted, expedited
@@ -137,7 +137,7 @@ def counter(dut: Dut) -> None:
 )
 def counter_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
-    dut.need(0x1010, 1)
+    dut.need_storage(STORE, 1)
     consume_only(dut)
     dut.sdo.write_integer(OVERFLOW, 0, 5, 1)
     produce(dut)
@@ -159,7 +159,7 @@ def overflow_in_use(dut: Dut) -> None:
 @case("SYNC-10", "The overflow value is stored by 0x1010:01 and kept over reset node", "7.5.2.13, 7.5.2.22")
 def overflow_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
-    dut.need(0x1010, 1)
+    dut.need_storage(STORE, 1)
     consume_only(dut)
     dut.sdo.write_integer(OVERFLOW, 0, 5, 1)
     dut.store(1)

@@ -76,11 +76,22 @@ def njit_part(function: _F) -> _F:
 
 def njit(function: _F) -> _F:
     """Compile ``function`` on its first call; the compiled code is kept in :func:`cache_dir`."""
+    return _kept(function, nogil=True)
+
+
+def njit_brief(function: _F) -> _F:
+    """The same for what takes a microsecond: it keeps the interpreter's lock. To let go of it would let
+    another thread in, and that may have it for longer than the whole rest of a field takes."""
+    return _kept(function, nogil=False)
+
+
+def _kept(function: _F, *, nogil: bool) -> _F:
     folder = cache_dir()
     kept = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(folder or "")
     try:  # the cache folder is read here, at decoration; other users of numba keep theirs
-        compiled: _F = numba.njit(cache=folder is not None, no_cfunc_wrapper=True, **_OPTIONS)(function)
+        options = _OPTIONS | {"nogil": nogil, "cache": folder is not None}
+        compiled: _F = numba.njit(no_cfunc_wrapper=True, **options)(function)
     finally:
         numba.config.CACHE_DIR = kept
     return compiled

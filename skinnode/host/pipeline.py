@@ -79,8 +79,9 @@ class Solver:
         field: FieldFrame = self._tracker.update(
             frame.resistance_ohm, frame.valid, np.where(frame.valid, noise, 1.0)
         )
-        field = replace(sealed(field), contacts=tuple(sealed(contact) for contact in field.contacts))
-        return replace(field, stamp=replace(frame.stamp, t_solved_ns=self._clock()))
+        contacts = tuple(sealed(contact) for contact in field.contacts)
+        stamp = replace(frame.stamp, t_solved_ns=self._clock())
+        return sealed(field, contacts=contacts, stamp=stamp)
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:

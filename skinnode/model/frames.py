@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -125,13 +125,17 @@ class FieldFrame:
 _Record = TypeVar("_Record", Contact, FieldFrame)
 
 
-def sealed(record: _Record) -> _Record:
-    """The same with arrays that cannot be written: what many are given, none may change. They are views, and
-    the solver goes on with its own."""
-    views: dict[str, Any] = {}
-    for entry in fields(record):
-        value = getattr(record, entry.name)
+def sealed(record: _Record, **changes: Any) -> _Record:
+    """The same, but for the fields in ``changes``, with arrays that cannot be written: what many are given,
+    none may change. They are views, and the solver goes on with its own."""
+    twin = object.__new__(type(record))  # once a field: ``replace`` takes five times as long
+    for name in _NAMES[type(record)]:
+        value = changes[name] if name in changes else getattr(record, name)
         if isinstance(value, np.ndarray):
-            views[entry.name] = view = value.view()
-            view.setflags(write=False)
-    return replace(record, **views)
+            value = value.view()
+            value.flags.writeable = False
+        object.__setattr__(twin, name, value)
+    return twin
+
+
+_NAMES: Final = {kind: [entry.name for entry in fields(kind)] for kind in (Contact, FieldFrame)}

@@ -67,20 +67,22 @@ class Smoothness:
 
     def __init__(self, problem: PatchProblem) -> None:
         self._problem = problem
-        covariance, self._whitening = _smooth(problem.layout, problem.step_limit)
-        self.covariance: Float = covariance
+        self.covariance: Float
         """(U, n, n)"""
+        self.whitening: Float
+        """(U, N, N) inverse of the Cholesky factor of one coordinate's C."""
+        self.covariance, self.whitening = _smooth(problem.layout, problem.step_limit)
 
     def roughness(self, x: Float) -> Float:
         """(U,) √(uᵀ C⁻¹ u) of x (U, n), in standard deviations."""
         displacement = (x - self._problem.rest).reshape(self._problem.layout.upper_m.shape)
-        return np.asarray(np.sqrt(((self._whitening @ displacement) ** 2).sum(axis=(1, 2))))
+        return np.asarray(np.sqrt(((self.whitening @ displacement) ** 2).sum(axis=(1, 2))))
 
 
 @functools.lru_cache(maxsize=64)
 def _smooth(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """(U, n, n) C for displacements of ``size``, which hardly matters, tenfold either way; (U, N, N) the
-    inverse of its Cholesky factor, of one coordinate."""
+    """(U, n, n) C for displacements of ``size``, which hardly matters, tenfold either way, and the
+    whitening."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

@@ -39,9 +39,11 @@ from skinnode.model.forward import jacobian
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
+from skinnode.solve import frame as around
 from skinnode.solve import operators as op
 from skinnode.solve import wires
-from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
+from skinnode.solve.frame import STALE
+from skinnode.solve.inputs import broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.system import operator_code
 
@@ -52,9 +54,11 @@ BRIDGE_TOLERANCE: Final = 1e-6
 """Of the substeps of a bridge, the paper's intermediate tolerance."""
 FRAME_STEPS: Final = 12
 """Most steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
-WIRE_S: Final = 150e-6
-"""A wire takes no longer for a frame: a dozen steps of 9 µs and its covariance. As many as fit for sure into
-what is left of a deadline are solved in one call; ten calls in place of one cost as much as the ten wires."""
+UNIT_S: Final = 10e-6
+"""An evaluation of F and J and the step from there take no longer. As many wires as fit for sure into what is
+left of a deadline are solved in one call: ten calls in place of one cost as much as the ten wires."""
+WIRE_UNITS: Final = FRAME_STEPS + 1 + wires.COVARIANCE_UNITS
+"""Most evaluations a wire may take for a frame."""
 BRIDGES: Final = (3, 5, 10)
 """Substeps of the bridges tried in turn. On staggered, h = 0.5, from rest: 3 bring every wire through
 a 50 % press between two frames, 5 all but one of 24 through 70 %. Steps halved and doubled, and held to the
@@ -67,8 +71,6 @@ not stop the stream."""
 Z_WIDEN: Final = 3.719
 """Normal deviate of the quantile, 1 − 1e-4, of χ² at which electrodes join: a long press at 100 frames/s
 gains one by chance in 100 s."""
-STALE: Final = 2.0
-"""The J⁺ of a tall system is used again while no equation's share of the weights has changed by more."""
 TINY: Final = 1e-200
 """Far below any square of a slope, and nothing overflows that is divided by it."""
 
@@ -139,7 +141,16 @@ class ExactTracker:
         self._hold = hold
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
         self._active_only = active_only
-        self._evaluations = self._steps = 0  # of the frame at hand
+        self._in_order = np.arange(layout.shape[0])
+        self._leaves_out = active_only or normal_only
+        # of the frame at hand
+        self._ohm, self._noise_now, self._a_now, self._weight_now, self._used = np.empty((5, *layout.shape))
+        self._valid = np.empty(layout.shape, np.bool_)
+        self._todo = np.empty(layout.shape[0], np.uint8)
+        self._good, self._good_now, self._incomplete = np.empty((3, layout.shape[0]), np.bool_)
+        self.status_codes = np.zeros(layout.shape[0], np.int64)
+        """(U,) status of each wire in the last frame."""
+        self._all_converged = as_statuses([op.CONVERGED] * layout.shape[0])
         self._solver = wires.Solver(self._problem, operator_code(operator), normal_only)
         self._rest_branch = self._solver.solve_rest()
         self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
@@ -157,7 +168,6 @@ class ExactTracker:
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
-        wires_all = range(self.layout.shape[0])
         self._x = self._problem.rest.copy()  # last trusted position of each wire, and its a
         self._a = self._problem.a_rest.copy()
         self._solver.inverse[:] = self._rest_inverse
@@ -166,9 +176,9 @@ class ExactTracker:
         self._weight = np.ones(self.layout.shape)  # at which the inverse of each wire was made
         self._unnoticed_weight = np.zeros(self.layout.shape)  # for which self._unnoticed was made
         self._predictable = self._rest_known.copy()  # wires whose inverse in the solver belongs to their x
-        self._order = list(wires_all)  # whose turn it is, where there is a deadline
+        self._order = self._in_order  # whose turn it is, where there is a deadline
         if self._active_only:
-            for u in wires_all:
+            for u in self._in_order.tolist():
                 self._set_electrodes(u, np.arange(0))
             self._predictable[:] = True
 
@@ -196,30 +206,35 @@ class ExactTracker:
         solver.report[:, wires.STATUS] = DEADLINE  # of all that get no turn
         solver.measure[:] = np.inf
         solver.std[:] = np.inf
-        self._evaluations = self._steps = 0
-        self._leave_out(frame)
-        todo = np.where(self._predictable, wires.HOLD if self._hold else wires.PREDICT, wires.SOLVE)
-        if self.layout.shape[1] > self._unknowns.min():
-            tall = (self._unknowns > 0) & (self._unknowns < self.layout.shape[1])
-            # J⁺ was made for other weights: what it trusted may be noise by now
-            todo[tall & _changed(frame.used, self._weight)] = wires.SOLVE
-        turns = self._solve(todo.astype(np.uint8), frame)
-        exhausted = np.zeros_like(turns)  # whatever could be tried has been
+        solver.tally[:] = 0
+        if self._leaves_out:
+            self._leave_out(frame)
+        first = wires.HOLD if self._hold else wires.PREDICT
+        around.choose(self._predictable, first, self._unknowns, frame.used, self._weight, self._todo)
+        self._solve(self._todo, frame)
+        turns: NDArray[np.bool_] | None = None  # all
+        exhausted = np.zeros(len(self._x), bool)  # whatever could be tried has been
+        if frame.until < math.inf or self._active_only:
+            turns = solver.report[:, wires.TURN] == 1
         if self._active_only:
+            assert turns is not None
             unexplained = turns & ~self._explained()
-            for u in [u for u in self._order if unexplained[u]]:
+            for u in [u for u in self._order.tolist() if unexplained[u]]:
                 turns[u] = not frame.expired
                 self._widen(u, frame)
                 exhausted[u] = True
-        good = self._reached()
         held = solver.report[:, wires.HELD] == 1
-        status = solver.report[:, wires.STATUS].copy()
-        if not good.all():
+        status = self.status_codes
+        status[:] = solver.report[:, wires.STATUS]
+        good, every = self._good, self._reached(self._good)
+        if not every:
             status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
             lost = ~good & (status != DEADLINE) & self._solvable(frame)
-            for u in [u for u in self._order if lost[u] and not exhausted[u]]:
+            for u in [u for u in self._order.tolist() if lost[u] and not exhausted[u]]:
                 if frame.expired:
-                    turns[u], status[u] = False, DEADLINE
+                    status[u] = DEADLINE
+                    if turns is not None:
+                        turns[u] = False
                     continue
                 good[u] = self._recover(u, frame)
                 ended = int(solver.report[u, wires.STATUS])
@@ -227,29 +242,31 @@ class ExactTracker:
             solver.std[~good] = np.inf
             self._predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
         residual = solver.measure[:, wires.RESIDUAL].copy()
-        for u in np.flatnonzero(~good).tolist():
-            known = status[u] != DEADLINE and not frame.expired
-            residual[u] = self._held_residual(u, frame) if known else math.inf
-        solved = good & ~held
-        self._x[solved] = solver.x[solved]
-        self._a[solved] = solver.a_solved[solved]
-        for u in np.flatnonzero(solved & (frame.used == 0).any(axis=1)).tolist():
-            missing = frame.used[u] == 0  # what they would have been
-            self._a[u, missing] = 1.0 / (
-                1.0 + self._relative_residual(self._x[u], np.ones(len(missing)))[missing]
-            )
-        self._weight[solved] = frame.used[solved]
+        if not every:
+            for u in np.flatnonzero(~good).tolist():
+                known = status[u] != DEADLINE and not frame.expired
+                residual[u] = self._held_residual(u, frame) if known else math.inf
+        if around.keep(solver.report, good, solver.x, solver.a_solved, frame.used, self._x, self._a,
+                       self._weight, self._incomplete):  # fmt: skip
+            for u in np.flatnonzero(self._incomplete).tolist():
+                missing = frame.used[u] == 0  # what they would have been
+                self._a[u, missing] = 1.0 / (
+                    1.0 + self._relative_residual(self._x[u], np.ones(len(missing)))[missing]
+                )
         self._predictable |= good
-        self._order.sort(key=lambda u: bool(turns[u]))  # who waits comes first, in the order of waiting
-        if turns.all():
-            self._order.sort()
+        if turns is not None:  # who waits comes first, in the order of waiting
+            if turns.all():
+                self._order = self._in_order
+            else:
+                self._order = self._order[np.argsort(turns[self._order], kind="stable")]
         displacement = self._problem.displacement_m(self._x)
+        evaluations, steps = solver.tally.tolist()
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=(solver.std * self.layout.pitch_m).reshape(displacement.shape),
-            status=as_statuses(status.tolist()),
+            status=self._all_converged if every else as_statuses(status.tolist()),
             residual=residual,
-            stats=SolveStats(self._evaluations, self._evaluations, self._steps, perf_counter() - start),
+            stats=SolveStats(evaluations, evaluations, steps, perf_counter() - start),
             force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
             held=held,
         )
@@ -270,47 +287,53 @@ class ExactTracker:
         self._x[wires_], self._a[wires_] = self._problem.rest[wires_], self._problem.a_rest[wires_]
         self._predictable[wires_] = False
 
-    def _solve(self, todo: NDArray[np.uint8], frame: _Frame) -> NDArray[np.bool_]:
-        """Solve the wires in ``todo`` for the frame, in turn where there is a deadline; (U,) who had one."""
-        if frame.until == math.inf:
-            self._call(todo, frame)
-            return np.ones(len(todo), bool)
-        turns = np.zeros(len(todo), bool)
-        waiting = list(self._order)
-        while waiting and not (turns.any() and frame.expired):  # one at least, lest the stream stand still
-            sure = max(1, int((frame.until - perf_counter()) / WIRE_S))
-            chosen, waiting = waiting[:sure], waiting[sure:]
-            turns[chosen] = True
-            share = np.full_like(todo, wires.LEAVE)
-            share[chosen] = todo[chosen]
-            self._call(share, frame)
-        return turns
+    def _solve(self, todo: NDArray[np.uint8], frame: _Frame) -> None:
+        """Solve the wires in ``todo`` for the frame, in turn where there is a deadline: one at least, lest
+        the stream stand still."""
+        units = math.inf
+        while True:
+            if frame.until < math.inf:
+                units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
+            self._call(todo, frame, units=units)
+            if units == math.inf:
+                return
+            todo[self._solver.report[:, wires.TURN] == 1] = wires.LEAVE
+            if not todo.any() or frame.expired:
+                return
 
     def _call(
         self, todo: NDArray[np.uint8], frame: _Frame, a: Float | None = None, last: bool = True,
-        most: int = FRAME_STEPS, method: int | None = None,
+        most: int = FRAME_STEPS, method: int | None = None, units: float = math.inf,
     ) -> None:  # fmt: skip
         """One call of the solver; other ``a`` and not ``last`` for the substeps of a bridge."""
-        solver = self._solver
-        tolerance = TOLERANCE if last else BRIDGE_TOLERANCE
-        tasks = wires.COVARIANCE if last else 0
-        values = frame.a if a is None else a
-        solver.solve(todo, values, frame.weight, tasks, tolerance, tolerance, most, frame.sigma, method)
-        called = todo != wires.LEAVE
-        self._evaluations += int(solver.report[called, wires.EVALUATIONS].sum())
-        self._steps += int(solver.report[called, wires.STEPS].sum())
+        self._solver.solve(
+            todo,
+            frame.a if a is None else a,
+            frame.weight,
+            wires.COVARIANCE if last else 0,
+            TOLERANCE if last else BRIDGE_TOLERANCE,
+            TOLERANCE if last else BRIDGE_TOLERANCE,
+            most,
+            frame.sigma,
+            method,
+            self._order,
+            units,
+        )
 
     def _only(self, u: int, task: int) -> NDArray[np.uint8]:
         todo = np.full(self.layout.shape[0], wires.LEAVE, np.uint8)
         todo[u] = task
         return todo
 
-    def _reached(self) -> NDArray[np.bool_]:
-        """(U,) wires the solver brought to a root on the branch of the rest position."""
-        report = self._solver.report
-        on_branch = report[:, wires.BRANCH] * self._rest_branch >= 0
-        reached = (report[:, wires.STATUS] == op.CONVERGED) & on_branch
-        return np.asarray(reached & ~self._problem.out_of_reach(self._solver.x))
+    def _reached(self, good: NDArray[np.bool_]) -> bool:
+        """Whether the solver brought all wires to a root on the branch of the rest position, into ``good``
+        (U,) which."""
+        solver, problem = self._solver, self._problem
+        return around.reach(solver.report, solver.x, self._rest_branch, problem.rest, problem.clearance, good)
+
+    def _has_root(self, u: int) -> bool:
+        self._reached(self._good_now)
+        return bool(self._good_now[u])
 
     @property
     def _unknowns(self) -> NDArray[np.int64]:
@@ -378,7 +401,8 @@ class ExactTracker:
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
         content = (solver.report[:, wires.HELD] == 1) | (solver.measure[:, wires.CHI2] <= limit)
         whole = 3 * solver.free == self.layout.unknowns
-        return np.asarray(whole | (self._reached() & content))
+        self._reached(self._good_now)
+        return np.asarray(whole | (self._good_now & content))
 
     def _widen(self, u: int, frame: _Frame) -> None:
         """Let electrodes of wire u join until they explain the frame; undone where not even all do."""
@@ -396,9 +420,9 @@ class ExactTracker:
             self._set_electrodes(u, electrodes)
             solver.x[u] = self._x[u]
             self._call(self._only(u, wires.SOLVE), frame)
-            if len(electrodes) == most and not self._reached()[u] and self._solvable(frame)[u]:
+            if len(electrodes) == most and not self._has_root(u) and self._solvable(frame)[u]:
                 self._recover(u, frame)
-        if len(solver.electrodes(u)) > len(before) and not self._reached()[u]:
+        if len(solver.electrodes(u)) > len(before) and not self._has_root(u):
             self._set_electrodes(u, before)
         if len(solver.electrodes(u)) > len(before):
             self._measure_unnoticed(u, frame.used[u])
@@ -426,12 +450,12 @@ class ExactTracker:
             starts.append(rest)
         for substeps in BRIDGES:
             for x_from, a_from in starts:
-                if self._steps >= RECOVERY_STEPS:
+                if self._solver.tally[1] >= RECOVERY_STEPS:
                     return False
                 if not self._bridge(u, x_from, a_from, frame, substeps):
                     self._solver.report[u, wires.STATUS] = DEADLINE
                     return False
-                if self._reached()[u]:
+                if self._has_root(u):
                     return True
         return False
 
@@ -468,19 +492,16 @@ class ExactTracker:
     def _checked_frame(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None, start: float
     ) -> _Frame:
-        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        noise, sigma = self._noise, self._sigma
-        if relative_noise is not None:
-            noise = broadcast_noise(relative_noise, self.layout)
-            known = (noise > 0) & (noise < NOISE_MAX)
-            noise = np.where(known, noise, np.inf)
-            sigma = float(noise.min()) if known.any() else self._sigma
-        weight = sigma / noise
-        if valid is not None:
-            weight *= checked_mask(valid, self.layout)
-        with np.errstate(over="ignore", invalid="ignore"):
-            a = frame * self._problem.gain
-            used = np.where((a > wires.A_MIN) & (a < wires.A_MAX), weight, 0.0)
+        # copies, for kernels are compiled for each kind of memory: what others give may be read-only
+        self._ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        self._noise_now[:] = (
+            self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
+        )
+        self._valid[:] = True if valid is None else checked_mask(valid, self.layout)
+        a, weight, used = self._a_now, self._weight_now, self._used
+        sigma = around.take(
+            self._ohm, self._problem.gain, self._noise_now, self._sigma, self._valid, a, weight, used
+        )
         return _Frame(a, weight, used, sigma, start + self._seconds)
 
 

@@ -15,6 +15,8 @@ NOISE_MAX: Final = 1e12
 
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
     """(U, K) deviations. ValueError for another shape than that or a number."""
+    if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
+        return np.asarray(relative_noise, np.float64)  # as from every frame of a host
     try:
         return np.asarray(np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape))
     except (TypeError, ValueError) as error:

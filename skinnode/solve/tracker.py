@@ -23,6 +23,7 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
+from skinnode.solve import frame
 from skinnode.solve.branch import (
     AGREE,
     BLIND,
@@ -126,11 +127,12 @@ class Tracker:
             active_only=active_only,
         )
         problem = PatchProblem.of(layout, baseline_ohm)
-        self._smoothness, self._rest = Smoothness(problem), problem.rest
-        self._step_limit = problem.step_limit
+        self._whitening, self._rough_limit = Smoothness(problem).whitening, ROUGH / problem.step_limit
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
-        self._large_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
+        self._far_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
+        self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
+        self._none_held = np.zeros(layout.shape[0], np.bool_)
         self._pause = 0  # frames until the posterior is asked again
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # what its confirmation left open of a wire
@@ -167,44 +169,52 @@ class Tracker:
         start = perf_counter()
         field = self._exact.update(frame_ohm, valid, relative_noise)
         lost, unsure = self._doubtful(field)
-        if (lost | unsure).any():
-            if self._pause:
+        doubtful = lost | unsure
+        if doubtful.any():
+            until, anew = start + self._seconds, bool(unsure.any())
+            if self._pause or (anew and perf_counter() + self._posterior.from_rest_s > until):
                 guide = _no_answer(field)
             else:
-                if unsure.any():
+                if anew:
                     self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
                 noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
-                self._posterior.stop_at(start + self._seconds)
+                self._posterior.stop_at(until)
                 guide = self._posterior.update(frame_ohm, valid, noise)
                 if Status.DEADLINE in guide.status:
                     self._pause = PAUSE
-            field = self._refer(field, lost | unsure, guide)
+            field = self._refer(field, doubtful, guide)
         self._pause = max(0, self._pause - 1)
-        field = self._keep_apart(field, ~(lost | unsure))
-        self._last_m = field.displacement_m
+        field = self._keep_apart(field, ~doubtful)
+        self._last_m[:] = field.displacement_m
         return field
 
     def _doubtful(self, field: FieldFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """(U,) wires without a root, and (U,) those whose root may not be the right one: where the layout has
         folds all that were solved, elsewhere those that jumped and the rough ones."""
-        status = np.array(field.status)
-        solved = status == Status.CONVERGED
-        lost = ~solved & (status != Status.DEADLINE)
-        if field.held is not None:
-            solved &= ~field.held
-        moved = field.displacement_m
-        unsure = solved & self._folded
-        unsure |= solved & (np.abs(moved - self._last_m).max(axis=(1, 2)) > self._jump_m)
-        large = solved & (np.abs(moved).max(axis=(1, 2)) > self._large_m)
-        if large.any():
-            pitches = (moved / self.layout.pitch_m).reshape(len(moved), -1)
-            size = np.sqrt((pitches**2).sum(axis=1)) / self._step_limit
-            rough = large & (self._smoothness.roughness(self._rest + pitches) > ROUGH * size)
+        assert self._exact is not None
+        moved, held = field.displacement_m, self._none_held if field.held is None else field.held
+        some_rough = frame.judge(
+            moved,
+            self._last_m,
+            self._exact.status_codes,
+            held,
+            self._folded,
+            self._jump_m,
+            self._far_m,
+            int(Status.DEADLINE),
+            self.layout.pitch_m,
+            self._whitening,
+            self._rough_limit,
+            self._lost,
+            self._unsure,
+            self._rough,
+        )
+        if some_rough:
             if self._confirmed is not None:  # what was confirmed a moment ago is not asked again
                 change = np.abs(moved - self._confirmed).max(axis=(1, 2))
-                rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
-            unsure |= rough
-        return lost, unsure
+                self._rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
+            self._unsure |= self._rough
+        return self._lost, self._unsure
 
     def _keep_apart(self, field: FieldFrame, unasked: NDArray[np.bool_]) -> FieldFrame:
         """A wire that is held is no better known than when the posterior confirmed it."""

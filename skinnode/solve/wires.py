@@ -57,7 +57,7 @@ from skinnode.solve.operators import (
 from skinnode.solve.problem import PatchProblem
 
 # Columns of the integer report of a wire
-STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, REPORT = range(7)
+STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
 # Columns of the real report of a wire; the residual is the weighted RMS over the equations in use, and CHI2
 # the residual's χ² at the end of a solve, with SPARE, equations less unknowns, degrees of freedom
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
@@ -83,6 +83,11 @@ COVARIANCE: Final = 1
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 
+
+COVARIANCE_UNITS: Final = 3.0
+"""What a covariance costs, in evaluations of F and J with their step, of a square system of 30."""
+HELD_UNITS: Final = 0.25
+"""What it costs to see that a wire can be held."""
 
 DATA_ROUNDING: Final = 2.0
 """Relative error of an a F, in eps: R, the gain, their product and F are rounded to half an eps each."""
@@ -159,25 +164,26 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 @njit_part
 def _within_noise(
     a: Float, weight: Float, sigma: float, tol: float, a_solved: Float, noise: Float, inverse: Float,
-    unknowns: int, rho: Float, std: Float,
+    unknowns: int, rho: Float, variance: Float, std: Float,
 ) -> float:  # fmt: skip
     """RMS of w ρ where the wire can be held, −1 where not; ``std`` (n,) of the unknowns of a held wire.
 
-    ``noise`` (K,) is the variance solved into x. What a held coordinate may be off by is the largest of the
-    noise solved into it, that of the frame which saw it unmoved, and what its correction has beyond both.
+    ``noise`` (K,) is the variance solved into x; ``rho`` and ``variance`` (K,) are room to work in. What a
+    held coordinate may be off by is the largest of the noise solved into it, that of the frame which saw it
+    unmoved, and what its correction has beyond both.
     """
     count, square, weighted, total, squares = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(a.size):
-        rho[k] = 0.0
+        rho[k] = variance[k] = 0.0
         if weight[k] > 0.0:
             count += 1
             rho[k] = a[k] / a_solved[k] - 1.0
             deviation = sigma / weight[k]
-            variance = deviation * deviation + tol * tol
-            ratio = noise[k] / variance
+            variance[k] = deviation * deviation + tol * tol
+            ratio = noise[k] / variance[k]
             total += ratio
             squares += ratio * ratio
-            square += rho[k] * rho[k] / variance
+            square += rho[k] * rho[k] / variance[k]
             weighted += weight[k] * weight[k] * rho[k] * rho[k]
     if not total <= FRESHER * count:
         return -1.0
@@ -191,9 +197,8 @@ def _within_noise(
         before, now = 0.0, 0.0
         for k in range(a.size):
             if weight[k] > 0.0:
-                deviation = sigma / weight[k]
                 slope = row[k] * row[k]
-                now += slope * (deviation * deviation + tol * tol)
+                now += slope * variance[k]
                 before += slope * noise[k]
         correction = dot(row, rho) ** 2
         std[j] = math.sqrt(max(before, max(now, correction - before - now)))
@@ -234,7 +239,10 @@ def solve_wires(
     std: Float,
     report: Index,
     measure: Float,
-) -> None:
+    order: Index,
+    units: float,
+    tally: Index,
+) -> float:
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo`` (U,).
 
     ``x`` (U, 3N) start, then solution, pitches; ``a`` and ``weight`` (U, K), where an ``a`` that is no
@@ -245,14 +253,21 @@ def solve_wires(
     (U, K) keep ∂x/∂r, 1/F and the variance of a of the last converged solve of each wire for the next
     frame, 1 and inf where it had no equation; ``std`` (U, 3N) is inf where not known. A wire with fewer
     equations than unknowns keeps its x and is ILL_CONDITIONED, or NON_FINITE where an ``a`` lost its weight.
+    Wires have their turn in ``order`` (U,), until one may need more than what is left of ``units``,
+    evaluations of F and J with all that goes with them. Returns how many were needed, by estimate; to
+    ``tally`` (2,) the evaluations and steps are added.
     """
     unknowns = w.x.size
     equations = a.shape[1]
     tall = equations > unknowns
     each = 1 if unknowns < point.size else 3
-    for u in range(x.shape[0]):
+    spent, worst = 0.0, max_steps + 1 + COVARIANCE_UNITS
+    for u in order:
         if todo[u] == LEAVE:
             continue
+        if spent + worst > units:
+            break
+        report[u, TURN] = 1
         x_u, a_u, w_u, inverse_u = x[u], a[u], weight[u], inverse[u]
         status = TRY
         count, lost = 0, 0
@@ -277,7 +292,7 @@ def solve_wires(
             std[u, j] = math.inf
         if status == TRY and todo[u] == HOLD:
             held = _within_noise(
-                a_u, w_u, sigma, tol_f, a_solved[u], noise[u], inverse_u, unknowns, w.e, w.newton
+                a_u, w_u, sigma, tol_f, a_solved[u], noise[u], inverse_u, unknowns, w.e, w.r, w.newton
             )
             if held >= 0.0:
                 status = CONVERGED
@@ -374,6 +389,13 @@ def solve_wires(
         report[u, STATUS] = status
         report[u, EVALUATIONS] = evaluations
         report[u, STEPS] = steps
+        tally[0] += evaluations
+        tally[1] += steps
+        if held >= 0.0:
+            spent += HELD_UNITS
+        elif evaluations > 0:
+            spent += evaluations + COVARIANCE_UNITS
+    return spent
 
 
 class Solver:
@@ -393,6 +415,8 @@ class Solver:
         """(U, 3N) pitches."""
         self.report = np.zeros((wires, REPORT), np.int64)
         self.measure = np.zeros((wires, MEASURES))
+        self.tally = np.zeros(2, np.int64)
+        """Evaluations and steps of all calls since its owner set it to zero."""
         self.still_std = np.full((wires, unknowns), np.inf)
         """(U, 3N) deviation of what is no unknown, pitches."""
         self.each = 1 if normal_only else 3
@@ -400,15 +424,12 @@ class Solver:
         most = unknowns // 3
         self.free = np.full(wires, most)
         """(U,) number of electrodes with unknowns."""
+        self._sizes: list[int] | None = [most]  # of ``free``, None where they have to be looked for
+        self._in_turn = np.arange(wires)
         self._electrodes = np.tile(np.arange(most), (wires, 1))
         self._still = np.zeros((wires, lower))
         self._work: dict[int, tuple[Work, Float, Float]] = {}
         self.step_limit = problem.step_limit
-
-    @property
-    def cost(self) -> tuple[int, int]:
-        """Evaluations and steps of the last call, of all wires."""
-        return int(self.report[:, EVALUATIONS].sum()), int(self.report[:, STEPS].sum())
 
     def electrodes(self, u: int) -> Index:
         """The electrodes of wire u that have unknowns."""
@@ -419,7 +440,7 @@ class Solver:
         belongs to it is void until the next converged solve."""
         n = self.problem.layout.unknowns // 3
         rest = np.setdiff1d(np.arange(n), electrodes)
-        self.free[u] = len(electrodes)
+        self.free[u], self._sizes = len(electrodes), None
         self._electrodes[u, : len(electrodes)] = electrodes
         self.x[u].reshape(n, 3)[rest] = self.problem.rest[u].reshape(n, 3)[rest]
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
@@ -443,10 +464,13 @@ class Solver:
         max_steps: int,
         sigma: float = 0.0,
         operator: int | None = None,
+        order: Index | None = None,
+        units: float = math.inf,
     ) -> None:
         """Solve the wires in ``todo`` from :attr:`x` on, into :attr:`x`, :attr:`std`, :attr:`report` and
-        :attr:`measure`. ``a`` and ``weight`` (U, K) may be overwritten."""
-        sizes = sorted(set(self.free[todo != LEAVE].tolist()))
+        :attr:`measure`. ``a`` and ``weight`` (U, K) may be overwritten. ``order`` and ``units`` as in
+        :func:`solve_wires`; who had a turn has TURN 1 in its report."""
+        sizes = self._sizes or sorted(set(self.free[todo != LEAVE].tolist()))
         for size in sizes:  # all the same, unless electrodes are left out
             if size not in self._work:
                 lower = self.problem.layout.shape[1]
@@ -454,7 +478,7 @@ class Solver:
                     workspace(self.each * size, lower), np.zeros(3 * size), np.zeros((3 * size, lower)),
                 )  # fmt: skip
             work, point, raw = self._work[size]
-            solve_wires(
+            units -= solve_wires(
                 self.operator if operator is None else operator,
                 tasks,
                 todo if len(sizes) == 1 else np.where(self.free == size, todo, LEAVE).astype(np.uint8),
@@ -479,4 +503,7 @@ class Solver:
                 self.std,
                 self.report,
                 self.measure,
+                self._in_turn if order is None else order,
+                units,
+                self.tally,
             )

@@ -441,15 +441,17 @@ class TestHold:
 
 
 class Clock:
-    """Time stands still but for the solver: every wire that it is called for takes ``call_s``."""
+    """Time stands still but for the solver: every wire that has its turn in a call takes ``call_s``."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, call_s: float) -> None:
         self.now, self.call_s = 0.0, call_s
         solve = wires.Solver.solve
 
         def timed(solver: wires.Solver, todo: np.ndarray, *args: object, **kwargs: object) -> None:
-            self.now += self.call_s * np.count_nonzero(todo != wires.LEAVE)
+            asked = todo != wires.LEAVE
+            solver.report[asked, wires.TURN] = 0
             solve(solver, todo, *args, **kwargs)
+            self.now += self.call_s * np.count_nonzero(solver.report[asked, wires.TURN])
 
         monkeypatch.setattr(exact, "perf_counter", lambda: self.now)
         monkeypatch.setattr(wires.Solver, "solve", timed)

@@ -261,6 +261,25 @@ def test_what_a_confirmation_left_open_stays_while_a_wire_is_held():
     assert (still > 0.5 * wide).all()
 
 
+def test_a_posterior_that_cannot_answer_by_the_deadline_is_not_asked(layout, monkeypatch):
+    """A field in doubt takes no time that cannot help it; with time enough it is put right."""
+    moved = hertz_press(layout, 0.1, centre_m=(6e-3, 6e-3))
+    shortest_s = sk.Tracker(layout, method="exact", deadline_us=1e6)._posterior.from_rest_s
+    for deadline_us, asks in ((0.9e6 * shortest_s, 0), (1e7, 3)):
+        tracker = sk.Tracker(layout, method="exact", deadline_us=deadline_us)
+        tracker._posterior.from_rest_s = shortest_s
+        asked, ask = [], tracker._posterior.update
+        monkeypatch.setattr(tracker._posterior, "update", lambda *args: asked.append(1) or ask(*args))  # noqa: B023
+        monkeypatch.setattr(
+            tracker, "_doubtful", lambda field: (np.zeros(4, bool), np.array([True, False, False, False]))
+        )
+        for _ in range(3):
+            field = tracker.update(frame_ohm(layout, moved))
+            assert field.trusted == (asks > 0)
+            assert np.isinf(field.displacement_std_m[0]).all() == (asks == 0)
+        assert len(asked) == asks
+
+
 def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout, monkeypatch):
     """A wire in doubt all the while stays untrusted, whether the posterior was asked or not."""
     tracker = sk.Tracker(layout, method="exact", deadline_us=1e7)

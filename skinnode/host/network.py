@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import canopen
 from canopen.objectdictionary import ObjectDictionary
+from canopen.sdo.client import BlockUploadStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
@@ -20,6 +21,9 @@ from skinnode.wire.indices import DEVICE_TYPE
 
 ATTEMPTS: Final = 3
 """Tries of a transfer that was not answered or whose answer belongs to an earlier one."""
+
+_SILENCES: Final = ("No SDO response", "could not be retransmitted")
+"""What canopen says where nothing came, the second after it asked for segments again."""
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
@@ -72,8 +76,8 @@ class RemoteOd:
         """A value of many bytes by block transfer with CRC."""
 
         def ask() -> bytes:
-            with self._client.open(index, 0, "rb", block_transfer=True) as stream:
-                return bytes(stream.read())
+            with _BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
+                return bytes(stream.readall())
 
         return bytes(self._transfer(index, 0, "block read", ask))
 
@@ -139,7 +143,7 @@ class RemoteOd:
                 raise SdoAbort(self.node_id, error.code, f"{where}: {text}") from None
             except SdoCommunicationError as error:
                 failure = error
-        if "No SDO response" in str(failure):
+        if any(silence in str(failure) for silence in _SILENCES):
             waited_s = ATTEMPTS * self._client.RESPONSE_TIMEOUT
             raise NodeTimeout(
                 self.node_id, f"{where}: got no answer, allowed: one within {waited_s:.1f} s"
@@ -149,6 +153,22 @@ class RemoteOd:
             why = f"two nodes answer with node-ID {self.node_id}, or another SDO client asks it"
             raise NodeError(self.node_id, f"{got}; {why}")
         raise NodeError(self.node_id, f"{where}: got {failure}, allowed: an answer of CiA 301") from None
+
+
+class _BlockUpload(BlockUploadStream):
+    """canopen 2.4 asks twice for a segment that did not come in time, and leaves out the first answer: every
+    pause longer than its time-out ended in a wrong CRC. One that comes out of order it asks for once, so a
+    segment that is late is made to look like that."""
+
+    def read(self, size: int = -1) -> bytes:
+        """One segment, as canopen has it."""
+        if size >= 0 and not self._done:
+            try:
+                response = self.sdo_client.read_response()
+            except SdoCommunicationError:
+                response = bytes(8)  # no segment has number 0
+            self.sdo_client.responses.queue.appendleft(response)
+        return bytes(super().read(size))  # type: ignore[no-untyped-call]  # as all of canopen
 
 
 def _name(index: int, subindex: int) -> str:

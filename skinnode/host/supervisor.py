@@ -282,7 +282,7 @@ class Supervisor:
             self._begin(node, now_ns)
         elif station.monitor.said_since(OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
-        elif now_ns > node.since_ns + START_DEADLINE_S * 1e9:
+        elif station.link.t_dealt_ns > node.since_ns + START_DEADLINE_S * 1e9:
             state = station.monitor.nmt_state
             text = f"node {station.patch.node_id}: got NMT state {state} after the start command, allowed: 5"
             self._fail(node, text, now_ns, refused=True)

@@ -45,6 +45,7 @@ def stamp(field: FieldFrame) -> ScanStamp:
     return field.stamp
 
 
+@pytest.mark.real_time
 def test_every_scan_from_the_first_on_every_patch(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         fields = take(host.fields(timeout_s=10, capacity=1000), 60)
@@ -132,6 +133,7 @@ def test_host_is_freed_with_its_last_reference(hand: HandConfig, fleet: Fleet) -
     assert fields.dropped == 0  # a subscription outlives its host
 
 
+@pytest.mark.real_time
 def test_pdo_of_wrong_length_is_rejected_counted_and_said_once(
     hand: HandConfig, fleet: Fleet, listener: CanPort, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -165,6 +167,7 @@ def test_foreign_and_remote_frames_do_no_harm(hand: HandConfig, fleet: Fleet, li
         assert host.stats().buses["can0"].malformed == 0
 
 
+@pytest.mark.real_time
 def test_subscriber_that_does_not_read_costs_nobody_else(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         asleep, awake = host.fields(capacity=1), host.fields(timeout_s=10, capacity=1000)
@@ -174,6 +177,7 @@ def test_subscriber_that_does_not_read_costs_nobody_else(hand: HandConfig, fleet
         assert sum(patch.skipped for patch in host.stats().patches.values()) == 0
 
 
+@pytest.mark.real_time
 def test_silence_is_a_timeout_and_a_lost_patch(hand: HandConfig) -> None:
     with Fleet(hand) as fleet, Host.from_config(hand) as host:
         fields = host.fields(timeout_s=0.5)
@@ -235,6 +239,7 @@ def test_two_buses_one_sync(make_hand: Callable[..., HandConfig]) -> None:
     assert all(len(times) == 1 for times in by_scan.values())
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("code_bits", [16, 24])
 def test_fields_over_can_fd_are_those_of_a_classic_bus(code_bits: int) -> None:
     """The same pressed patch on two buses of one hand: the same codes, so the same fields to the last bit."""
@@ -291,6 +296,7 @@ class Fixed:
         return self.ohm
 
 
+@pytest.mark.real_time
 def test_simulated_hand_over_can_fd(make_hand: Callable[..., HandConfig]) -> None:
     bus = {"name": "can0", "channel": uuid.uuid4().hex, "fd": True}
     hand = make_hand(buses=[bus])

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._console import counted
 from skinnode.cli._usage import Seconds, run
+from skinnode.words import counted
 
 if TYPE_CHECKING:
     from skinnode.node import NmtState

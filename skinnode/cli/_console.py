@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-def counted(number: int, one: str, several: str = "") -> str:
-    """``1 node``, ``2 nodes``; ``several`` where that is not ``one`` and an s."""
-    return f"{number} {one}" if number == 1 else f"{number} {several or one + 's'}"
-
-
 def print_json(value: Any) -> None:
     """One JSON document."""
     from skinnode.cli._files import plain

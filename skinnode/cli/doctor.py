@@ -101,8 +101,9 @@ def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
     from rich.markup import escape
     from rich.padding import Padding
 
-    from skinnode.cli._console import console, counted
+    from skinnode.cli._console import console
     from skinnode.doctor.checks import not_judged
+    from skinnode.words import counted
 
     out = console()
     for known in facts:

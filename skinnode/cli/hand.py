@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skinnode.cli._console import counted
+from skinnode.words import counted
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._console import counted
 from skinnode.cli._usage import Seconds
+from skinnode.words import counted
 
 if TYPE_CHECKING:
     from skinnode.host import Host, HostStats

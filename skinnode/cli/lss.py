@@ -26,9 +26,10 @@ def list_nodes(
 ) -> None:
     """Find all nodes without a node-ID, by fastscan. Changes nothing."""
     from skinnode.cli._bus import find_bus
-    from skinnode.cli._console import console, counted, print_json, progress, table
+    from skinnode.cli._console import console, print_json, progress, table
     from skinnode.technician.line import Line
     from skinnode.technician.survey import find_unconfigured
+    from skinnode.words import counted
 
     place = find_bus(interface, channel, bitrate, fd, hand, bus)
     with progress(as_json) as tell, Line(place.bus) as line:

@@ -142,12 +142,13 @@ def _running(
     stack: ExitStack, plan: HandConfig, told: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
     """A host of that hand; ``stack`` ends it. Raises as :meth:`Host.from_config`."""
-    from skinnode.cli._console import counted, progress
+    from skinnode.cli._console import progress
     from skinnode.host import Host
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
     from skinnode.monitor.source import HostSource
     from skinnode.pauses import responsive_threads, short_pauses
+    from skinnode.words import counted
 
     if not quiet:
         import skinnode.monitor.app  # noqa: F401  # while nothing has a deadline yet

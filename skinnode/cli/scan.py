@@ -85,7 +85,8 @@ def _as_json(found: Survey, place: Place, faults: list[str]) -> dict[str, object
 
 
 def _print(found: Survey, place: Place, faults: list[str]) -> None:
-    from skinnode.cli._console import console, counted, table
+    from skinnode.cli._console import console, table
+    from skinnode.words import counted
 
     out = console()
     if found.nodes:

@@ -11,6 +11,7 @@ import numpy as np
 
 from skinnode.doctor.facts import BusFacts, Finding, Sure
 from skinnode.model.config import MAX_BUS_LOAD
+from skinnode.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
@@ -67,7 +68,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "the interface failed while it was watched",
             Sure.CERTAIN,
-            f"{bus.outages} times",
+            counted(bus.outages, "time"),
             "cable and power of the adapter; kernel log (dmesg)",
         )
     if bus.foreign:
@@ -118,6 +119,6 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "somebody commands the nodes",
             Sure.POSSIBLE,
-            f"{bus.nmt_commands} NMT commands in {bus.seconds:.1f} s",
+            f"{counted(bus.nmt_commands, 'NMT command')} in {bus.seconds:.1f} s",
             f"fine while a host starts; else a second master: {stop_one}",
         )

@@ -18,6 +18,8 @@ from skinnode.wire.profile import PatchProfile
 
 _MOST_SCANS: Final = 1000
 _MOST_SYNCS: Final = 100_000
+_LONGEST_NS: Final = 10_000_000_000
+"""From a SYNC to the scan that it began."""
 
 
 class Capture:
@@ -90,13 +92,14 @@ class Capture:
             stats=patch.assembler.stats,
         )
 
-    def _sync_ns(self, counter: int) -> int | None:
-        """The newest SYNC of that counter; the newest of all where SYNCs have none."""
-        for t_ns, number in reversed(self.syncs):
-            if number in (counter, 0):
-                return t_ns
-            if len(self.syncs) and self.syncs[-1][0] - t_ns > 10_000_000_000:
+    def _sync_ns(self, scan: Scan) -> int | None:
+        """When the SYNC of a scan came: the newest before its first frame, of its counter where SYNCs have
+        one. The next SYNC may be there before the last frame."""
+        for t_ns, number in reversed(list(self.syncs)):  # another thread may note one meanwhile
+            if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None
+            if t_ns <= scan.t_first_ns and number in (scan.counter, 0):
+                return t_ns
         return None
 
 
@@ -106,6 +109,6 @@ class _Patch:
         self.begun = False
         self.scans: deque[tuple[Scan, int | None]] = deque(maxlen=_MOST_SCANS)
 
-    def keep(self, scan: Scan | None, sync_ns: Callable[[int], int | None]) -> None:
+    def keep(self, scan: Scan | None, sync_ns: Callable[[Scan], int | None]) -> None:
         if scan is not None:
-            self.scans.append((scan, sync_ns(scan.counter)))
+            self.scans.append((scan, sync_ns(scan)))

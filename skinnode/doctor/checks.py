@@ -7,6 +7,8 @@ from typing import Final
 
 from skinnode.doctor import bus, configuration, nodes, skin, timing
 from skinnode.doctor.facts import BusFacts, Finding, Sure
+from skinnode.doctor.quiet import LEAST_SCANS
+from skinnode.words import counted
 
 _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
@@ -38,10 +40,16 @@ def not_judged(facts: BusFacts) -> list[str]:
     lines = []
     for patch in facts.patches:
         scans = 0 if patch.scans is None else patch.scans.scans
-        if patch.found is not None and scans < skin.LEAST_SCANS:
+        if patch.found is not None and scans < LEAST_SCANS:
+            came = counted(scans, "scan") if scans else "no scans"
             lines.append(
-                f"{patch.name}: noise, steps and drift: {scans or 'no'} scans came, {skin.LEAST_SCANS} needed"
+                f"{patch.name}: noise, steps and drift: {came} came, {LEAST_SCANS} needed"
                 + ("" if facts.running or facts.active else "; it does not run: --active starts it")
+            )
+        elif patch.scans is not None and skin.is_touched(patch.scans):
+            lines.append(
+                f"{patch.name}: noise of single crossings, and what is not at its baseline: something moves "
+                "on the skin; leave it alone while the doctor listens"
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(

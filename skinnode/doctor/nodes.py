@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.wire.emergency import error_text, register_text
+from skinnode.words import counted
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:
@@ -19,7 +20,7 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
             bus.name,
             "no node of the hand answers",
             Sure.CERTAIN,
-            f"{len(bus.patches)} asked, {bus.frames} frames heard in {bus.seconds:.1f} s",
+            f"{len(bus.patches)} asked, {counted(bus.frames, 'frame')} heard in {bus.seconds:.1f} s",
             "supply of the patches, cable, termination, bit rate, channel",
         )
         return
@@ -88,7 +89,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "the node restarts by itself",
             Sure.CERTAIN,
-            f"{max(patch.boot_ups, node.boot_ups)} boot-up messages in {bus.seconds:.1f} s",
+            f"{counted(max(patch.boot_ups, node.boot_ups), 'boot-up message')} in {bus.seconds:.1f} s",
             "supply voltage under load, connector, watchdog of the board",
         )
     if bus.running and node.state != "operational":

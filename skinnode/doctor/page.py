@@ -12,7 +12,7 @@ import numpy as np
 
 from skinnode.doctor.checks import not_judged
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts
-from skinnode.doctor.skin import LEAST_SCANS, analyse
+from skinnode.doctor.quiet import LEAST_SCANS, analyse
 from skinnode.model.layout import Float
 
 _STYLE = """
@@ -100,7 +100,8 @@ def _maps(scans: ScanFacts) -> str:
     """Noise over what is told, and R/R0, crossing by crossing."""
     quiet = analyse(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
-    _map(figure, axes[0], quiet.noise / quiet.told, "noise / noise told, grey: none", "viridis", 0.0, None)
+    title = "noise / noise told, grey: none" + (", with what a touch left in it" if quiet.is_touched else "")
+    _map(figure, axes[0], quiet.noise / quiet.told, title, "viridis", 0.0, None)
     off = 100 * (quiet.level - 1.0)
     known = off[np.isfinite(off)]
     limit = max(0.05, float(np.abs(known).max())) if known.size else 1.0

@@ -1,79 +1,30 @@
 """What some fifty scans say of the skin: wires, noise, frozen values, steps, baseline. Pure functions.
 
-Noise is taken from second differences of successive scans, which a slow touch leaves alone: their variance is
-6 σ². A crossing that moves is one whose means of five scans wander by more than that noise explains.
+Somebody who touches the skin is no defect: what touch may explain is not told of.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skinnode.doctor.facts import BusFacts, Counts, Finding, PatchFacts, ScanFacts, Sure
+from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts, Sure
+from skinnode.doctor.quiet import LEAST_SCANS, Mask, Quiet, analyse
 from skinnode.model.layout import Float
-
-LEAST_SCANS: Final = 20
-"""A standard deviation of fewer is known to worse than a quarter."""
+from skinnode.words import counted
 
 NOISY: Final = 5.0
 """Times the noise told above which a crossing is noisy: far beyond what 20 scans leave open."""
 
-_BLOCK: Final = 5
-_WANDER: Final = 6.0
-_STEP: Final = 20.0
 _DRIFT: Final = 0.003
 """|R/R0 − 1| at rest that is worth a tare: a hundred times the noise of a good converter, 1 % of a press."""
 
 _MANY: Final = 0.8
 _FEW: Final = 0.1
-
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Quiet:
-    """Crossing by crossing, (U, K)."""
-
-    noise: Float
-    """Relative to R0; NaN where it could not be had."""
-    told: Float
-    """What converter and codes explain."""
-    level: Float
-    """Median R/R0."""
-    moves: Mask
-    steps: Mask
-    step_at: Counts
-    step_by: Float
-
-
-def analyse(scans: ScanFacts) -> Quiet:
-    """Figures of each crossing over all scans. Needs LEAST_SCANS."""
-    ratio = scans.ratio[scans.complete] if scans.complete.sum() >= LEAST_SCANS else scans.ratio
-    known = np.isfinite(ratio).all(axis=0)
-    safe = np.where(known, ratio, 1.0)
-    noise = np.sqrt(np.mean(np.diff(safe, 2, axis=0) ** 2, axis=0) / 6.0)
-    level = np.median(safe, axis=0)
-    told = np.hypot(scans.told_noise * level, scans.step / np.sqrt(12.0))
-    whole = len(safe) // _BLOCK * _BLOCK
-    blocks = safe[:whole].reshape(-1, _BLOCK, *safe.shape[1:]).mean(axis=1)
-    wander = np.ptp(blocks, axis=0)
-    jumps = np.abs(np.diff(safe, axis=0))
-    at = jumps.argmax(axis=0)
-    by = np.take_along_axis(jumps, at[None], axis=0)[0]
-    # A step stays, and is all there is: the medians before and after it differ by about as much.
-    stays = np.zeros(known.shape)
-    for row, column in np.argwhere(by > _STEP * told):
-        k = int(at[row, column]) + 1
-        if 3 <= k <= len(safe) - 3:
-            series = safe[:, row, column]
-            stays[row, column] = abs(np.median(series[k:]) - np.median(series[:k]))
-    steps = known & (stays > 0.7 * by) & (stays < 1.4 * by) & (by > _STEP * told)
-    moves = known & ~steps & (wander > _WANDER * np.maximum(noise, told))
-    return Quiet(np.where(known, noise, np.nan), told, np.where(known, level, np.nan), moves, steps, at, by)
+_SHARE: Final = 0.7
+"""Of the crossings of a noisy wire: a few may be quiet by chance or be spoilt otherwise."""
 
 
 def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, Quiet]]:
@@ -124,7 +75,7 @@ def _check_crossings(
                     patch.name,
                     f"{side} wires {what}: {_listed(tuple(int(i) for i in np.flatnonzero(wires)))}",
                     Sure.CERTAIN,
-                    f"every crossing, in all {scans.scans} scans",
+                    f"every crossing, {_in_all(scans)}",
                     "connector and solder joint of these wires" if what == "open" else advice,
                 )
         always &= ~(always.all(axis=1, keepdims=True) | always.all(axis=0, keepdims=True))
@@ -132,16 +83,16 @@ def _check_crossings(
             yield Finding(
                 "wires",
                 patch.name,
-                f"{int(always.sum())} crossings {what}",
+                f"{_crossings(always)} {what}",
                 Sure.CERTAIN,
-                f"in all {scans.scans} scans: {_places(always)}",
+                f"{_in_all(scans)}: {_places(always)}",
                 advice,
             )
         if sometimes.any():
             yield Finding(
                 "wires",
                 patch.name,
-                f"{int(sometimes.sum())} crossings now and then {what}",
+                f"{_crossings(sometimes)} now and then {what}",
                 Sure.LIKELY if what == "open" else Sure.POSSIBLE,
                 f"in up to {int(counts[sometimes].max())} of {scans.scans} scans: {_places(sometimes)}",
                 "a loose contact: move the cable and watch" if what == "open" else advice,
@@ -152,17 +103,13 @@ def check_noise(bus: BusFacts) -> Iterator[Finding]:
     """Noise against what the hand file tells, steps, and values that stand still."""
     for patch, scans, quiet in _judged(bus):
         yield from _check_frozen(patch, scans)
-        factor = quiet.noise / quiet.told
-        judged = np.isfinite(factor) & ~quiet.moves & ~quiet.steps
-        noisy = judged & (factor > NOISY)
-        if noisy.any():
-            yield _noise_finding(patch, scans, quiet, factor, judged, noisy)
+        yield from _check_noise(patch, scans, quiet)
         if quiet.steps.any() and quiet.steps.mean() <= max(_FEW, 1.0 / min(quiet.steps.shape)):
             row, column = (int(i) for i in np.argwhere(quiet.steps)[0])
             yield Finding(
                 "wires",
                 patch.name,
-                f"{int(quiet.steps.sum())} crossings jumped and stayed",
+                f"{_crossings(quiet.steps)} jumped and stayed",
                 Sure.POSSIBLE,
                 f"{_places(quiet.steps)}; at {row}/{column} by {quiet.step_by[row, column]:.2%} of R0, "
                 f"scan {int(quiet.step_at[row, column]) + 1}",
@@ -170,40 +117,54 @@ def check_noise(bus: BusFacts) -> Iterator[Finding]:
             )
 
 
-def _noise_finding(
-    patch: PatchFacts, scans: ScanFacts, quiet: Quiet, factor: Float, judged: Mask, noisy: Mask
-) -> Finding:
-    worst = float(np.max(factor[noisy]))
-    figures = (
-        f"{float(np.median(quiet.noise[noisy])):.1e} of R0 in the median, {worst:.0f} times what is told at "
-        f"worst, over {scans.scans} scans"
-    )
-    if noisy.sum() > 0.5 * judged.sum():
-        return Finding(
-            "wires",
-            patch.name,
+def _check_noise(patch: PatchFacts, scans: ScanFacts, quiet: Quiet) -> Iterator[Finding]:
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("wires", patch.name, what, sure, evidence, advice)
+
+    factor = quiet.noise / quiet.told
+    judged = np.isfinite(factor) & ~quiet.steps
+    noisy = judged & (factor > NOISY)
+    over = f"over {counted(scans.scans, 'scan')}"
+    figures = ""
+    if noisy.any():
+        median, worst = float(np.median(quiet.noise[noisy])), float(np.max(factor[noisy]))
+        figures = f"{median:.1e} of R0 in the median, {worst:.0f} times what is told at worst, {over}"
+    all_alike = noisy.sum() > 0.5 * judged.sum()
+    if quiet.is_touched:
+        levels = (quiet.floor, np.median(quiet.upper), np.median(quiet.lower))
+        all_alike &= bool(min(levels) > NOISY)
+    if all_alike or quiet.supply > NOISY:
+        yield found(
             "the whole patch is noisier than the hand file says",
             Sure.LIKELY,
-            f"{int(noisy.sum())} of {int(judged.sum())} crossings; {figures}",
+            f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
+            if all_alike
+            else f"all crossings together, {quiet.supply:.0f} times what is told, {over}",
             "supply and shield of the patch; is relative_noise in the hand file the converter's?",
         )
-    share = 0.7  # of the crossings of a wire: a few may be quiet by chance or be spoilt otherwise
-    rows = np.flatnonzero(noisy.sum(axis=1) > share * np.maximum(1, judged.sum(axis=1)))
-    columns = np.flatnonzero(noisy.sum(axis=0) > share * np.maximum(1, judged.sum(axis=0)))
-    if rows.size or columns.size:
-        names = [f"upper wire {r}" for r in rows] + [f"lower wire {c}" for c in columns]
+        return
+    names = [
+        f"{side} wire {wire}"
+        for side, axis, levels in (("upper", 1, quiet.upper), ("lower", 0, quiet.lower))
+        for wire in np.flatnonzero(noisy.sum(axis=axis) > _SHARE * np.maximum(1, judged.sum(axis=axis)))
+        if not quiet.is_touched or _stands_out(levels, int(wire))
+    ]
+    if names:
         shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
-        return Finding(
-            "wires", patch.name, f"noise on {shown}", Sure.LIKELY, figures, "a bad contact of that wire"
+        yield found(f"noise on {shown}", Sure.LIKELY, figures, "a bad contact of that wire")
+    elif noisy.any() and not quiet.is_touched:
+        yield found(
+            f"noise at {_crossings(noisy)}",
+            Sure.POSSIBLE,
+            f"{_places(noisy)}; {figures}",
+            "a bad contact at the electrodes, or a light touch",
         )
-    return Finding(
-        "wires",
-        patch.name,
-        f"noise at {int(noisy.sum())} crossings",
-        Sure.POSSIBLE,
-        f"{_places(noisy)}; {figures}",
-        "a bad contact at the electrodes, or a light touch",
-    )
+
+
+def _stands_out(levels: Float, wire: int) -> bool:
+    """Whether a wire is noisy where its neighbours are not: a touch takes the next wires with it."""
+    neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
+    return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
 
 def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
@@ -224,7 +185,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             patch.name,
             "the values are frozen",
             Sure.LIKELY,
-            f"{int(still.sum())} of {int(known.sum())} crossings without any change in {scans.scans} scans, "
+            f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
             f"though a noise of {scans.told_noise:.0e} is told and a code is {scans.step:.0e}",
             "the converter has stopped: power the patch off and on",
         )
@@ -256,13 +217,13 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
             yield Finding(
                 "baseline",
                 patch.name,
-                f"{own.baseline_missing} crossings have no baseline",
+                f"{counted(own.baseline_missing, 'crossing has', 'crossings have')} no baseline",
                 Sure.CERTAIN,
                 "R0 is 0 (0x2301)",
                 f"leave the skin alone and tare: skinnode od {patch.node_id} 2021:4 --write 0x65726174",
             )
     for patch, scans, quiet in _judged(bus):
-        at_rest = np.isfinite(quiet.level) & ~quiet.moves & ~quiet.steps
+        at_rest = np.isfinite(quiet.level) & ~quiet.touched & ~quiet.steps
         if at_rest.sum() < 0.5 * at_rest.size:
             continue  # somebody touches the skin
         off = quiet.level[at_rest] - 1.0
@@ -279,7 +240,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 figures,
                 "temperature or age: tare with nothing touching the skin",
             )
-        elif share > 0.02:
+        elif share > 0.02 and not quiet.is_touched:
             yield Finding(
                 "baseline",
                 patch.name,
@@ -288,6 +249,19 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 figures,
                 "something presses there; if nothing does, tare",
             )
+
+
+def is_touched(scans: ScanFacts) -> bool:
+    """Whether something moved on the skin, so that not all could be judged."""
+    return scans.scans >= LEAST_SCANS and analyse(scans).is_touched
+
+
+def _in_all(scans: ScanFacts) -> str:
+    return "in the only scan" if scans.scans == 1 else f"in all {scans.scans} scans"
+
+
+def _crossings(mask: Mask) -> str:
+    return counted(int(mask.sum()), "crossing")
 
 
 def _listed(wires: tuple[int, ...]) -> str:

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from skinnode.doctor.facts import BusFacts, Finding, Sure
+from skinnode.words import counted
 
 _JITTER: Final = 0.1
 """Share of the period that a SYNC may come early or late before somebody should know."""
@@ -100,8 +101,8 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 "scans with holes",
                 Sure.LIKELY if bus.dropped else Sure.CERTAIN,
-                f"{stats.scans_torn} of {scans} torn, {stats.chunks_lost} chunks and {stats.summaries_lost} "
-                "summaries lost",
+                f"{stats.scans_torn} of {scans} torn, {counted(stats.chunks_lost, 'chunk')} and "
+                f"{counted(stats.summaries_lost, 'summary', 'summaries')} lost",
                 "bus errors, load, or a node that is interrupted; compare with the other patches",
             )
         if stats.scans_missed:
@@ -117,7 +118,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 "two different chunks with one number",
                 Sure.LIKELY,
-                f"{stats.conflicts} times",
+                counted(stats.conflicts, "time"),
                 "two nodes with one node-ID: skinnode scan",
             )
         wrong = stats.bad_length + stats.bad_index + stats.bad_counter

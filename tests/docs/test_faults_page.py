@@ -35,8 +35,22 @@ def _text(what: ast.expr) -> str | None:
     if isinstance(what, ast.Constant) and isinstance(what.value, str):
         return what.value
     if isinstance(what, ast.JoinedStr):
-        return "".join(part.value if isinstance(part, ast.Constant) else "…" for part in what.values)
+        return "".join(
+            part.value if isinstance(part, ast.Constant) else _filled(part) for part in what.values
+        )
     return None
+
+
+def _filled(part: ast.expr) -> str:
+    """What the page has for a value: an ellipsis, and the plural of what is counted."""
+    match part:
+        case ast.FormattedValue(value=ast.Call(func=ast.Name(id="_crossings"))):
+            return "… crossings"
+        case ast.FormattedValue(
+            value=ast.Call(func=ast.Name(id="counted"), args=[_, _, ast.Constant(several)])
+        ):
+            return f"… {several}"
+    return "…"
 
 
 def findings() -> set[str]:

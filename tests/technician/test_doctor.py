@@ -113,7 +113,7 @@ def _warm(ohm: np.ndarray, t_ns: int) -> np.ndarray:
 
 THUMB_AND_INDEX = [
     (_cut_wire, "upper wires open: 2", "certain", _noisy_wire, "noise on lower wire 4", "likely"),
-    (_short_crossing, "1 crossings shorted", "certain", _warm, "the baseline is no longer", "likely"),
+    (_short_crossing, "1 crossing shorted", "certain", _warm, "the baseline is no longer", "likely"),
 ]
 
 

@@ -1,0 +1,8 @@
+"""Words for people that more than one room uses."""
+
+from __future__ import annotations
+
+
+def counted(number: int, one: str, several: str = "") -> str:
+    """``1 node``, ``2 nodes``; ``several`` where that is not ``one`` and an s."""
+    return f"{number} {one}" if number == 1 else f"{number} {several or one + 's'}"

@@ -147,7 +147,11 @@ class ExactTracker:
         self._ohm, self._noise_now, self._a_now, self._weight_now, self._used = np.empty((5, *layout.shape))
         self._valid = np.empty(layout.shape, np.bool_)
         self._todo = np.empty(layout.shape[0], np.uint8)
-        self._good, self._good_now, self._incomplete = np.empty((3, layout.shape[0]), np.bool_)
+        self._good = np.empty(layout.shape[0], np.bool_)
+        self._now = (
+            np.empty(layout.shape[0], np.bool_),
+            np.empty(layout.shape[0], np.int64),
+        )  # to look between
         self.status_codes = np.zeros(layout.shape[0], np.int64)
         """(U,) status of each wire in the last frame."""
         self._all_converged = as_statuses([op.CONVERGED] * layout.shape[0])
@@ -199,42 +203,69 @@ class ExactTracker:
         there, and inf where the deadline left no time to. Raises ValueError for wrong shapes.
         """
         start = perf_counter()
-        frame = self._checked_frame(frame_ohm, valid, relative_noise, start)
-        solver = self._solver
-        solver.x[:] = self._x
-        solver.report[:] = 0
-        solver.report[:, wires.STATUS] = DEADLINE  # of all that get no turn
-        solver.measure[:] = np.inf
-        solver.std[:] = np.inf
-        solver.tally[:] = 0
+        frame = self._begin(frame_ohm, valid, relative_noise, start)
         if self._leaves_out:
             self._leave_out(frame)
-        first = wires.HOLD if self._hold else wires.PREDICT
+        solver, good, first = self._solver, self._good, wires.HOLD if self._hold else wires.PREDICT
         around.choose(self._predictable, first, self._unknowns, frame.used, self._weight, self._todo)
         self._solve(self._todo, frame)
-        turns: NDArray[np.bool_] | None = None  # all
-        exhausted = np.zeros(len(self._x), bool)  # whatever could be tried has been
-        if frame.until < math.inf or self._active_only:
-            turns = solver.report[:, wires.TURN] == 1
+        easy = self._reached(good, self.status_codes) and not self._active_only
+        if easy:
+            self._order = self._in_order
+            residual = solver.measure[:, wires.RESIDUAL].copy()
+        else:
+            residual = self._rescue(frame)
+        size = self._x.shape
+        moved, std, held = np.empty(size), np.empty(size), np.empty(size[0], np.bool_)
+        incomplete = around.finish(
+            solver.report,
+            good,
+            solver.x,
+            solver.a_solved,
+            solver.std,
+            frame.used,
+            self._x,
+            self._a,
+            self._weight,
+            self._predictable,
+            self._problem.rest,
+            self.layout.pitch_m,
+            moved,
+            std,
+            held,
+        )
+        if incomplete:
+            self._complete(frame)
+        displacement = moved.reshape(self.layout.upper_m.shape)
+        evaluations, steps = solver.tally.tolist()
+        return FieldFrame(
+            displacement_m=displacement,
+            displacement_std_m=std.reshape(displacement.shape),
+            status=self._all_converged if easy else as_statuses(self.status_codes.tolist()),
+            residual=residual,
+            stats=SolveStats(evaluations, evaluations, steps, perf_counter() - start),
+            force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
+            held=held,
+        )
+
+    def _rescue(self, frame: _Frame) -> Float:
+        """Try what is left to try on wires that were not brought to a root: their status and whether they are
+        good, and (U,) residuals."""
+        solver, good, status = self._solver, self._good, self.status_codes
+        turns = solver.report[:, wires.TURN] == 1
+        exhausted = np.zeros_like(turns)  # whatever could be tried has been
         if self._active_only:
-            assert turns is not None
             unexplained = turns & ~self._explained()
             for u in [u for u in self._order.tolist() if unexplained[u]]:
                 turns[u] = not frame.expired
                 self._widen(u, frame)
                 exhausted[u] = True
-        held = solver.report[:, wires.HELD] == 1
-        status = self.status_codes
-        status[:] = solver.report[:, wires.STATUS]
-        good, every = self._good, self._reached(self._good)
-        if not every:
+        if not self._reached(good, status):
             status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
             lost = ~good & (status != DEADLINE) & self._solvable(frame)
             for u in [u for u in self._order.tolist() if lost[u] and not exhausted[u]]:
                 if frame.expired:
-                    status[u] = DEADLINE
-                    if turns is not None:
-                        turns[u] = False
+                    turns[u], status[u] = False, DEADLINE
                     continue
                 good[u] = self._recover(u, frame)
                 ended = int(solver.report[u, wires.STATUS])
@@ -242,34 +273,23 @@ class ExactTracker:
             solver.std[~good] = np.inf
             self._predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
         residual = solver.measure[:, wires.RESIDUAL].copy()
-        if not every:
-            for u in np.flatnonzero(~good).tolist():
-                known = status[u] != DEADLINE and not frame.expired
-                residual[u] = self._held_residual(u, frame) if known else math.inf
-        if around.keep(solver.report, good, solver.x, solver.a_solved, frame.used, self._x, self._a,
-                       self._weight, self._incomplete):  # fmt: skip
-            for u in np.flatnonzero(self._incomplete).tolist():
-                missing = frame.used[u] == 0  # what they would have been
-                self._a[u, missing] = 1.0 / (
-                    1.0 + self._relative_residual(self._x[u], np.ones(len(missing)))[missing]
-                )
-        self._predictable |= good
-        if turns is not None:  # who waits comes first, in the order of waiting
-            if turns.all():
-                self._order = self._in_order
-            else:
-                self._order = self._order[np.argsort(turns[self._order], kind="stable")]
-        displacement = self._problem.displacement_m(self._x)
-        evaluations, steps = solver.tally.tolist()
-        return FieldFrame(
-            displacement_m=displacement,
-            displacement_std_m=(solver.std * self.layout.pitch_m).reshape(displacement.shape),
-            status=self._all_converged if every else as_statuses(status.tolist()),
-            residual=residual,
-            stats=SolveStats(evaluations, evaluations, steps, perf_counter() - start),
-            force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
-            held=held,
+        for u in np.flatnonzero(~good).tolist():
+            known = status[u] != DEADLINE and not frame.expired
+            residual[u] = self._held_residual(u, frame) if known else math.inf
+        # who waits comes first, in the order of waiting
+        self._order = (
+            self._in_order if turns.all() else self._order[np.argsort(turns[self._order], kind="stable")]
         )
+        return residual
+
+    def _complete(self, frame: _Frame) -> None:
+        """The ``a`` of equations that solved wires did not have: what they would have been."""
+        solved = self._good & (self._solver.report[:, wires.HELD] == 0)
+        for u in np.flatnonzero(solved & (frame.used == 0).any(axis=1)).tolist():
+            missing = frame.used[u] == 0
+            self._a[u, missing] = 1.0 / (
+                1.0 + self._relative_residual(self._x[u], np.ones(len(missing)))[missing]
+            )
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
         """Go on from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
@@ -325,15 +345,17 @@ class ExactTracker:
         todo[u] = task
         return todo
 
-    def _reached(self, good: NDArray[np.bool_]) -> bool:
-        """Whether the solver brought all wires to a root on the branch of the rest position, into ``good``
-        (U,) which."""
+    def _reached(self, good: NDArray[np.bool_], status: NDArray[np.int64]) -> bool:
+        """Whether the solver brought all wires to a root on the branch of the rest position; into ``good``
+        (U,) which, and into ``status`` (U,) what it says of each."""
         solver, problem = self._solver, self._problem
-        return around.reach(solver.report, solver.x, self._rest_branch, problem.rest, problem.clearance, good)
+        return around.reach(
+            solver.report, solver.x, self._rest_branch, problem.rest, problem.clearance, good, status
+        )
 
     def _has_root(self, u: int) -> bool:
-        self._reached(self._good_now)
-        return bool(self._good_now[u])
+        self._reached(*self._now)
+        return bool(self._now[0][u])
 
     @property
     def _unknowns(self) -> NDArray[np.int64]:
@@ -401,8 +423,8 @@ class ExactTracker:
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
         content = (solver.report[:, wires.HELD] == 1) | (solver.measure[:, wires.CHI2] <= limit)
         whole = 3 * solver.free == self.layout.unknowns
-        self._reached(self._good_now)
-        return np.asarray(whole | (self._good_now & content))
+        self._reached(*self._now)
+        return np.asarray(whole | (self._now[0] & content))
 
     def _widen(self, u: int, frame: _Frame) -> None:
         """Let electrodes of wire u join until they explain the frame; undone where not even all do."""
@@ -489,19 +511,23 @@ class ExactTracker:
             return math.inf
         return float(np.sqrt(np.mean(self._relative_residual(self._x[u], frame.a[u])[used] ** 2)))
 
-    def _checked_frame(
+    def _begin(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None, start: float
     ) -> _Frame:
+        """The frame, checked, and a solver that has not begun with it."""
         # copies, for kernels are compiled for each kind of memory: what others give may be read-only
         self._ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         self._noise_now[:] = (
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
         )
         self._valid[:] = True if valid is None else checked_mask(valid, self.layout)
-        a, weight, used = self._a_now, self._weight_now, self._used
+        a, weight, used, solver = self._a_now, self._weight_now, self._used, self._solver
         sigma = around.take(
             self._ohm, self._problem.gain, self._noise_now, self._sigma, self._valid, a, weight, used
         )
+        around.clear(
+            DEADLINE, self._x, solver.x, solver.report, solver.measure, solver.std, solver.tally
+        )  # that of all that get no turn
         return _Frame(a, weight, used, sigma, start + self._seconds)
 
 

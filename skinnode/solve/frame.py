@@ -53,6 +53,23 @@ def take(
     return least
 
 
+@njit_brief
+def clear(
+    status: int, x: Float, start: Float, report: Index, measure: Float, std: Float, tally: Index
+) -> None:
+    """A solver that starts from ``x`` and has nothing to report of any wire but ``status``."""
+    for u in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            start[u, j] = x[u, j]
+            std[u, j] = math.inf
+        for i in range(wires.REPORT):
+            report[u, i] = 0
+        report[u, wires.STATUS] = status
+        for i in range(wires.MEASURES):
+            measure[u, i] = math.inf
+    tally[0] = tally[1] = 0
+
+
 @njit_part
 def _stale(weight: Float, before: Float) -> bool:
     stale = False
@@ -86,11 +103,14 @@ def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
 
 
 @njit_brief
-def reach(report: Index, x: Float, rest_branch: Index, rest: Float, clearance: Float, good: Flags) -> bool:
-    """Whether all wires were brought to a root on the branch of the rest position and within reach, into
-    ``good`` (U,) which."""
+def reach(
+    report: Index, x: Float, rest_branch: Index, rest: Float, clearance: Float, good: Flags, status: Index
+) -> bool:
+    """Whether all wires were brought to a root on the branch of the rest position and within reach; into
+    ``good`` (U,) which, and into ``status`` (U,) that of the report."""
     every = True
     for u in range(good.size):
+        status[u] = report[u, wires.STATUS]
         good[u] = (
             report[u, wires.STATUS] == CONVERGED
             and report[u, wires.BRANCH] * rest_branch[u] >= 0
@@ -101,32 +121,41 @@ def reach(report: Index, x: Float, rest_branch: Index, rest: Float, clearance: F
 
 
 @njit_brief
-def keep(
+def finish(
     report: Index,
     good: Flags,
     solved_x: Float,
     solved_a: Float,
+    solved_std: Float,
     used: Float,
     x: Float,
     a: Float,
     weight: Float,
-    incomplete: Flags,
+    predictable: Flags,
+    rest: Float,
+    pitch_m: float,
+    moved_m: Float,
+    std_m: Float,
+    held: Flags,
 ) -> bool:
-    """Take over position, ``a`` and weights of the wires that were solved. Whether some of these had
-    equations without weight, into ``incomplete`` (U,) which: their ``a`` there is not known yet."""
-    some = False
+    """Take over position, ``a`` and weights of the wires that were solved; displacement and deviation (U, 3N)
+    of all, and (U,) which were held. Whether a solved wire had an equation without weight: its ``a`` there is
+    not known yet."""
+    incomplete = False
     for u in range(good.size):
-        incomplete[u] = False
-        if not good[u] or report[u, wires.HELD] == 1:
-            continue
+        held[u] = report[u, wires.HELD] == 1
+        predictable[u] |= good[u]
+        if good[u] and not held[u]:
+            for j in range(x.shape[1]):
+                x[u, j] = solved_x[u, j]
+            for k in range(a.shape[1]):
+                a[u, k] = solved_a[u, k]
+                weight[u, k] = used[u, k]
+                incomplete |= used[u, k] == 0.0
         for j in range(x.shape[1]):
-            x[u, j] = solved_x[u, j]
-        for k in range(a.shape[1]):
-            a[u, k] = solved_a[u, k]
-            weight[u, k] = used[u, k]
-            incomplete[u] |= used[u, k] == 0.0
-        some |= incomplete[u]
-    return some
+            moved_m[u, j] = (x[u, j] - rest[u, j]) * pitch_m
+            std_m[u, j] = solved_std[u, j] * pitch_m
+    return incomplete
 
 
 @njit_part

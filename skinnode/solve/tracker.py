@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.model.elastic import Rubber
-from skinnode.model.frames import FieldFrame, SolveStats
+from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
 from skinnode.solve import frame
@@ -136,6 +136,7 @@ class Tracker:
         self._pause = 0  # frames until the posterior is asked again
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # what its confirmation left open of a wire
+        self._any_apart = False
         self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
         rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
         self._folded = folded_wires(layout, normal_only) | rough_noise
@@ -146,7 +147,7 @@ class Tracker:
         if self._exact is not None:
             self._exact.reset()
             self._confirmed = None
-            self._apart[:] = 0.0
+            self._apart[:], self._any_apart = 0.0, False
             self._last_m[:] = 0.0
             self._pause = 0
 
@@ -173,7 +174,7 @@ class Tracker:
         if doubtful.any():
             until, anew = start + self._seconds, bool(unsure.any())
             if self._pause or (anew and perf_counter() + self._posterior.from_rest_s > until):
-                guide = _no_answer(field)
+                field = self._give_up(field, doubtful)
             else:
                 if anew:
                     self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
@@ -182,7 +183,7 @@ class Tracker:
                 guide = self._posterior.update(frame_ohm, valid, noise)
                 if Status.DEADLINE in guide.status:
                     self._pause = PAUSE
-            field = self._refer(field, doubtful, guide)
+                field = self._refer(field, doubtful, guide)
         self._pause = max(0, self._pause - 1)
         field = self._keep_apart(field, ~doubtful)
         self._last_m[:] = field.displacement_m
@@ -218,10 +219,12 @@ class Tracker:
 
     def _keep_apart(self, field: FieldFrame, unasked: NDArray[np.bool_]) -> FieldFrame:
         """A wire that is held is no better known than when the posterior confirmed it."""
-        if field.held is None:
+        if field.held is None or not self._any_apart:
             return field
         self._apart[unasked & ~field.held] = 0.0
-        still = unasked & field.held & (self._apart[:, 0, 0] > 0.0)
+        apart_now = self._apart[:, 0, 0] > 0.0
+        self._any_apart = bool(apart_now.any())
+        still = unasked & field.held & apart_now
         if not still.any():
             return field
         apart = np.where(still[:, None, None], self._apart, 0.0)
@@ -230,6 +233,25 @@ class Tracker:
             field,
             displacement_std_m=np.hypot(field.displacement_std_m, apart),
             core_std_m=None if core is None else np.hypot(core, apart),
+        )
+
+    def _give_up(self, field: FieldFrame, doubtful: NDArray[np.bool_]) -> FieldFrame:
+        """The field where nobody is asked about the doubtful wires, for want of time."""
+        assert self._exact is not None
+        status = list(field.status)
+        for u in np.flatnonzero(doubtful).tolist():
+            if status[u] is Status.CONVERGED:
+                status[u] = Status.ILL_CONDITIONED
+        std = field.displacement_std_m.copy()
+        std[doubtful] = np.inf
+        self._apart[doubtful] = 0.0
+        self._exact.distrust(doubtful)
+        return dataclasses.replace(
+            field,
+            displacement_std_m=std,
+            core_std_m=std,
+            status=tuple(status),
+            by_prior=np.zeros_like(doubtful),
         )
 
     def _refer(self, field: FieldFrame, doubtful: NDArray[np.bool_], guide: FieldFrame) -> FieldFrame:
@@ -265,6 +287,7 @@ class Tracker:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
+        self._any_apart = True  # perhaps
 
         assert guide.core_std_m is not None
         self._exact.adopt(replaced, moved)
@@ -290,18 +313,6 @@ class Tracker:
             force_n=force,
             by_prior=replaced,
         )
-
-
-def _no_answer(field: FieldFrame) -> FieldFrame:
-    """What the posterior says that was not asked for want of time."""
-    unknown = np.full_like(field.displacement_std_m, np.inf)
-    return dataclasses.replace(
-        field,
-        status=(Status.DEADLINE,) * len(field.status),
-        displacement_std_m=unknown,
-        core_std_m=unknown,
-        stats=SolveStats(0, 0, 0, 0.0),
-    )
 
 
 def _choose(

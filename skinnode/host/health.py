@@ -33,7 +33,7 @@ SCANS_MISSED: Final = 3
 """SYNC periods without a scan after which a patch counts as stale."""
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""How long a boot-up that nobody asked for is remembered as a restart."""
+"""How long after the last of its restarts a node that restarts in a loop is said to do so."""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
@@ -55,7 +55,7 @@ class Condition(enum.StrEnum):
     STALE = "stale"
     """Operational by its heartbeat, but no scan comes."""
     RESTARTING = "restarting"
-    """Booted a moment ago without being asked to."""
+    """In a loop, by itself: see :data:`LOOP_RESTARTS`. After a single restart it is what it does."""
     FROZEN = "frozen"
     """Scans come, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
@@ -143,7 +143,6 @@ class NodeMonitor:
         self.nmt_state: int | None = None
         self._t_heartbeat_ns: int | None = None
         self._t_scan_ns: int | None = None
-        self._t_restart_ns: int | None = None
         self._boot_ups = self._emergencies = self._error_register = 0
         self._registers_said = 0
         self._last_emergency: int | None = None
@@ -179,7 +178,6 @@ class NodeMonitor:
             self._boot_ups += 1
             self._on_register(0)  # as after any reset; an error that is still there is told anew
             if self.running:
-                self._t_restart_ns = t_ns
                 self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
         else:
@@ -233,17 +231,16 @@ class NodeMonitor:
             return None if t_ns is None else max(0, now_ns - t_ns) * 1e-9
 
         heartbeat_age_s, scan_age_s = age_s(self._t_heartbeat_ns), age_s(self._t_scan_ns)
-        restart_age_s = age_s(self._t_restart_ns)
+        in_a_loop = self._in_a_loop(now_ns)
         condition = judge(
             nmt_state=self.nmt_state,
             late_heartbeats=None if heartbeat_age_s is None else heartbeat_age_s / heartbeat_s,
             late_scans=None if scan_age_s is None else scan_age_s / scan_s,
-            restarted=restart_age_s is not None and restart_age_s < RESTART_MEMORY_NS * 1e-9,
+            restarting=in_a_loop,
             error_register=self._error_register,
             refused=self.refusal is not None,
             frozen=self._watch is not None and self._watch.frozen,
         )
-        lately = restart_age_s is not None and restart_age_s < RESTART_MEMORY_NS * 1e-9
         return PatchHealth(
             patch=self.patch,
             node_id=self.node_id,
@@ -258,15 +255,17 @@ class NodeMonitor:
             error_register=self._error_register,
             rejoins=self.rejoins,
             refusal=self.refusal,
-            restarts_in_a_loop=lately and self._in_a_loop(),
+            restarts_in_a_loop=in_a_loop,
             duplicate_id=self._beats_too_often(now_ns, heartbeat_s),
             conflicts=conflicts,
             wires=() if self._watch is None else self._watch.wires,
         )
 
-    def _in_a_loop(self) -> bool:
+    def _in_a_loop(self, now_ns: int) -> bool:
         restarts = list(self._restarts)
-        return len(restarts) == LOOP_RESTARTS and restarts[-1] - restarts[0] < LOOP_NS
+        if len(restarts) < LOOP_RESTARTS or now_ns - restarts[-1] > RESTART_MEMORY_NS:
+            return False
+        return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
         """Two nodes send twice as many heartbeats as one."""
@@ -281,7 +280,7 @@ def judge(
     nmt_state: int | None,
     late_heartbeats: float | None,
     late_scans: float | None,
-    restarted: bool,
+    restarting: bool,
     error_register: int,
     refused: bool = False,
     frozen: bool = False,
@@ -293,7 +292,7 @@ def judge(
         return Condition.NEVER_SEEN
     if late_heartbeats > HEARTBEATS_MISSED:
         return Condition.LOST
-    if restarted:
+    if restarting:
         return Condition.RESTARTING
     if nmt_state != OPERATIONAL:
         return Condition.BOOTING

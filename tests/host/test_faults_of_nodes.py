@@ -104,7 +104,7 @@ def test_node_reset_in_the_middle_of_a_scan(running: Hand) -> None:
     running.inject(Faults(reset=1.0))
     assert eventually(lambda: running.fleet.injected("p0").reset == 1)
     running.fleet.inject(NO_FAULTS)
-    assert running.hears("p0", "restarting")
+    assert running.hears("p0", "boot_ups")
     assert running.well_again()
     assembler, resets = running.host.stats().patches["p0"].assembler, running.fleet.injected("p0").reset
     assert assembler.scans_discarded + assembler.scans_torn == resets
@@ -197,11 +197,8 @@ def test_bus_off_and_recovery(make_hand: Callable[..., HandConfig]) -> None:
     assert discrepancies(host.stats()) == []
 
 
-def test_fleet_that_is_started_anew_below_a_host(
-    make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fleet_that_is_started_anew_below_a_host(make_hand: Callable[..., HandConfig]) -> None:
     """Its nodes hear SYNC with a counter before they are told that there is one."""
-    monkeypatch.setattr("skinnode.host.health.RESTART_MEMORY_NS", 10_000_000)
     hand = make_hand(patches=1)
     with ExitStack() as power:
         fleet = power.enter_context(Fleet(hand))

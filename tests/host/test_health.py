@@ -35,17 +35,41 @@ def test_life_of_a_node(monitor: NodeMonitor) -> None:
     assert condition(monitor, 760 + 751) is Condition.LOST  # three of 250 ms
 
 
-def test_restart_is_remembered_for_five_seconds(monitor: NodeMonitor) -> None:
+def restarted(monitor: NodeMonitor, t_ms: int) -> None:
+    """It boots by itself, and runs again a quarter of a second later."""
+    monitor.on_heartbeat(b"\x00", t_ms * MS)
+    assert condition(monitor, t_ms + 1) in (Condition.BOOTING, Condition.RESTARTING)
+    monitor.on_heartbeat(b"\x05", (t_ms + 250) * MS)
+    monitor.on_scan((t_ms + 250) * MS)
+
+
+def test_a_node_that_restarted_once_is_what_it_does(monitor: NodeMonitor) -> None:
     monitor.running = True
     monitor.on_heartbeat(b"\x05", 0)
-    monitor.on_heartbeat(b"\x00", 100 * MS)
-    assert condition(monitor, 101) is Condition.RESTARTING
-    for t_ms in range(300, 5301, 250):
+    restarted(monitor, 100)
+    assert condition(monitor, 351) is Condition.OPERATIONAL
+    assert monitor.health(351 * MS, 0.25, 0.08).boot_ups == 1
+
+
+def test_restarting_is_a_loop_and_remembered_for_five_seconds(monitor: NodeMonitor) -> None:
+    monitor.running = True
+    for t_ms in (100, 4000, 8000):
+        restarted(monitor, t_ms)
+    assert condition(monitor, 8251) is Condition.RESTARTING
+    assert monitor.health(8251 * MS, 0.25, 0.08).restarts_in_a_loop
+    for t_ms in range(8300, 13301, 200):
         monitor.on_heartbeat(b"\x05", t_ms * MS)
         monitor.on_scan(t_ms * MS)
-    assert condition(monitor, 5099) is Condition.RESTARTING
-    assert condition(monitor, 5301) is Condition.OPERATIONAL
-    assert monitor.health(5301 * MS, 0.25, 0.08).boot_ups == 1
+    assert condition(monitor, 12999) is Condition.RESTARTING
+    assert condition(monitor, 13301) is Condition.OPERATIONAL
+    assert monitor.health(13301 * MS, 0.25, 0.08).boot_ups == 3
+
+
+def test_restarts_far_apart_are_no_loop(monitor: NodeMonitor) -> None:
+    monitor.running = True
+    for t_ms in (100, 5000, 10100):
+        restarted(monitor, t_ms)
+    assert condition(monitor, 10351) is Condition.OPERATIONAL
 
 
 def test_a_boot_up_that_was_waited_for_is_no_restart(monitor: NodeMonitor) -> None:

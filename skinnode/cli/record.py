@@ -93,15 +93,15 @@ def _listen(
 ) -> list[str]:
     from skinnode.errors import SkinError
     from skinnode.host.link import BusLink
+    from skinnode.host.mainline import Mainline
     from skinnode.host.tap import tap_link
 
     failures: list[SkinError] = []
     with ExitStack() as stack:
-        for bus in plan.buses:
-            link = BusLink(bus, {}, failures.append)
-            stack.callback(link.close)
+        links = [stack.enter_context(BusLink(bus, {}, failures.append)) for bus in plan.buses]
+        for link in links:
             tap_link(recorder, link)
-            link.run()
+        stack.enter_context(Mainline(links))
         _say(as_json, note="listening; Ctrl-C ends")
         _follow(recorder, told, seconds, as_json)
     if failures:

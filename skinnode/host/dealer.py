@@ -5,6 +5,7 @@ A :class:`~skinnode.host.link.BusLink` is fed by a bus; a replay feeds a dealer 
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,10 @@ Handler = Callable[[bytes, int], None]
 _MARK_NS: Final = 100_000_000
 _MARKS: Final = 10
 """The load is the mean over the last ten tenths of a second."""
+
+_POLL_NS: Final = 2_000_000
+"""How often the pollers are asked: what they wait for takes 5 ms at least, and frames come in batches a
+millisecond apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +83,11 @@ class Dealer:
         self._foreign_ids: dict[int, int] = {}
         self._bus_state: BusState | None = None
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
-        self._unmetered: list[Frame] = []
+        self._unmetered: list[Sequence[Frame]] = []
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._marks: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=_MARKS)
         self._load = 0.0
+        self._polled_ns = 0
 
     def handle(self, cob_id: int, handler: Handler) -> None:
         """From now on ``handler`` gets the data frames of ``cob_id``, on the mainline."""
@@ -97,7 +103,8 @@ class Dealer:
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None]) -> None:
-        """From now on ``poller`` is told the time, monotonic ns, after each batch of frames."""
+        """From now on ``poller`` is told the time, monotonic ns, after a batch of frames and when none come;
+        not more often than every 2 ms."""
         self._pollers = (*self._pollers, poller)
 
     def count_sent(self, can_id: int, data: bytes) -> None:
@@ -111,28 +118,35 @@ class Dealer:
         for listener in self._listeners:
             listener(batch)
         handlers, takes_fd = self._handlers, self.config.fd
-        keep, before = self._unmetered.append, len(self._unmetered)
+        others: list[Frame] = []
         for frame in batch:
             can_id, data, t_ns, remote, error, extended, fd = frame
             if remote or error or extended or (fd and not takes_fd):
-                if error:
-                    self._on_error_frame(frame)
-                else:
-                    self._ignored += 1
+                others.append(frame)
                 continue
-            keep(frame)
             handler = handlers.get(can_id)
             if handler is None:
                 self._foreign += 1
                 self._foreign_ids[can_id] = self._foreign_ids.get(can_id, 0) + 1
                 continue
             handler(data, t_ns)
-        self._received += len(self._unmetered) - before
+        if others:
+            set_aside = {id(frame) for frame in others}
+            batch = [frame for frame in batch if id(frame) not in set_aside]
+            for frame in others:
+                if frame.error:
+                    self._on_error_frame(frame)
+                else:
+                    self._ignored += 1
+        self._received += len(batch)
+        self._unmetered.append(batch)
 
     def poll(self, now_ns: int) -> None:
         """Tell the pollers the time, after a batch."""
-        for poll in self._pollers:
-            poll(now_ns)
+        if not 0 <= now_ns - self._polled_ns < _POLL_NS:
+            self._polled_ns = now_ns
+            for poll in self._pollers:
+                poll(now_ns)
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
 
@@ -184,9 +198,13 @@ class Dealer:
 
     def _mark(self, now_ns: int) -> None:
         """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
-        for frame in self._unmetered:
-            self._meter.add(frame.can_id, frame.data, fd=frame.fd)
+        frames = list(itertools.chain.from_iterable(self._unmetered))
         self._unmetered.clear()
+        self._meter.add_all(
+            [frame.can_id for frame in frames],
+            [frame.data for frame in frames],
+            [frame.fd for frame in frames],
+        )
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

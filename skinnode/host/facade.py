@@ -21,6 +21,7 @@ from skinnode.host.hand_frame import HandGatherer, HandSubscription
 from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
+from skinnode.host.mainline import Mainline
 from skinnode.host.pipeline import Lane, LaneStats, check_solvable
 from skinnode.host.publish import Publisher, Subscription
 from skinnode.host.reception import receive_bus, receive_patch
@@ -171,7 +172,7 @@ class Host:
             buses = {
                 bus.name: _serve_bus(
                     hand,
-                    stack.enter_context(contextlib.closing(BusLink(bus, {}, publisher.fail, open_port))),
+                    stack.enter_context(BusLink(bus, {}, publisher.fail, open_port)),
                     ticks if bus.role == "master" else Ticks(hand.sync.counter_overflow),
                 )
                 for bus in hand.buses
@@ -184,18 +185,16 @@ class Host:
                     tap_link(tap, bus.link)
                 for station in stations:
                     station.lane.tap = tap
-            for bus in buses.values():  # everybody knows by now what to do with what comes
-                bus.link.run()
-            for patch in hand.patches:
-                go_on_unless(cancelled)
-                check_solvable(patch, hand.solver)
             # Undone in this order from below: SYNC stops, the scans under way end, nobody is brought up any
-            # more, nodes fall silent, mainlines end, boxes are emptied, workers end, interfaces close,
+            # more, nodes fall silent, the mainline ends, boxes are emptied, workers end, interfaces close,
             # subscribers hear the end.
             for station in stations:
                 stack.callback(station.lane.close)
-            for bus in buses.values():
-                stack.callback(bus.link.stop)
+            # Everybody knows by now what to do with what comes.
+            stack.enter_context(Mainline([bus.link for bus in buses.values()]))
+            for patch in hand.patches:
+                go_on_unless(cancelled)
+                check_solvable(patch, hand.solver)
             try:
                 ready = bring_up_all(stations, hand.bring_up.missing, boot_deadline_s, cancelled)
                 for station in stations:

@@ -1,4 +1,4 @@
-"""One bus of the hand: its port, its receive thread, and its mainline."""
+"""One bus of the hand: its port, and what becomes of what is received there and sent."""
 
 from __future__ import annotations
 
@@ -14,26 +14,22 @@ from skinnode.errors import BusError, CodecError, SkinError
 from skinnode.host.dealer import BusStats, Dealer, Handler
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.model.config import BusConfig
-from skinnode.transport import CanPort, Frame, Receiver
+from skinnode.transport import CanPort, Frame, Intake
 from skinnode.wire.indices import sdo_response_cob_id
 
 _log = logging.getLogger(__name__)
-
-_WAIT_S: Final = 0.02
-"""How long the mainline waits for a frame before it looks at the clock for scans that lack something."""
-
 
 _REOPEN_S: Final = 0.1
 """Pause before an interface that failed is opened again."""
 
 
 class BusLink(Dealer):
-    """An open bus. It receives from construction to :meth:`close`, and deals out from :meth:`run` or the
-    beginning of a ``with`` block on.
+    """An open bus, from construction to :meth:`close` or the end of a ``with`` block. A
+    :class:`~skinnode.host.mainline.Mainline` makes it deal out what comes.
 
-    ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once, from
-    the mainline, if a handler fails. Raises BusError where the interface does not open. An interface that
-    fails later is opened again and again until it is back.
+    ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once if a
+    handler fails; nothing is dealt out any more then. Raises BusError where the interface does not open. An
+    interface that fails later is opened again and again until it is back.
     """
 
     def __init__(
@@ -50,18 +46,17 @@ class BusLink(Dealer):
         self.failure: BusError | None = None
         """Why the bus is away; None while it is there."""
         self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
-        self._outages = self._dropped_before = 0
+        self._outages = 0
         self.t_dealt_ns = 0
         """What was received up to then has been dealt out, monotonic."""
+        self._rests = False  # while the bus is away, and for good after a defect
+        self._resume: Callable[[], None] = lambda: None
+        self._reopening: threading.Thread | None = None
         self._stop = threading.Event()
         self._port = open_port(config)
+        self.intake = Intake(self._port)
+        """What is received and not dealt out yet."""
         self.network = SkinNetwork(self.send)
-        self._receiver = Receiver(self._port)
-        self._thread = threading.Thread(target=self._run, name=f"mainline {config.name}", daemon=True)
-
-    def run(self) -> None:
-        """Begin to deal frames out; those received before come first."""
-        self._thread.start()
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send a data frame, from any thread. Raises BusError."""
@@ -107,27 +102,18 @@ class BusLink(Dealer):
     def stats(self) -> BusStats:
         return self.count(
             sent=self._port.sent,
-            dropped=self._dropped_before + self._receiver.dropped,
+            dropped=self.intake.dropped,
             outages=self._outages,
             read=self._port.received,
-            waiting=self._receiver.queued,
+            waiting=self.intake.queued,
             kernel_dropped=self._port.dropped,
         )
 
-    def stop(self) -> None:
-        """End and join the mainline; frames can still be sent."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join()
-
     def close(self) -> None:
-        """End all threads and close the interface."""
-        self.stop()
-        self._receiver.close()
+        """Close the interface. The mainline must have ended before."""
         self._port.close()
 
     def __enter__(self) -> Self:
-        self.run()
         return self
 
     def __exit__(
@@ -135,46 +121,36 @@ class BusLink(Dealer):
     ) -> None:
         self.close()
 
-    def _run(self) -> None:
-        try:
-            while not self._stop.is_set():
-                try:
-                    heard = self._turn()
-                    if self.failure is not None and (heard or time.monotonic() > self._due_s):
-                        self.failure = None
-                        _log.warning("%s: the bus is back", self.config.name)
-                except BusError as error:
-                    self._reopen(error)
-        except Exception as error:  # a defect of ours: it must reach the user, not die with the thread
-            _log.debug("bus %s", self.config.name, exc_info=True)
-            failure = SkinError(f"bus {self.config.name!r}: {type(error).__name__}: {error}")
-            failure.__cause__ = error
-            self._on_failure(failure)
+    # --- the mainline's
 
-    def _reopen(self, error: BusError) -> None:
-        """Open the interface again; one that does not open, or fails at once, is tried after a pause."""
-        if self.failure is None:
-            self._outages += 1
-            self.failure = error
-            _log.warning("%s; tried again until it is back", error)
-        self._receiver.close()
-        while not self._stop.wait(_REOPEN_S):
-            try:
-                self._port.reopen()
-            except BusError:
-                continue
-            self._dropped_before += self._receiver.dropped
-            self._receiver = Receiver(self._port)
-            self._due_s = time.monotonic() + _REOPEN_S
+    def begin(self, resume: Callable[[], None]) -> None:
+        """Before the first turn. ``resume``: receives again on an interface that was opened again."""
+        self._resume = resume
+
+    def turn(self) -> None:
+        """What was received since the last turn, to its handlers. Raises nothing."""
+        if self._rests:
             return
+        try:
+            heard = self._deal_out()
+            if self.failure is not None and (heard or time.monotonic() > self._due_s):
+                self.failure = None
+                _log.warning("%s: the bus is back", self.config.name)
+        except BusError as error:
+            self._go_away(error)
+        except Exception as error:  # a defect of ours: it must reach the user, and the other buses go on
+            self._fail(error)
 
-    def _turn(self) -> bool:
+    def end(self) -> None:
+        """After the last turn: open the interface no more."""
+        self._stop.set()
+        if self._reopening is not None:
+            self._reopening.join()
+
+    def _deal_out(self) -> bool:
         """One batch of frames to their handlers; whether there was any."""
-        receiver = self._receiver
-        batch, seen_ns = receiver.get_batch(_WAIT_S), self.t_dealt_ns
-        if not batch:
-            seen_ns = receiver.seen_ns
-            batch = receiver.get_batch(0.0)
+        seen_ns = self.intake.seen_ns  # first: whatever came before it is in the batch
+        batch = self.intake.take()
         while self._jobs:
             self._jobs.popleft()()
         self.deal(batch)
@@ -183,3 +159,36 @@ class BusLink(Dealer):
         self.t_dealt_ns = batch[-1].t_ns if batch else max(seen_ns, self.t_dealt_ns)
         self.poll(self.t_dealt_ns)
         return bool(batch)
+
+    def _go_away(self, error: BusError) -> None:
+        """Have the interface opened again, on a thread of its own: that may take long."""
+        if self.failure is None:
+            self._outages += 1
+            self.failure = error
+            _log.warning("%s; tried again until it is back", error)
+        self._rests = True
+        name = f"reopen {self.config.name}"
+        self._reopening = threading.Thread(target=self._reopen, name=name, daemon=True)
+        self._reopening.start()
+
+    def _reopen(self) -> None:
+        """One that does not open, or fails at once, is tried after a pause."""
+        try:
+            while not self._stop.wait(_REOPEN_S):
+                try:
+                    self._port.reopen()
+                except BusError:
+                    continue
+                self._due_s = time.monotonic() + _REOPEN_S
+                self._resume()
+                self._rests = False
+                return
+        except Exception as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        self._rests = True
+        _log.debug("bus %s", self.config.name, exc_info=True)
+        failure = SkinError(f"bus {self.config.name!r}: {type(error).__name__}: {error}")
+        failure.__cause__ = error
+        self._on_failure(failure)

@@ -1,7 +1,7 @@
 """Keeps the nodes of a running hand running: who comes back is brought up again, whoever comes late is taken
 up, whose baseline changed is read again. Each for itself; the others do not notice.
 
-One thread looks fifty times a second at what the mainlines have written down and decides. What waits for a
+One thread looks fifty times a second at what the mainline has written down and decides. What waits for a
 node (bring-up, reading a baseline) is done by a pool, one job a node at a time, and looked at when it is
 done. So all state here has one owner.
 

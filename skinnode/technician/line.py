@@ -10,6 +10,7 @@ from typing import Final, NamedTuple, Self
 from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
+from skinnode.host.mainline import Mainline
 from skinnode.host.network import RemoteOd
 from skinnode.model.config import BusConfig
 from skinnode.technician.heard import Beat, Heard
@@ -57,7 +58,7 @@ class Line:
         self.link.listen(self.heard.on_frames)
         self.lss = LssMaster(self.link.send)
         self.link.handle(od.LSS_RESPONSE_COB_ID, self.lss.on_response)
-        self.link.run()
+        self._mainline = Mainline([self.link])
 
     def od(self, node_id: int) -> RemoteOd:
         """The object dictionary of a node."""
@@ -123,6 +124,7 @@ class Line:
         return State(None, "no heartbeat, no guarding")
 
     def close(self) -> None:
+        self._mainline.stop()
         self.link.close()
 
     def __enter__(self) -> Self:

@@ -1,7 +1,7 @@
-"""The only users of python-can at run time: a port on a bus and the thread that empties it."""
+"""The only users of python-can at run time: ports on buses and the threads that empty them."""
 
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
-from skinnode.transport.receiver import Receiver
+from skinnode.transport.receiver import Intake, Receiver
 
-__all__ = ["CanPort", "Frame", "Receiver"]
+__all__ = ["CanPort", "Frame", "Intake", "Receiver"]

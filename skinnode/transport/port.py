@@ -142,6 +142,11 @@ class CanPort:
         """Whether :meth:`recv_batch` may return more than one frame."""
         return self._reader is not None
 
+    def fileno(self) -> int:
+        """Of the socket of a port that :attr:`reads_batches`, to wait for several at once; -1 while it is
+        closed."""
+        return -1 if self._reader is None else self._reader.fileno()
+
     @property
     def sent(self) -> int:
         """Frames handed to the interface."""

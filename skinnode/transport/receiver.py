@@ -1,15 +1,18 @@
-"""The receive context: a thread that copies frames into a bounded queue, counts what does not fit, and
-nothing else. Whoever owns the receiver reads whole batches from the other end."""
+"""The receive context: threads that copy frames into bounded queues, count what does not fit, and nothing
+else. Whoever owns the receiver takes whole batches from the other end."""
 
 from __future__ import annotations
 
+import contextlib
 import queue
+import select
 import threading
 import time
+from collections import deque
+from collections.abc import Iterable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
-from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
@@ -17,7 +20,7 @@ CAPACITY_FRAMES: Final = 16384
 """Two seconds of a full bus at 1 Mbit/s (8,000 frames/s): longer than any pause a host survives otherwise."""
 
 _POLL_S: Final = 0.02
-"""How long the thread waits for a frame before it says that there is none, and sees whether it should end."""
+"""How long a thread waits for a frame before it says that there is none, and sees whether it should end."""
 
 
 GATHER_S: Final = 1e-3
@@ -26,29 +29,23 @@ frames a second would spend more on waking than on frames. The first frame after
 it, and each has the time of its arrival."""
 
 
-class Receiver:
-    """Frames of ``port``, received on a thread of its own from construction until :meth:`close`.
+class Intake:
+    """Frames of ``port`` on their way from the thread that receives them to the one that takes them.
 
     When the queue is full the newest frame is dropped, as a kernel socket does: what has been queued stays
     complete and in order, and only the thread that fills the queue ever touches its end. ``dropped`` counts.
-
-    An error of the bus ends the thread and is raised to the reader, after the frames that came before it.
     """
 
     def __init__(self, port: CanPort, capacity: int = CAPACITY_FRAMES) -> None:
         if capacity < 1:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
-        self._port = port
-        self._capacity = capacity
-        self._queue: queue.SimpleQueue[list[Frame] | None] = queue.SimpleQueue()  # None: the bus failed
-        self._left: list[Frame] = []  # of a batch that was longer than asked for
-        self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the thread's
+        self.port = port
         self.seen_ns = 0
         """Whatever came before is queued, or was dropped; monotonic."""
-        self._error: BusError | None = None
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"receive {port.config.name}", daemon=True)
-        self._thread.start()
+        self._capacity = capacity
+        self._queue: deque[list[Frame]] = deque()
+        self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the receiver's
+        self._error: Exception | None = None
 
     @property
     def dropped(self) -> int:
@@ -57,36 +54,102 @@ class Receiver:
 
     @property
     def queued(self) -> int:
-        """Frames waiting to be read."""
+        """Frames waiting to be taken."""
         taken = self._taken  # first: there are never fewer put than taken
         return self._put - taken
 
-    def get_batch(self, timeout_s: float, max_frames: int = 1024) -> list[Frame]:
-        """All frames waiting, at most ``max_frames``, in order of arrival; waits up to ``timeout_s`` for the
-        first and returns an empty list if there is none. Raises BusError once the bus has failed."""
-        frames, self._left = self._left, []
-        try:
-            while len(frames) < max_frames:
-                wait_s = 0.0 if frames else timeout_s
-                batch = self._queue.get(timeout=wait_s) if wait_s > 0.0 else self._queue.get_nowait()
-                if batch is None:
-                    self._queue.put(None)  # whoever asks next hears of the failure too
-                    break
-                frames = frames + batch if frames else batch
-        except queue.Empty:
-            pass
-        else:
-            if not frames:
-                assert self._error is not None  # set before the mark was queued
-                raise self._error
-        frames, self._left = frames[:max_frames], frames[max_frames:]
+    def take(self) -> list[Frame]:
+        """All frames waiting, in order of arrival; never waits. Raises BusError once the bus has failed,
+        after the frames that came before; and whatever else went wrong in receiving."""
+        error, batches = self._error, self._queue  # the error first: what is queued came before it
+        if not batches:
+            if error is not None:
+                raise error
+            return []
+        frames = batches.popleft()
+        for _ in range(len(batches)):
+            frames += batches.popleft()
         self._taken += len(frames)
         return frames
 
+    # --- the receiver's
+
+    @property
+    def failed(self) -> bool:
+        """Whether nothing more is received until :meth:`Receiver.resume`."""
+        return self._error is not None
+
+    def resume(self) -> None:
+        """Forget the error."""
+        self._error = None
+
+    def fetch(self, timeout_s: float) -> bool:
+        """Queue what has come, waiting up to ``timeout_s`` for it; whether there is anything new to take."""
+        now_ns = time.monotonic_ns()
+        try:
+            frames = self.port.recv_batch(timeout_s)
+        except Exception as error:  # a defect, too, must reach the reader and not die with the thread
+            self._error = error
+            return True
+        if not frames:
+            self.seen_ns = now_ns
+            return False
+        seen_ns = frames[-1].t_ns
+        room = self._capacity - self.queued
+        if len(frames) > room:
+            self._dropped += len(frames) - room
+            frames = frames[:room]
+        if frames:
+            self._put += len(frames)
+            self._queue.append(frames)
+        self.seen_ns = seen_ns
+        return True
+
+
+class Receiver:
+    """Receives on the ports of ``intakes`` from construction until :meth:`close`.
+
+    Ports that read batches share one thread: for as many buses it wakes as often as for one. Any other may
+    block in python-can, and has a thread of its own. What goes wrong on a port ends its receiving alone.
+    """
+
+    def __init__(self, intakes: Sequence[Intake]) -> None:
+        self._news: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._joining: deque[Intake] = deque()  # to those of the shared thread
+        self._stop = threading.Event()
+        self._shared: threading.Thread | None = None
+        self._alone: dict[Intake, threading.Thread] = {}
+        if any(intake.port.reads_batches for intake in intakes):
+            self._shared = threading.Thread(target=self._receive_batches, name="receive", daemon=True)
+            self._shared.start()
+        for intake in intakes:
+            self.resume(intake)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait up to ``timeout_s`` until there is something to take. One thread may."""
+        with contextlib.suppress(queue.Empty):
+            self._news.get(timeout=timeout_s)
+
+    def resume(self, intake: Intake) -> None:
+        """Receive again on a port that failed and was opened again. From any thread."""
+        intake.resume()
+        if intake.port.reads_batches:
+            self._joining.append(intake)
+            return
+        if intake in self._alone:
+            self._alone[intake].join()  # it ended with the failure
+        name = f"receive {intake.port.config.name}"
+        thread = threading.Thread(target=self._receive_alone, args=(intake,), name=name, daemon=True)
+        self._alone[intake] = thread
+        thread.start()
+
     def close(self) -> None:
-        """End and join the thread. The port stays open: it belongs to whoever opened it."""
+        """End and join the threads. The ports stay open: they belong to whoever opened them."""
         self._stop.set()
-        self._thread.join()
+        for thread in self._alone.values():
+            thread.join()
+        if self._shared is not None:
+            self._shared.join()
 
     def __enter__(self) -> Self:
         return self
@@ -96,33 +159,40 @@ class Receiver:
     ) -> None:
         self.close()
 
-    def _run(self) -> None:
-        receive, put = self._port.recv_batch, self._queue.put
-        stopped, pause_s = self._stop.is_set, GATHER_S if self._port.reads_batches else 0.0
-        try:
-            while not stopped():
-                frames = receive(_POLL_S)
-                if not frames:
-                    now_ns = time.monotonic_ns()
-                    frames = receive(
-                        0.0
-                    )  # this thread may have been away since it was told that there is none
-                    if not frames:
-                        self.seen_ns = now_ns
-                        continue
-                room = self._capacity - self.queued
-                if len(frames) > room:
-                    self._dropped += len(frames) - room
-                    frames = frames[:room]
-                self._put += len(frames)
-                put(frames)
-                if frames:
-                    self.seen_ns = frames[-1].t_ns
-                if pause_s:
-                    time.sleep(pause_s)
-        except BusError as error:
-            self._error = error
-            put(None)
+    def _receive_batches(self) -> None:
+        intakes: dict[Intake, None] = {}  # in order, each once
+        poll = select.poll()
+        while not self._stop.is_set():
+            if self._joining:
+                while self._joining:
+                    intakes[self._joining.popleft()] = None
+                poll = _poll_of(intakes)
+            if not sum(intake.fetch(0.0) for intake in intakes):
+                poll.poll(_POLL_S * 1e3)
+                continue
+            if any(intake.failed for intake in intakes):
+                intakes = {intake: None for intake in intakes if not intake.failed}
+                poll = _poll_of(intakes)
+            self._tell()
+            time.sleep(GATHER_S)
+
+    def _receive_alone(self, intake: Intake) -> None:
+        while not (self._stop.is_set() or intake.failed):
+            # Asked twice: this thread may have been away since it was told that there is none.
+            if intake.fetch(_POLL_S) or intake.fetch(0.0):
+                self._tell()
+
+    def _tell(self) -> None:
+        if self._news.empty():  # once is enough
+            self._news.put(None)
+
+
+def _poll_of(intakes: Iterable[Intake]) -> select.poll:
+    poll = select.poll()
+    for intake in intakes:
+        with contextlib.suppress(ValueError):  # it was closed: the next fetch says so
+            poll.register(intake.port.fileno(), select.POLLIN)
+    return poll
 
 
 def drain(port: CanPort, within_s: float) -> list[Frame]:

@@ -10,10 +10,9 @@ import ctypes
 import errno
 import os
 import socket
+import struct
+from collections.abc import Iterator
 from typing import Any, Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 
 class _Iovec(ctypes.Structure):
@@ -40,6 +39,11 @@ class _Message(ctypes.Structure):
     _fields_ = (("head", _Head), ("length", ctypes.c_uint))
 
 
+_USED: Final = struct.Struct(
+    f"@{_Head.control_length.offset}xN"
+    f"{_Message.length.offset - _Head.control_length.offset - _Head.control_length.size}xI"
+    f"{ctypes.sizeof(_Message) - _Message.length.offset - _Message.length.size}x"
+)
 _libc: Final = ctypes.PyDLL(None, use_errno=True)
 
 
@@ -47,47 +51,52 @@ class MessageBatch:
     """Room for ``count`` messages of up to ``size`` bytes with ``control`` bytes of ancillary data each."""
 
     def __init__(self, count: int, size: int, control: int) -> None:
-        self.size, self.control = size, control
-        self._payload, self._ancillary = (
-            memoryview(bytearray(count * size)),
-            memoryview(bytearray(count * control)),
-        )
+        self._count, self._size, self._record = count, size, size + control
+        self._room = memoryview(bytearray(count * self._record))
         self._vectors = (_Iovec * count)()
         self._messages = (_Message * count)()
-        payload, ancillary, vectors = map(_address, (self._payload, self._ancillary, self._vectors))
+        room, vectors = _address(self._room), ctypes.addressof(self._vectors)
         for i, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
-            vector.base, vector.length = payload + i * size, size
+            vector.base, vector.length = room + i * self._record, size
             message.head.vector, message.head.vector_length = vectors + i * ctypes.sizeof(_Iovec), 1
-            message.head.control, message.head.control_length = ancillary + i * control, control
+            message.head.control, message.head.control_length = room + i * self._record + size, control
         self._fresh = bytes(self._messages)
-        self._count = count
         self._memory = memoryview(self._messages).cast("B")
-        self._lengths = self._every(_Message.length.offset, np.uintc)
-        self._control_lengths = self._every(_Head.control_length.offset, np.uintp)
+        self._got = 0
 
-    def receive(self, sock: socket.socket, most: int) -> tuple[list[int], list[int]]:
-        """Lengths of the messages that wait, at most ``most`` and ``count``, and of their ancillary data. It
-        does not wait. Raises OSError; where messages came before the error, it is raised by the next call."""
-        count = min(most, self._count)
-        got = _libc.recvmmsg(sock.fileno(), self._messages, count, socket.MSG_DONTWAIT, None)
+    def receive(self, sock: socket.socket, most: int) -> int:
+        """How many messages were waiting, at most ``most`` and ``count``; they take the place of those
+        before. It does not wait. Raises OSError; where messages came before the error, it is raised by the
+        next call."""
+        used = self._got * _USED.size
+        self._memory[:used] = self._fresh[:used]  # the kernel wrote there what it used of the room
+        self._got = 0
+        got = _libc.recvmmsg(sock.fileno(), self._messages, min(most, self._count), socket.MSG_DONTWAIT, None)
         if got < 0:
             error = ctypes.get_errno()
             if error in (errno.EAGAIN, errno.EWOULDBLOCK):
-                return [], []
+                return 0
             raise OSError(error, os.strerror(error))
-        lengths, control = self._lengths[:got].tolist(), self._control_lengths[:got].tolist()
-        used = got * ctypes.sizeof(_Message)
-        self._memory[:used] = self._fresh[:used]  # the kernel wrote there what it used of the room
-        return lengths, control
+        self._got = got
+        return self._got
 
-    def taken(self, count: int) -> tuple[bytes, bytes]:
-        """A copy of the first ``count`` messages, and of their ancillary data."""
-        return bytes(self._payload[: count * self.size]), bytes(self._ancillary[: count * self.control])
+    def used(self) -> Iterator[tuple[int, int]]:
+        """Bytes of ancillary data and of the message, of each message received."""
+        return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
-    def _every(self, offset: int, kind: type[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
-        """The number at ``offset`` of every message, as it is at any time."""
-        numbers = np.frombuffer(self._memory, dtype=kind)
-        return numbers[offset // numbers.itemsize :: ctypes.sizeof(_Message) // numbers.itemsize]
+    def taken(self) -> memoryview:
+        """The messages received, each followed by its ancillary data, both with the room they left."""
+        return self._room[: self._got * self._record]
+
+    def payload(self, number: int, length: int) -> bytes:
+        """A copy of the message of this number."""
+        at = number * self._record
+        return bytes(self._room[at : at + length])
+
+    def control(self, number: int, length: int) -> bytes:
+        """A copy of its ancillary data."""
+        at = number * self._record + self._size
+        return bytes(self._room[at : at + length])
 
 
 def _address(memory: Any) -> int:

@@ -35,8 +35,9 @@ _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
 _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that is a time and nothing else
-_CONTROLS: Final = struct.Struct(f"@Nii6q{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
-_HEADERS: Final = struct.Struct(f"<IBB2x{FD_MTU - HEADER.size}x")
+_STAMP_HEAD: Final = _CONTROL.pack(socket.CMSG_LEN(_STAMPS.size), socket.SOL_SOCKET, _SO_TIMESTAMPING)
+_RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}sqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
+"""A frame and its time as they usually are: identifier, length, 8 bytes, head, software and hardware time."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _FLAGS: Final = _EXTENDED | _REMOTE | _ERROR
@@ -76,44 +77,51 @@ class SocketReader:
         )
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
+    def fileno(self) -> int:
+        """Of the socket; -1 when it was closed."""
+        return self._sock.fileno()
+
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
         """Frames that wait, at most ``most`` or a batch; waits up to ``timeout_s`` for the first. Raises
         OSError if the interface fails."""
-        lengths, controls_used = self._batch.receive(self._sock, most)
-        if not lengths:
-            if not self._poll.poll(max(0, round(timeout_s * 1e3))):
-                return []
-            lengths, controls_used = self._batch.receive(self._sock, most)
+        batch = self._batch
+        if not batch.receive(self._sock, most) and (
+            timeout_s <= 0.0
+            or not self._poll.poll(round(timeout_s * 1e3))
+            or not batch.receive(self._sock, most)
+        ):
+            return []
         now_ns = time.monotonic_ns()
         wall_to_mono_ns = now_ns - time.time_ns()
-        payload, controls = self._batch.taken(len(lengths))
+        earliest_ns, latest_ns = now_ns - _OLDEST_NS, now_ns + _NEWEST_NS
         frames: list[Frame] = []
-        new, at = tuple.__new__, 0  # a NamedTuple's own __new__ takes twice as long
-        heads, stamps = _HEADERS.iter_unpack(payload), _CONTROLS.iter_unpack(controls)
-        for length, control, head, stamp in zip(lengths, controls_used, heads, stamps, strict=True):
-            word, used, _ = head
-            _, _, kind, seconds, nanoseconds, _, _, hardware_s, _ = stamp
-            if control == _STAMPED_BYTES and kind == _SO_TIMESTAMPING and seconds and not hardware_s:
+        new = tuple.__new__  # a NamedTuple's own __new__ takes twice as long
+        for (control, length), record in zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True):
+            word, size, data, head, seconds, nanoseconds, hardware_s = record
+            if control == _STAMPED_BYTES and head == _STAMP_HEAD and seconds and not hardware_s:
                 t_ns = seconds * 1_000_000_000 + nanoseconds + wall_to_mono_ns
-                if not -_NEWEST_NS < now_ns - t_ns < _OLDEST_NS:
+                if not earliest_ns < t_ns < latest_ns:
                     t_ns = now_ns
             else:
-                t_ns = self._arrival(controls, len(frames), control, now_ns, wall_to_mono_ns)
-            data, fd = payload[at + HEADER.size : at + HEADER.size + used], length == FD_MTU
+                t_ns = self._arrival(batch.control(len(frames), control), now_ns, wall_to_mono_ns)
+            fd = length == FD_MTU
+            if size != 8:
+                data = batch.payload(len(frames), length)[HEADER.size : HEADER.size + size]
+            if word <= 0x7FF:
+                frames.append(new(Frame, (word, data, t_ns, False, False, False, fd)))
+                continue
             remote, error, extended = word & _REMOTE != 0, word & _ERROR != 0, word & _EXTENDED != 0
             can_id = word & (0x1FFF_FFFF if extended or error else 0x7FF)
             frames.append(new(Frame, (can_id, b"" if remote else data, t_ns, remote, error, extended, fd)))
-            at += FD_MTU
         return frames
 
-    def _arrival(self, controls: bytes, number: int, used: int, now_ns: int, wall_to_mono_ns: int) -> int:
-        """When the frame of this number in the batch came in, by the monotonic clock."""
-        t_ns, at = now_ns, number * _ANCILLARY_BYTES
-        end = at + used
-        while at < end:
-            length, _, kind = _CONTROL.unpack_from(controls, at)
+    def _arrival(self, control: bytes, now_ns: int, wall_to_mono_ns: int) -> int:
+        """When the frame with this ancillary data came in, by the monotonic clock."""
+        t_ns, at = now_ns, 0
+        while at < len(control):
+            length, _, kind = _CONTROL.unpack_from(control, at)
             if kind == _SO_TIMESTAMPING:
-                stamps = _STAMPS.unpack_from(controls, at + _CONTROL.size)
+                stamps = _STAMPS.unpack_from(control, at + _CONTROL.size)
                 seconds, nanoseconds, _, _, hardware_s, hardware_ns = stamps
                 if seconds:
                     t_ns = seconds * 1_000_000_000 + nanoseconds + wall_to_mono_ns
@@ -123,7 +131,7 @@ class SocketReader:
                 if hardware_s:
                     t_ns = self._delay.arrival_ns(hardware_s * 1_000_000_000 + hardware_ns, t_ns)
             elif kind == _SO_RXQ_OVFL:
-                (self.dropped,) = _DROPS.unpack_from(controls, at + _CONTROL.size)
+                (self.dropped,) = _DROPS.unpack_from(control, at + _CONTROL.size)
             at += -(-length // _ALIGNED) * _ALIGNED
         return t_ns
 

@@ -19,6 +19,7 @@ bits inter-frame space) at the nominal one.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
@@ -37,6 +38,7 @@ _FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11 bits identifier, RRS, IDE, FDF, res
 _RUN: Final = 5
 _NO_RUN: Final = 0
 _ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
+_STUFF_SHIFT: Final = 12
 
 _Int = NDArray[np.int64]
 
@@ -116,22 +118,18 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
     length = payload.shape[1]
     if length not in FD_LENGTHS or np.any((ids < 0) | (ids > 0x7FF)):
         raise ValueError(f"can_id, data: got {length} bytes, must be one of {FD_LENGTHS}, and 11-bit numbers")
-    _, next_run, stuffed = _array_tables()
     # 22 bits up to the length code are two less than three bytes, and the data follow bytewise. FDF, res and
     # BRS alternate: no stuff bit stands between the first two bytes (nominal) and ESI.
-    head = 0b01 << 22 | ids << 10 | 0b10100000 | FD_LENGTHS.index(length)
-    run = np.full(ids.shape, _NO_RUN, dtype=np.int64)
-    stuff = [np.zeros_like(ids), np.zeros_like(ids)]
-    byte = head
-    for number, byte in enumerate([head >> 16, head >> 8 & 0xFF, head & 0xFF, *payload.T.astype(np.int64)]):
-        at = run << 8 | byte
-        stuff[number > 1] += stuffed[at]
-        run = next_run[at]
+    stream = np.empty((3 + length, len(ids)), np.int64)
+    stream[:3] = _three_bytes(0b01 << 22 | ids << 10 | 0b10100000 | FD_LENGTHS.index(length))
+    stream[3:] = payload.T
+    last = stream[-1] & 1
+    nominal, fast, run = _stuff_bits(stream, 2)
     # A stuff bit due after the last bit is not sent: the first fixed one stands there.
-    stuff[1] -= (run - 1 >> 2) != (byte & 1)
+    fast -= (run - 1 >> 2) != last
     crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
     data_bits = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1  # ESI, DLC, data, count, CRC, delimiter
-    return _FD_NOMINAL_BITS + stuff[0], data_bits + stuff[1]
+    return _FD_NOMINAL_BITS + nominal, data_bits + fast
 
 
 @functools.cache
@@ -190,31 +188,39 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 def _bits_of_one_length(ids: _Int, length: int, payload: NDArray[np.uint8]) -> _Int:
-    crc_table, next_run, stuffed = _array_tables()
     head = ids << 7 | length
-    crc = np.zeros_like(ids)
-    columns = [head >> 16, head >> 8 & 0xFF, head & 0xFF, *payload[:, :length].T.astype(np.int64)]
-    for byte in columns:
-        crc = (crc << 8 & 0x7FFF) ^ crc_table[crc >> 7 ^ byte]
+    columns = np.empty((3 + length, len(ids)), np.int64)
+    columns[:3] = _three_bytes(head)
+    columns[3:] = payload[:, :length].T
+    # The CRC is linear: that of a frame is the sum of those that its bytes would have alone.
+    of_byte, place = _crc_by_place(), np.arange(2 + length, -1, -1)
+    crc = np.bitwise_xor.reduce(of_byte.take(columns + 256 * place[:, None]), axis=0)
 
     # 19 + 15 bits of head and CRC are two more than four bytes: six bits of filler make it five. The bytes
     # of the stuffed region straddle those of the payload, so they are cut from pairs of neighbours.
-    n_bits = _HEAD_BITS + 8 * length + _CRC_BITS
-    filler = (_ALTERNATING & 0x3F) << 18 | head >> 1  # 6 + 18 bits: three bytes
-    stream = [filler >> 16, filler >> 8 & 0xFF, filler & 0xFF]
-    carried = head & 1
-    for byte in columns[3:]:
-        stream.append(carried << 7 | byte >> 1)
-        carried = byte & 1
-    last = carried << 15 | crc
-    stream += [last >> 8, last & 0xFF]
-    run = np.full(ids.shape, _NO_RUN, dtype=np.int64)
-    bits = np.full(ids.shape, n_bits + TAIL_BITS, dtype=np.int64)
-    for byte in stream:
-        at = run << 8 | byte
-        bits += stuffed[at]
-        run = next_run[at]
-    return bits
+    stream = np.empty((5 + length, len(ids)), np.int64)
+    stream[:3] = _three_bytes((_ALTERNATING & 0x3F) << 18 | head >> 1)  # 6 + 18 bits
+    stream[3:-2] = (columns[2:-1] & 1) << 7 | columns[3:] >> 1
+    last = (columns[-1] & 1) << 15 | crc
+    stream[-2], stream[-1] = last >> 8, last & 0xFF
+    stuff, _, _ = _stuff_bits(stream, len(stream))
+    return _HEAD_BITS + 8 * length + _CRC_BITS + TAIL_BITS + stuff
+
+
+def _three_bytes(number: _Int) -> tuple[_Int, _Int, _Int]:
+    return number >> 16, number >> 8 & 0xFF, number & 0xFF
+
+
+def _stuff_bits(stream: _Int, first: int) -> tuple[_Int, _Int, _Int]:
+    """Of (bytes, n) stuffed from the first bit on, which it overwrites: how many stuff bits are in the
+    ``first`` bytes and in the others, and the run that they end with."""
+    after, run = _run_and_stuff(), np.full(stream.shape[1], _NO_RUN << 8, np.int64)
+    for byte in stream:  # three calls a byte: with a few hundred frames it is the calls that cost
+        byte |= run
+        after.take(byte, out=byte, mode="clip")
+        np.bitwise_and(byte, 0xF00, out=run)
+    stream >>= _STUFF_SHIFT
+    return stream[:first].sum(axis=0), stream[first:].sum(axis=0), run >> 8
 
 
 @functools.cache
@@ -248,9 +254,20 @@ def _tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
 
 
 @functools.cache
-def _array_tables() -> tuple[_Int, _Int, _Int]:
-    crc_table, next_run, stuffed = (np.array(table, dtype=np.int64) for table in _tables())
-    return crc_table, next_run, stuffed
+def _run_and_stuff() -> _Int:
+    """For run << 8 | byte: the run after the byte << 8, and the stuff bits in it << :data:`_STUFF_SHIFT`."""
+    _, next_run, stuffed = (np.array(table, dtype=np.int64) for table in _tables())
+    return next_run << 8 | stuffed << _STUFF_SHIFT
+
+
+@functools.cache
+def _crc_by_place() -> _Int:
+    """For place << 8 | byte: the CRC of that byte with as many zero bytes after it."""
+    crc_table = np.array(_tables()[0], dtype=np.int64)
+    rows = [crc_table]
+    for _ in range(2 + 8):  # a head of three bytes and eight of data
+        rows.append((rows[-1] << 8 & 0x7FFF) ^ crc_table[rows[-1] >> 7])
+    return np.concatenate(rows)
 
 
 class BusLoad:
@@ -271,7 +288,7 @@ class BusLoad:
         self._bits = self._fast_bits = 0
         self._ids: list[int] = []
         self._data: list[bytes] = []
-        self._fd: list[tuple[int, bytes]] = []
+        self._fd: list[bool] = []
 
     def add(
         self,
@@ -289,18 +306,22 @@ class BusLoad:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
             self._frames += 1
             return
-        if fd:
-            self._fd.append((can_id, data))
-        else:
-            self._ids.append(can_id)
-            self._data.append(data)
-        if len(self._ids) + len(self._fd) >= self._BATCH:
+        self._ids.append(can_id)
+        self._data.append(data)
+        self._fd.append(fd)
+        if len(self._ids) >= self._BATCH:
             self._work_off()
+
+    def add_all(self, can_ids: Iterable[int], data: Iterable[bytes], fd: Iterable[bool]) -> None:
+        """Count standard data frames, as many as each of the three has."""
+        self._ids.extend(can_ids)
+        self._data.extend(data)
+        self._fd.extend(fd)
 
     @property
     def frames(self) -> int:
         """Frames added so far."""
-        return self._frames + len(self._ids) + len(self._fd)
+        return self._frames + len(self._ids)
 
     @property
     def bits(self) -> int:
@@ -314,18 +335,19 @@ class BusLoad:
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 
     def _work_off(self) -> None:
-        self._frames += len(self._ids) + len(self._fd)
-        if self._ids:
-            padded = b"".join([data.ljust(8, b"\0") for data in self._data])
-            payload = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 8)
-            lengths = [len(data) for data in self._data]
-            self._bits += int(exact_bits_batch(self._ids, lengths, payload).sum())
-            self._ids.clear()
-            self._data.clear()
-        for length in {len(data) for _, data in self._fd}:
-            chosen = [frame for frame in self._fd if len(frame[1]) == length]
-            payload = np.frombuffer(b"".join([data for _, data in chosen]), dtype=np.uint8)
-            nominal, fast = fd_bits([can_id for can_id, _ in chosen], payload.reshape(len(chosen), length))
-            self._bits += int(nominal.sum())
-            self._fast_bits += int(fast.sum())
+        ids, fd = np.array(self._ids, np.int64), np.array(self._fd, bool)
+        lengths = np.array([len(data) for data in self._data], np.int64)
+        joined, begins = np.frombuffer(b"".join(self._data), np.uint8), np.cumsum(lengths) - lengths
+        self._frames += len(ids)
+        self._ids.clear()
+        self._data.clear()
         self._fd.clear()
+        for kind in np.unique(lengths << 1 | fd):
+            length, rows = int(kind) >> 1, np.flatnonzero((lengths << 1 | fd) == kind)
+            payload = joined[begins[rows, None] + np.arange(length)]
+            if kind & 1:
+                nominal, fast = fd_bits(ids[rows], payload)
+                self._bits += int(nominal.sum())
+                self._fast_bits += int(fast.sum())
+            else:
+                self._bits += int(_bits_of_one_length(ids[rows], length, payload).sum())

@@ -102,10 +102,11 @@ def test_brings_a_hand_up_and_down(hand: HandConfig, fleet: Fleet, listener: Can
 
 def test_configuration_is_in_the_node(hand: HandConfig, fleet: Fleet) -> None:
     from skinnode.host.link import BusLink
+    from skinnode.host.mainline import Mainline
 
     with Host.from_config(hand):
         pass
-    with BusLink(hand.buses[0], {}, lambda error: None) as link:
+    with BusLink(hand.buses[0], {}, lambda error: None) as link, Mainline([link]):
         od = link.remote_od(5)
         assert od.read(0x1005, 0, "u32") == 0x80
         assert od.read(0x1006, 0, "u32") == 25_000

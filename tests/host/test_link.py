@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Sequence
 
 import pytest
 
-from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
+from skinnode.errors import BusError, NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host.link import BusLink
-from skinnode.model.config import HandConfig
+from skinnode.host.mainline import Mainline
+from skinnode.model.config import BusConfig, HandConfig
 from skinnode.transport import CanPort, Frame
 from skinnode.wire.timing import exact_bits
 
@@ -26,7 +29,7 @@ def test_frames_go_to_their_handlers_in_order(hand: HandConfig, listener: CanPor
         0x185: lambda data, t_ns: got.put(("a", data)),
         0x186: lambda data, t_ns: got.put(("b", data)),
     }
-    with BusLink(hand.buses[0], handlers, fail) as link:
+    with BusLink(hand.buses[0], handlers, fail) as link, Mainline([link]):
         for can_id, data in ((0x186, b"1"), (0x185, b"2"), (0x3F0, b"x"), (0x186, b"3")):
             listener.send(can_id, data)
         assert [got.get(timeout=10) for _ in range(3)] == [("b", b"1"), ("a", b"2"), ("b", b"3")]
@@ -37,7 +40,7 @@ def test_frames_go_to_their_handlers_in_order(hand: HandConfig, listener: CanPor
 def test_bits_are_those_of_every_frame_sent_and_received(hand: HandConfig, listener: CanPort) -> None:
     received = [(0x185, bytes([i, 255 - i, 0, 0, 0, 0, 255, 255])) for i in range(200)] + [(0x705, b"\x05")]
     sent = [(0x080, bytes([i])) for i in range(1, 20)]
-    with BusLink(hand.buses[0], {}, fail) as link:
+    with BusLink(hand.buses[0], {}, fail) as link, Mainline([link]):
         for can_id, data in received:
             listener.send(can_id, data)
         for can_id, data in sent:
@@ -54,11 +57,114 @@ def test_defect_of_a_handler_is_reported(hand: HandConfig, listener: CanPort) ->
     def broken(data: bytes, t_ns: int) -> None:
         raise ZeroDivisionError("by zero")
 
-    with BusLink(hand.buses[0], {0x185: broken}, failures.put):
+    with BusLink(hand.buses[0], {0x185: broken}, failures.put) as link, Mainline([link]):
         listener.send(0x185, b"")
         error = failures.get(timeout=10)
     assert str(error) == "bus 'can0': ZeroDivisionError: by zero"
     assert isinstance(error.__cause__, ZeroDivisionError)
+
+
+def numbered(send: Callable[[int, bytes], object], got: queue.SimpleQueue[bytes], first: int) -> None:
+    """Ten frames come through, in order."""
+    expected = [bytes([first + i]) for i in range(10)]
+    for data in expected:
+        send(0x185, data)
+    assert [got.get(timeout=10) for _ in expected] == expected
+
+
+def two_buses(hand: HandConfig) -> list[BusConfig]:
+    return [hand.buses[0].model_copy(update={"name": name, "channel": f"{name}-{id(hand)}"}) for name in "ab"]
+
+
+def test_a_defect_on_one_bus_is_told_once_and_the_other_goes_on(hand: HandConfig) -> None:
+    failures: queue.SimpleQueue[SkinError] = queue.SimpleQueue()
+    got: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def broken(data: bytes, t_ns: int) -> None:
+        raise ZeroDivisionError("by zero")
+
+    one, other = two_buses(hand)
+    with (
+        CanPort(one) as to_one,
+        CanPort(other) as to_other,
+        BusLink(one, {0x185: broken}, failures.put) as a,
+        BusLink(other, {0x185: lambda data, t_ns: got.put(data)}, failures.put) as b,
+        Mainline([a, b]),
+    ):
+        to_one.send(0x185, b"")
+        assert str(failures.get(timeout=10)) == "bus 'a': ZeroDivisionError: by zero"
+        to_one.send(0x185, b"")
+        numbered(to_other.send, got, 0)
+    assert failures.empty()
+
+
+def test_an_interface_that_takes_long_to_open_again_holds_up_no_other_bus(hand: HandConfig) -> None:
+    opening, go = threading.Event(), threading.Event()
+
+    class Slow(CanPort):
+        def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
+            if not opening.is_set():
+                raise BusError("a: unplugged")
+            return super().recv_batch(timeout_s, most)
+
+        def reopen(self) -> None:
+            opening.set()
+            go.wait(10)
+            super().reopen()
+
+    got: dict[str, queue.SimpleQueue[bytes]] = {"a": queue.SimpleQueue(), "b": queue.SimpleQueue()}
+    one, other = two_buses(hand)
+    with (
+        CanPort(one) as to_one,
+        CanPort(other) as to_other,
+        BusLink(one, {0x185: lambda data, t_ns: got["a"].put(data)}, fail, Slow) as a,
+        BusLink(other, {0x185: lambda data, t_ns: got["b"].put(data)}, fail) as b,
+        Mainline([a, b]),
+    ):
+        assert opening.wait(10)
+        numbered(to_other.send, got["b"], 0)
+        assert (str(a.failure), a.stats().outages, b.failure, b.stats().outages) == (
+            "a: unplugged",
+            1,
+            None,
+            0,
+        )
+        go.set()
+        assert eventually(lambda: a.failure is None)
+        numbered(to_one.send, got["a"], 0)
+        numbered(to_other.send, got["b"], 10)
+        assert (a.stats().outages, a.stats().received, b.stats().received) == (1, 10, 20)
+
+
+def test_the_mainline_ends_while_an_interface_is_away(hand: HandConfig) -> None:
+    class Gone(CanPort):
+        def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
+            raise BusError("can0: unplugged")
+
+        def reopen(self) -> None:
+            raise BusError("can0: does not open")
+
+    with BusLink(hand.buses[0], {}, fail, Gone) as link:
+        with Mainline([link]) as mainline:
+            assert eventually(lambda: link.failure is not None)
+        mainline.stop()
+        assert link.stats().outages == 1
+
+
+def test_time_goes_on_for_a_silent_bus_while_another_is_busy(hand: HandConfig) -> None:
+    """What a scan on it lacks is not waited for until the other falls silent."""
+    one, other = two_buses(hand)
+    told: queue.SimpleQueue[int] = queue.SimpleQueue()
+    with CanPort(one) as to_one, BusLink(one, {}, fail) as busy, BusLink(other, {}, fail) as silent:
+        silent.poll_with(told.put)
+        with Mainline([busy, silent]):
+            begin_ns = time.monotonic_ns()
+            end_s, newest_ns = time.monotonic() + 10, 0
+            while newest_ns < begin_ns and time.monotonic() < end_s:
+                to_one.send(0x185, b"")
+                while not told.empty():
+                    newest_ns = told.get()
+    assert begin_ns < newest_ns <= time.monotonic_ns()
 
 
 @pytest.mark.parametrize(
@@ -92,7 +198,9 @@ def test_sdo_that_goes_wrong(
     bus = hand.buses[0]
     with (  # the node is a link as well: it answers on its own mainline
         BusLink(bus, {}, fail) as link,
-        BusLink(bus, {0x605: on_request}, fail),
+        BusLink(bus, {0x605: on_request}, fail) as node,
+        Mainline([link]),
+        Mainline([node]),
         pytest.raises(error) as caught,
     ):
         link.remote_od(5).read(0x1017, 0, "u16")
@@ -105,7 +213,12 @@ def test_short_sdo_answer_is_rejected_and_the_next_one_counts(hand: HandConfig, 
         listener.send(0x585, bytes.fromhex("4b 17 10 00 fa 00 00 00"))
 
     bus = hand.buses[0]
-    with BusLink(bus, {}, fail) as link, BusLink(bus, {0x605: on_request}, fail):
+    with (
+        BusLink(bus, {}, fail) as link,
+        BusLink(bus, {0x605: on_request}, fail) as node,
+        Mainline([link]),
+        Mainline([node]),
+    ):
         assert link.remote_od(5).read(0x1017, 0, "u16") == 250
         assert link.stats().malformed == 1
         assert str(link.first_malformed) == (
@@ -120,7 +233,7 @@ def test_listener_gets_frames_of_all_kinds(hand: HandConfig, listener: CanPort) 
         for frame in frames:
             got.put((frame.can_id, frame.data, frame.remote))
 
-    with BusLink(hand.buses[0], {}, fail) as link:
+    with BusLink(hand.buses[0], {}, fail) as link, Mainline([link]):
         link.listen(note)
         listener.send(0x705, remote=True, data=b"")
         listener.send(0x3F0, b"x")

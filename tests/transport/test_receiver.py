@@ -1,16 +1,19 @@
-"""The receive thread: bounded, counted, and never dead unheard."""
+"""The receive threads: bounded, counted, and never dead unheard."""
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
 from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
-from skinnode.transport import CanPort, Frame, Receiver
+from skinnode.transport import CanPort, Frame, Intake, Receiver
+from skinnode.transport.datagram import DatagramPort, datagram, free_channel
 
 
 @pytest.fixture(autouse=True)
@@ -23,9 +26,9 @@ def _no_thread_is_left() -> Iterator[None]:
 class Script:
     """A port that plays frames and then an error, or silence."""
 
-    reads_batches = True
+    reads_batches = False
 
-    def __init__(self, count: int, error: BusError | None = None) -> None:
+    def __init__(self, count: int, error: Exception | None = None) -> None:
         self.config = BusConfig(name="script")
         self.left, self.error = count, error
         self.count = count
@@ -44,65 +47,185 @@ class Script:
         return []
 
 
-def test_order_and_batches() -> None:
+@contextmanager
+def buses(count: int) -> Iterator[tuple[list[DatagramPort], list[Callable[[int], object]]]]:
+    """Ports that read batches, and for each what sends it a frame with that identifier."""
+    with ExitStack() as stack:
+        ports, senders = [], []
+        for number in range(count):
+            bus = BusConfig(name=f"can{number}", interface="udp", channel=free_channel())
+            ports.append(stack.enter_context(DatagramPort(bus)))
+            sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            sock.connect(("127.0.0.1", int(bus.channel)))
+            senders.append(lambda can_id, sock=sock: sock.send(datagram(can_id, b"")))
+        yield ports, senders
+
+
+def ids(frames: Sequence[Frame]) -> list[int]:
+    return [frame.can_id for frame in frames]
+
+
+def take(receiver: Receiver, intake: Intake, count: int) -> list[int]:
+    """Identifiers of as many frames, or of those that came within five seconds."""
+    got: list[int] = []
+    end_s = time.monotonic() + 5
+    while len(got) < count and time.monotonic() < end_s:
+        receiver.wait(0.1)
+        got += ids(intake.take())
+    return got
+
+
+def failure_of(receiver: Receiver, intake: Intake) -> Exception | None:
+    """What a reader is told within five seconds instead of frames."""
+    end_s = time.monotonic() + 5
+    while time.monotonic() < end_s:
+        receiver.wait(0.1)
+        try:
+            intake.take()
+        except Exception as error:
+            return error
+    return None
+
+
+def test_order() -> None:
     port = Script(10)
-    with Receiver(port) as receiver:
+    intake = Intake(port)
+    with Receiver([intake]) as receiver:
         assert port.played.wait(5)
-        assert [frame.can_id for frame in receiver.get_batch(1.0, max_frames=4)] == [0, 1, 2, 3]
-        assert receiver.queued == 6
-        assert [frame.can_id for frame in receiver.get_batch(1.0)] == [4, 5, 6, 7, 8, 9]
-        assert receiver.get_batch(0.0) == []
-        assert receiver.get_batch(0.01) == []
-        assert receiver.dropped == 0
+        assert intake.queued == 10
+        receiver.wait(5.0)
+        assert ids(intake.take()) == list(range(10))
+        assert (intake.queued, intake.dropped) == (0, 0)
+        assert intake.take() == []
+        receiver.close()
+        receiver.close()
 
 
 def test_a_full_queue_drops_the_newest_and_counts() -> None:
     port = Script(100)
-    with Receiver(port, capacity=30) as receiver:
+    intake = Intake(port, capacity=30)
+    with Receiver([intake]):
         assert port.played.wait(5)
-        assert [frame.can_id for frame in receiver.get_batch(0.0)] == list(range(30))
-        assert receiver.dropped == 70
+        assert ids(intake.take()) == list(range(30))
+        assert intake.dropped == 70
+
+
+def test_capacity() -> None:
+    with pytest.raises(ValueError, match="capacity: got 0, must be at least 1"):
+        Intake(Script(0), capacity=0)
+
+
+def test_on_a_bus(any_bus: BusConfig) -> None:
+    with CanPort(any_bus) as ours, CanPort(any_bus) as theirs:
+        intake = Intake(theirs)
+        with Receiver([intake]) as receiver:
+            for number in range(200):
+                ours.send(number, b"12345678")
+            assert take(receiver, intake, 200) == list(range(200))
+
+
+def test_many_buses_each_in_order_and_a_full_one_costs_the_others_nothing() -> None:
+    with buses(4) as (ports, senders):
+        intakes = [Intake(ports[0], capacity=5), *(Intake(port) for port in ports[1:])]
+        with Receiver(intakes) as receiver:
+            for number in range(300):
+                for send in senders:
+                    send(number)
+            for intake in intakes[1:]:
+                assert take(receiver, intake, 300) == list(range(300))
+            end_s = time.monotonic() + 5
+            while ports[0].received < 300 and time.monotonic() < end_s:
+                time.sleep(0.005)
+            assert ids(intakes[0].take()) == list(range(5))
+        assert [intake.dropped for intake in intakes] == [295, 0, 0, 0]
+        assert [port.received for port in ports] == [300] * 4
+
+
+def test_many_buses_wake_one_thread() -> None:
+    before = set(threading.enumerate())
+    with (
+        buses(4) as (ports, _),
+        CanPort(BusConfig(name="can7", channel="slow")) as other,
+        Receiver([Intake(port) for port in (*ports, other)]),
+    ):
+        names = sorted(thread.name for thread in set(threading.enumerate()) - before)
+    assert names == ["receive", "receive can7"]  # python-can may block in the other
 
 
 def test_an_error_is_raised_to_the_reader_after_the_frames_before_it() -> None:
     error = BusError("script: gone")
     port = Script(3, error)
-    with Receiver(port) as receiver:
+    intake = Intake(port)
+    with Receiver([intake]) as receiver:
         assert port.played.wait(5)
-        assert len(receiver.get_batch(1.0)) == 3
-        for _ in range(2):
-            with pytest.raises(BusError, match="script: gone"):
-                receiver.get_batch(1.0)
+        assert failure_of(receiver, intake) is error
+        with pytest.raises(BusError, match="script: gone"):
+            intake.take()
+        port.left, port.error = 4, None
+        receiver.resume(intake)  # it was opened again
+        assert take(receiver, intake, 4) == [-1, 0, 1, 2]
+    assert intake.queued == 0
 
 
-def test_capacity() -> None:
-    with pytest.raises(ValueError, match="capacity: got 0, must be at least 1"):
-        Receiver(Script(0), capacity=0)
+@pytest.mark.parametrize("error", [BusError("can1: gone"), ZeroDivisionError("by zero")])
+def test_what_goes_wrong_on_one_bus_is_told_to_its_reader_and_the_others_go_on(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with buses(3) as (ports, senders):
+        intakes = [Intake(port) for port in ports]
+
+        def broken(timeout_s: float, most: int = 1) -> list[Frame]:
+            raise error
+
+        with Receiver(intakes) as receiver:
+            for send in senders:
+                send(1)
+            assert [take(receiver, intake, 1) for intake in intakes] == [[1], [1], [1]]
+            with monkeypatch.context() as patch:
+                patch.setattr(ports[1], "recv_batch", broken)
+                assert failure_of(receiver, intakes[1]) is error
+            for send in senders:
+                send(2)
+            assert [take(receiver, intakes[number], 1) for number in (0, 2)] == [[2], [2]]
+            assert intakes[1].failed
+            ports[1].reopen()
+            receiver.resume(intakes[1])
+            senders[1](3)
+            assert take(receiver, intakes[1], 1) == [3]
 
 
-def test_on_a_bus(any_bus: BusConfig) -> None:
-    with CanPort(any_bus) as ours, CanPort(any_bus) as theirs, Receiver(theirs) as receiver:
-        for number in range(200):
-            ours.send(number, b"12345678")
-        frames: list[Frame] = []
-        end_s = time.monotonic() + 5
-        while len(frames) < 200 and time.monotonic() < end_s:
-            frames += receiver.get_batch(0.1)
-        assert [frame.can_id for frame in frames] == list(range(200))
-        receiver.close()
-        receiver.close()
+def test_a_port_that_is_closed_meanwhile_fails_alone() -> None:
+    with buses(2) as (ports, senders):
+        intakes = [Intake(port) for port in ports]
+        with Receiver(intakes) as receiver:
+            ports[0].close()
+            assert isinstance(failure_of(receiver, intakes[0]), BusError)
+            senders[1](5)
+            assert take(receiver, intakes[1], 1) == [5]
 
 
 def test_it_knows_up_to_when_it_has_seen_everything() -> None:
     port = Script(10)
     begin_ns = time.monotonic_ns()
-    with Receiver(port) as receiver:
+    intake = Intake(port)
+    with Receiver([intake]):
         assert port.played.wait(5)
         end_s = time.monotonic() + 5
-        while receiver.seen_ns < begin_ns and time.monotonic() < end_s:
+        while intake.seen_ns < begin_ns and time.monotonic() < end_s:
             time.sleep(0.005)
-        assert begin_ns < receiver.seen_ns <= time.monotonic_ns()
-        assert receiver.queued == 10
+        assert begin_ns < intake.seen_ns <= time.monotonic_ns()
+        assert intake.queued == 10
+
+
+def test_of_a_silent_bus_it_knows_that_nothing_came_while_another_is_busy() -> None:
+    with buses(2) as (ports, senders):
+        busy, silent = (Intake(port) for port in ports)
+        with Receiver([busy, silent]):
+            begin_ns = time.monotonic_ns()
+            end_s = time.monotonic() + 5
+            while silent.seen_ns < begin_ns and time.monotonic() < end_s:
+                senders[0](1)
+            assert begin_ns < silent.seen_ns <= time.monotonic_ns()
 
 
 def test_frames_that_wait_are_not_yet_seen(any_bus: BusConfig) -> None:
@@ -113,19 +236,20 @@ def test_frames_that_wait_are_not_yet_seen(any_bus: BusConfig) -> None:
 
         def hold(timeout_s: float, most: int = 256) -> list[Frame]:
             frames = receive(timeout_s)
-            if not frames and not go.is_set() and timeout_s:
+            if not frames and not go.is_set():
                 held.set()
                 go.wait(10)  # it was told that there is nothing, and is away for a while
             return frames
 
         theirs.recv_batch = hold  # type: ignore[method-assign]
-        with Receiver(theirs) as receiver:
+        intake = Intake(theirs)
+        with Receiver([intake]) as receiver:
             assert held.wait(5)
             ours.send(1, b"")
             time.sleep(0.05)
             sent_ns = time.monotonic_ns()
-            assert receiver.seen_ns < sent_ns
+            assert intake.seen_ns < sent_ns
             go.set()
-            (frame,) = receiver.get_batch(5.0)
-            assert frame.can_id == 1
-            assert receiver.seen_ns < sent_ns or receiver.queued == 0
+            receiver.wait(5.0)
+            seen_ns = intake.seen_ns
+            assert ids(intake.take()) == [1] or seen_ns < sent_ns

@@ -1,0 +1,54 @@
+"""The mainline context: one thread that deals out what is received on all buses."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.host.link import BusLink
+from skinnode.transport import Receiver
+
+_WAIT_S: Final = 0.02
+"""How long it waits for a frame before it looks at the clock for scans that lack something."""
+
+
+class Mainline:
+    """Receives on ``links`` and makes them deal out, from construction until :meth:`stop` or the end of a
+    ``with`` block. What goes wrong on one of them does not keep the others from it.
+
+    One thread for all: frames of all buses come at the same time, and waking costs as much as twenty of them.
+    """
+
+    def __init__(self, links: Sequence[BusLink]) -> None:
+        self._links = tuple(links)
+        self._stop = threading.Event()
+        self._receiver = Receiver([link.intake for link in links])
+        for link in links:
+            link.begin(functools.partial(self._receiver.resume, link.intake))
+        self._thread = threading.Thread(target=self._run, name="mainline", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End and join all threads; frames can still be sent. Stopping twice is fine."""
+        self._stop.set()
+        self._thread.join()
+        for link in self._links:
+            link.end()
+        self._receiver.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._receiver.wait(_WAIT_S)
+            for link in self._links:
+                link.turn()

@@ -136,7 +136,8 @@ class LaneTap(Protocol):
 
 class Lane:
     """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
-    them. ``on_scan`` is told of each at once, ``watch`` a while later."""
+    them. ``on_scan`` is told of each at once, ``watch`` a while later. ``under_way``: others start the node,
+    which may be sending already whenever its scans are let through."""
 
     def __init__(
         self,
@@ -148,12 +149,14 @@ class Lane:
         on_scan: Callable[[Scan], None],
         partial: Partial = "pass",
         watch: Callable[[Scan], None] = lambda scan: None,
+        *,
+        under_way: bool = False,
     ) -> None:
         self._patch, self._passes_partial = patch, partial == "pass"
         self._solver: Solver | None = None  # None: withhold
         self._assembler, self._workers, self._publisher = assembler, workers, publisher
         self._tick, self._on_scan = tick, on_scan
-        self._watch = watch
+        self._watch, self._under_way = watch, under_way
         self._unwatched: deque[tuple[int, Scan]] = deque()
         self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
@@ -218,7 +221,7 @@ class Lane:
         self._solver = solver
         self.doubtful = False
         if anew:
-            self._assembler.reset()
+            self._assembler.reset(under_way=self._under_way)
         if self.tap is not None:
             self.tap.resumed(self._patch, solver, anew=anew)
 

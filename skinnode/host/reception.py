@@ -76,10 +76,12 @@ def receive_patch(
         grace_ns=max(LEAST_GRACE_NS, hand.sync.period_ms * 500_000),
         node_id=patch.node_id,
         on_reject=dealer.reject,
+        under_way=True,
     )
     lane = Lane(
-        patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial, watch.on_scan
-    )
+        patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial, watch.on_scan,
+        under_way=dealer.config.role == "guest",
+    )  # fmt: skip
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)

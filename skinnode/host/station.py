@@ -93,7 +93,9 @@ class Station:
 
     def start(self, solver: Solver, withholdings: int) -> None:
         """Let scans through to ``solver`` and, as master, tell the node to send them. Raises BusError."""
-        self.link.call(lambda: self.lane.resume(solver, withholdings, anew=True))
+        # What a guest finds running goes on, heard since its bus was opened, unless the node has booted.
+        anew = not self.is_guest or self.monitor.boot_ups > 0
+        self.link.call(lambda: self.lane.resume(solver, withholdings, anew=anew))
         if not self.is_guest:
             bringup.start(self.link.send, self.patch.node_id)
         self.monitor.running = True

@@ -91,6 +91,8 @@ class AssemblerStats:
     """Open at a reset, never published."""
     scans_mixed: int
     """Thrown away, because frames of two scans had their counter, by all that can be seen."""
+    scans_joined: int
+    """Under way when the stream was taken up, so only partly heard, and never published."""
     chunks_accepted: int
     """*"""
     summaries_accepted: int
@@ -130,6 +132,7 @@ class ScanAssembler:
         grace_ns: how long frames may be late on a scan whose summary, or all chunks, are there.
         node_id: named in the errors given to ``on_reject``.
         on_reject: called with each CodecError of a frame of the wrong length.
+        under_way: the node may be sending already; see :meth:`reset`.
 
     Raises ConfigError for a counter overflow that is not 0 or 2 to 240, or times that are not positive.
     """
@@ -143,6 +146,7 @@ class ScanAssembler:
         grace_ns: int = 5_000_000,
         node_id: int = 0,
         on_reject: Callable[[CodecError], None] | None = None,
+        under_way: bool = False,
     ) -> None:
         if counter_overflow != 0 and not 2 <= counter_overflow <= 240:
             raise ConfigError("counter_overflow", counter_overflow, "0 or 2 to 240")
@@ -168,6 +172,7 @@ class ScanAssembler:
         self._scan = _NEVER
         self._frames: list[bytes | None] = self._no_frames()
         self._mixed = False
+        self._may_join, self._joined_late = under_way, False
         self._received = 0
         self._sent = _NEVER
         self._summary: Summary | None = None
@@ -180,6 +185,7 @@ class ScanAssembler:
         self._changed_only = False
 
         self._complete = self._torn = self._missed = self._discarded = self._thrown = self._resyncs = 0
+        self._joined = 0
         self._chunks = self._summaries = self._chunks_lost = self._summaries_lost = 0
         self._duplicates = self._conflicts = self._late = 0
         self._bad_length = self._bad_index = self._bad_counter = 0
@@ -222,7 +228,7 @@ class ScanAssembler:
             return None
         else:
             closed = self._close() if self._counter != _NONE_OPEN else None
-            self._open(summary.scan, t_ns)
+            self._open(summary.scan, t_ns, from_its_begin=False)
         self._summary = summary
         self._sent = summary.chunks
         self._t_chunk_ns, self._t_summary_ns, self._t_last_ns = self._t_last_ns, t_ns, t_ns
@@ -245,13 +251,16 @@ class ScanAssembler:
             return min(self._t_last_ns + self._grace_ns, self._expires_ns)
         return self._expires_ns
 
-    def reset(self) -> None:
-        """Forget the open scan, the last codes and the counter, as after a boot-up. The statistics stay."""
+    def reset(self, *, under_way: bool = False) -> None:
+        """Forget the open scan, the last codes and the counter, as after a boot-up. The statistics stay.
+        ``under_way``: the node may be sending already, so that a first scan which is not heard from its first
+        chunk on lacks nothing that was lost."""
         if self._counter != _NONE_OPEN:
             self._discarded += 1
             self._book()
         self._counter, self._last_counter = _NONE_OPEN, _NEVER
         self._changed_only = False
+        self._may_join = under_way
 
     @property
     def stats(self) -> AssemblerStats:
@@ -263,6 +272,7 @@ class ScanAssembler:
             scans_missed=self._missed,
             scans_discarded=self._discarded,
             scans_mixed=self._thrown,
+            scans_joined=self._joined,
             chunks_accepted=self._chunks + is_open * self._received,
             summaries_accepted=self._summaries + (is_open and self._summary is not None),
             chunks_lost=self._chunks_lost,
@@ -286,7 +296,7 @@ class ScanAssembler:
         if not self._is_news(data[1], t_ns, known=self._frames[index] == data):
             return None
         closed = self._close() if self._counter != _NONE_OPEN else None
-        self._open(data[1], t_ns)
+        self._open(data[1], t_ns, from_its_begin=index == 0)
         self._frames[index] = data
         self._received = 1
         return closed
@@ -337,8 +347,9 @@ class ScanAssembler:
     def _no_frames(self) -> list[bytes | None]:
         return [None] * self._n + [_NOT_EXPECTED] * max(1, _CHUNK_INDICES - self._n)
 
-    def _open(self, counter: int, t_ns: int) -> None:
+    def _open(self, counter: int, t_ns: int, *, from_its_begin: bool) -> None:
         self._follows = False
+        self._joined_late, self._may_join = self._may_join and not from_its_begin, False
         if self._last_counter == _NEVER:  # the first at all, or after a reset
             self._scan = counter if self._scan == _NEVER else self._scan + self._steps_to(counter, self._scan)
         else:
@@ -379,17 +390,17 @@ class ScanAssembler:
             self._thrown += 1
             self._held = [None] * self._n
             return None
+        expected, complete = self._n, self._received == self._n
         if summary is not None:
             self._changed_only = bool(summary.flags & SummaryFlag.CHANGED_ONLY)
             overrun = bool(summary.flags & SummaryFlag.OVERRUN)
             expected = summary.chunks
-            complete = self._received == self._n or (
-                self._received == expected and self._changed_only and not overrun
-            )
-        else:
-            self._summaries_lost += 1
-            expected = self._n
-            complete = self._received == self._n
+            complete |= self._received == expected and self._changed_only and not overrun
+        if self._joined_late and not complete:
+            self._joined += 1
+            self._held = [None] * self._n
+            return None
+        self._summaries_lost += summary is None
         if summary is not None or not self._changed_only:
             self._chunks_lost += max(0, expected - self._received)
         self._complete += complete

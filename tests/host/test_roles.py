@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.cli.host import faults_of
 from skinnode.errors import BusError, ConfigError, NodeError
 from skinnode.host import Condition, Host
+from skinnode.host.accounting import discrepancies
 from skinnode.host.sync import SyncProducer, Ticks
 from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.layout import PatchLayout
@@ -77,6 +80,32 @@ def test_a_guest_that_may_send_nothing_sends_nothing_and_hears_all(
             assert (host.stats().sync.sent, host.stats().buses["can0"].sent) == (0, 0)
         assert {frame.can_id for frame in heard(port)} <= of_nodes(port)
         assert {node.nmt_state for node in rack.nodes.values()} == {NmtState.OPERATIONAL}
+
+
+def all_operational(host: Host) -> bool:
+    return {host.health(patch.name).condition for patch in host.hand.patches} == {Condition.OPERATIONAL}
+
+
+@pytest.mark.real_time
+def test_a_guest_that_joins_while_patches_run_tears_no_scan(
+    hand: HandConfig, rack: Rack, listener: CanPort, tmp_path: Path
+) -> None:
+    """Whenever it comes: all but the scan under way is whole, and the command ends with 0."""
+    file = str(baseline_file(rack, tmp_path))
+    hand = changed(hand, bus={"role": "guest"}, patch={"baseline": file}, sync={"period_ms": 40})
+    for patch in hand.patches:
+        listener.send(0x600 + patch.node_id, bytes.fromhex("2b 17 10 00 64 00 00 00"))  # a heartbeat
+    joined = 0
+    with robot(listener, hand):
+        assert eventually(lambda: {n.nmt_state for n in rack.nodes.values()} == {NmtState.OPERATIONAL})
+        for _ in range(8):
+            with Host.from_config(hand) as host:
+                take(host.fields(timeout_s=10), 8)
+                assert eventually(functools.partial(all_operational, host))
+                assert faults_of(host) == []
+            assert discrepancies(host.stats()) == []
+            joined += sum(lane.assembler.scans_joined for lane in host.stats().patches.values())
+    assert joined > 0
 
 
 def test_a_guest_that_may_configure_sends_sdo_and_nothing_else(

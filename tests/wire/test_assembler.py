@@ -104,9 +104,10 @@ def receive(
 
     def poll(t_ns: int) -> None:
         while polled and (deadline := assembler.next_deadline_ns()) is not None and deadline <= t_ns:
-            thrown = assembler.stats.scans_mixed
+            before = assembler.stats
             published.append(assembler.poll(deadline))
-            assert published[-1] is not None or assembler.stats.scans_mixed > thrown, "a deadline in vain"
+            thrown = (assembler.stats.scans_mixed, assembler.stats.scans_joined)
+            assert published[-1] is not None or thrown > (before.scans_mixed, before.scans_joined), "in vain"
 
     for frame in frames:
         poll(frame.t_ns)
@@ -268,6 +269,7 @@ def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
         scans_missed=seen[-1][0] - seen[0][0] + 1 - len(seen) if seen else 0,
         scans_discarded=0,
         scans_mixed=0,
+        scans_joined=0,
         chunks_accepted=sum(min(count, 1) for _, copies in seen for count in copies[:n]),
         summaries_accepted=sum(min(copies[n], 1) for _, copies in seen),
         chunks_lost=sum(count == 0 for _, copies in seen for count in copies[:n]),
@@ -644,3 +646,39 @@ def test_frames_of_the_wrong_length_are_rejected_and_reported() -> None:
 def test_settings_that_cannot_be_are_refused(arguments: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="allowed"):
         ScanAssembler(PROFILES[0], **arguments)  # type: ignore[arg-type]  # ints by name
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_scan_that_was_under_way_when_the_stream_was_taken_up_is_not_torn(
+    profile: PatchProfile, changed: bool
+) -> None:
+    chunks = range(profile.n_chunks) if changed else None
+    for first in range(1, profile.n_chunks + 1):
+        node, assembler = (
+            ModelNode(profile, 240),
+            ScanAssembler(profile, counter_overflow=240, under_way=True),
+        )
+        frames = [*node.scan(1, chunks)[first:], *node.scan(2)]
+        assert [origin(scan, node) for scan in receive(assembler, frames)] == [2]
+        stats = assembler.stats
+        assert (stats.scans_joined, stats.scans_complete, stats.scans_torn) == (1, 1, 0)
+        assert (stats.chunks_lost, stats.summaries_lost, stats.scans_missed) == (0, 0, 0)
+        assert stats.chunks_accepted + stats.summaries_accepted == len(frames)
+        assembler.reset(under_way=True)
+        receive(assembler, [*node.scan(7)[first:], *node.scan(8)])
+        assert (assembler.stats.scans_joined, assembler.stats.scans_torn) == (2, 0)
+
+
+def test_a_scan_that_was_heard_from_its_first_chunk_on_lacks_what_was_lost() -> None:
+    profile = PROFILES[0]
+    for under_way in (True, False):
+        node = ModelNode(profile, 240)
+        assembler = ScanAssembler(profile, counter_overflow=240, under_way=under_way)
+        frames = node.scan(1)
+        (scan,) = receive(assembler, [*frames[:2], *frames[3:], *node.scan(2)])[:1]
+        assert (scan.complete, scan.chunks_received) == (False, profile.n_chunks - 1)
+        assert (assembler.stats.scans_torn, assembler.stats.scans_joined) == (1, 0)
+    assembler = ScanAssembler(profile, counter_overflow=240)  # begun by whoever listens: nothing came before
+    receive(assembler, [*frames[1:], *node.scan(2)])
+    assert (assembler.stats.scans_torn, assembler.stats.scans_joined) == (1, 0)

@@ -2,7 +2,7 @@
 
 Types 0 to 240 act at the next SYNC with what came last, 254 and 255 at once. Bytes beyond the mapping are
 left alone, a PDO that is too short is not taken at all; both are told by EMCY once, until the length is right
-again. An event timer watches over its RPDO from the first one on that comes.
+again. An event timer watches over its RPDO from the first one on that comes, in OPERATIONAL.
 """
 
 from __future__ import annotations
@@ -111,10 +111,13 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """The node entered another state: what was received before is void, and nothing is waited for."""
+        """The node entered another state: what was received before is void, and nothing is waited for, so that
+        none is late any more (the deadline is monitored in OPERATIONAL only: CiA 301 v4.2, 7.5.2.33)."""
         self._operational = operational
         self._pending.clear()
         self._alarms.clear()
+        for number in tuple(self._late):
+            self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
         """A frame came; it may be an RPDO, or several that share the COB-ID."""

@@ -201,6 +201,25 @@ class TestDeadline:
         desk.run(200)
         assert desk.take() == []
 
+    @pytest.mark.parametrize(("command", "told"), [("80 00", ["00 00 00 50 82 00 00 00"]), ("02 00", [])])
+    def test_nothing_is_late_any_more_outside_operational(self, rpdo2, command: str, told: list[str]) -> None:
+        """A stopped node may not tell of the end, and does so when it may."""
+        desk = rpdo2(kind=255, timer=50)
+        desk.frame(PDO, "01")
+        desk.run(60)
+        assert emergencies(desk.take()) == ["50 82 11 02 00 00 00 00"]
+        at_once = emergencies(desk.frame(0, command))
+        assert at_once == told
+        desk.run(200)
+        assert [*at_once, *emergencies(desk.frame(0, "80 00"))] == ["00 00 00 50 82 00 00 00"]
+        assert desk.read(0x1001, 0) == 0
+        desk.start()
+        desk.run(200)
+        assert emergencies(desk.take()) == []  # watched over anew from the next one on
+        desk.frame(PDO, "01")
+        desk.run(60)
+        assert emergencies(desk.take()) == ["50 82 11 02 00 00 00 00"]
+
     def test_switched_off_ends_the_error(self, rpdo2) -> None:
         desk = rpdo2(kind=255, timer=50)
         desk.frame(PDO, "01")

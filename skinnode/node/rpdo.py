@@ -111,8 +111,8 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """The node entered another state: what was received before is void, and nothing is waited for, so that
-        none is late any more (the deadline is monitored in OPERATIONAL only: CiA 301 v4.2, 7.5.2.33)."""
+        """The node entered another state: what was received before is void, and nothing is waited for. None
+        is late any more: the deadline is monitored in OPERATIONAL only (CiA 301 v4.2, 7.5.2.33)."""
         self._operational = operational
         self._pending.clear()
         self._alarms.clear()

@@ -168,12 +168,11 @@ class Host:
         with contextlib.ExitStack() as stack:
             stack.callback(callbacks.join)
             stack.callback(publisher.end)
-            ticks = Ticks(hand.sync.counter_overflow)
             buses = {
                 bus.name: _serve_bus(
                     hand,
                     stack.enter_context(BusLink(bus, {}, publisher.fail, open_port)),
-                    ticks if bus.role == "master" else Ticks(hand.sync.counter_overflow),
+                    Ticks(hand.sync.counter_overflow),
                 )
                 for bus in hand.buses
                 if hand.patches_on(bus.name)
@@ -210,13 +209,13 @@ class Host:
             supervisor = stack.enter_context(
                 Supervisor(stations, list(ready), hand.bring_up.heartbeat_s, publisher.fail)
             )
-            own = [bus.link for bus in buses.values() if bus.link.config.role == "master"]
+            own = [bus for bus in buses.values() if bus.link.config.role == "master"]
             sync: SyncProducer | None = None
             if own:
-                lanes = [station.lane for station in stations if not station.is_guest]
-                stack.callback(_let_scans_end, lanes, ticks, hand.sync.period_s, publisher)
-                senders = [link.send for link in own]
-                sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, ticks))
+                lanes = [(each.lane, buses[each.patch.bus].ticks) for each in stations if not each.is_guest]
+                stack.callback(_let_scans_end, lanes, hand.sync.period_s, publisher)
+                senders = [(bus.link.send, bus.ticks) for bus in own]
+                sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, hand.sync.stagger_s))
             events = Events()
             host = cls(hand, buses, stations, sync, supervisor, publisher, callbacks, events)
             stack.callback(events.end)
@@ -374,10 +373,10 @@ def _serve_bus(hand: HandConfig, link: BusLink, ticks: Ticks) -> _Bus:
     return _Bus(link, ticks, heard.rivals, heard.follower, lss)
 
 
-def _let_scans_end(lanes: Sequence[Lane], ticks: Ticks, period_s: float, publisher: Publisher) -> None:
+def _let_scans_end(lanes: Sequence[tuple[Lane, Ticks]], period_s: float, publisher: Publisher) -> None:
     """Wait for the scans of the last SYNC, so that no scan is cut off by the end of the program."""
     end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
-    while not all(lane.settled(ticks.newest) for lane in lanes) and publisher.failure is None:
+    while not all(lane.settled(ticks.newest) for lane, ticks in lanes) and publisher.failure is None:
         if time.monotonic() > end_s:
             return
         time.sleep(_POLL_S)

@@ -27,7 +27,8 @@ class HandFrame:
     scan: int
     """Number of the SYNC since the host started, unwrapped: the scan number of every field."""
     t_sync_ns: int
-    """When it was sent or seen, monotonic; 0 where it was not."""
+    """When it was sent or seen on the last of the buses, monotonic; 0 where it was not. Each field has the
+    time of its own (``sync.stagger_ms``)."""
     fields: Mapping[str, FieldFrame]
     """By patch."""
     missing: Mapping[str, str]

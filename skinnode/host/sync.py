@@ -84,19 +84,21 @@ class SyncFollower:
         self._ticks.note(newest + ahead, t_ns)
 
 
+Send = Callable[[int, bytes], None]
+
+
 class SyncProducer:
-    """Sends SYNC on every bus at the same instant, from construction until :meth:`close`, on its own thread.
+    """Sends SYNC on every bus, from construction until :meth:`close`, on its own thread: at the same instant,
+    or on each bus ``stagger_s`` after the one before.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
-    first; a thread that wakes too late for a whole period skips it rather than send two in a row.
+    first; a thread that wakes too late for a whole period skips it rather than send two in a row. No bus is
+    left out of a SYNC that was begun.
     """
 
-    def __init__(
-        self, senders: Sequence[Callable[[int, bytes], None]], period_s: float, ticks: Ticks
-    ) -> None:
-        self._senders = tuple(senders)
-        self._period_ns = round(period_s * 1e9)
-        self._ticks = ticks
+    def __init__(self, buses: Sequence[tuple[Send, Ticks]], period_s: float, stagger_s: float = 0.0) -> None:
+        self._buses = tuple(buses)
+        self._period_ns, self._stagger_ns = round(period_s * 1e9), round(stagger_s * 1e9)
         self._sent = self._missed = self._failed = self._latest_ns = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
@@ -121,12 +123,14 @@ class SyncProducer:
     def _run(self) -> None:
         due_ns = time.monotonic_ns()
         number = 0
-        while not self._stop.wait(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)):
+        while not self._wait(due_ns):
             number += 1
-            now_ns = time.monotonic_ns()
-            self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-            payload = bytes([self._ticks.note(number, now_ns)])  # before it is sent: the answers must find it
-            for send in self._senders:
+            for i, (send, ticks) in enumerate(self._buses):
+                if i and self._stagger_ns:
+                    self._wait(due_ns + i * self._stagger_ns)
+                now_ns = time.monotonic_ns()
+                self._latest_ns = max(self._latest_ns, now_ns - due_ns - i * self._stagger_ns)
+                payload = bytes([ticks.note(number, now_ns)])  # before it is sent: the answers must find it
                 try:
                     send(SYNC_COB_ID, payload)
                 except BusError:  # a full or silent bus may recover; the scans it costs are counted there
@@ -136,3 +140,7 @@ class SyncProducer:
             skipped = max(0, (time.monotonic_ns() - due_ns) // self._period_ns)
             self._missed += skipped
             due_ns += skipped * self._period_ns
+
+    def _wait(self, until_ns: int) -> bool:
+        """Until then, or at once when there are to be no more; whether that is so."""
+        return self._stop.wait(max(0.0, (until_ns - time.monotonic_ns()) * 1e-9))

@@ -40,7 +40,7 @@ def robot(port: CanPort, hand: HandConfig) -> Iterator[None]:
     for patch in hand.patches:
         port.send(0x600 + patch.node_id, bytes.fromhex("2f 19 10 00 f0 00 00 00"))
     port.send(0x000, b"\x01\x00")
-    with SyncProducer([port.send], hand.sync.period_s, Ticks(240)):
+    with SyncProducer([(port.send, Ticks(240))], hand.sync.period_s):
         yield
 
 

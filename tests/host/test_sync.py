@@ -12,7 +12,7 @@ from skinnode.host.sync import SyncProducer, Ticks
 def test_counter_runs_from_one_and_wraps() -> None:
     sent: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
     ticks = Ticks(3)
-    with SyncProducer([lambda cob_id, data: sent.put((cob_id, data))], 0.002, ticks):
+    with SyncProducer([(lambda cob_id, data: sent.put((cob_id, data)), ticks)], 0.002):
         frames = [sent.get(timeout=10) for _ in range(8)]
     assert frames == [(0x80, bytes([counter])) for counter in (1, 2, 3, 1, 2, 3, 1, 2)]
 
@@ -32,7 +32,7 @@ def test_the_tick_is_known_before_the_frame_is_out() -> None:
     """A node may answer before send() returns."""
     ticks = Ticks(240)
     known: queue.SimpleQueue[bool] = queue.SimpleQueue()
-    with SyncProducer([lambda _, data: known.put(ticks.find(data[0]) is not None)], 0.002, ticks):
+    with SyncProducer([(lambda _, data: known.put(ticks.find(data[0]) is not None), ticks)], 0.002):
         assert [known.get(timeout=10) for _ in range(5)] == [True] * 5
 
 
@@ -42,7 +42,7 @@ def test_a_bus_that_refuses_does_not_silence_the_others() -> None:
     def broken(cob_id: int, data: bytes) -> None:
         raise BusError("can0: 0x080 not sent (no buffer space)")
 
-    with SyncProducer([broken, lambda _, data: sent.put(data[0])], 0.002, Ticks(240)) as sync:
+    with SyncProducer([(broken, Ticks(240)), (lambda _, data: sent.put(data[0]), Ticks(240))], 0.002) as sync:
         assert [sent.get(timeout=10) for _ in range(3)] == [1, 2, 3]
     stats = sync.stats()
     assert stats.failed == stats.sent >= 3
@@ -59,7 +59,7 @@ def test_missed_periods_are_skipped_and_counted_not_sent_in_a_burst() -> None:
             hold.wait(5.5 * period_s)
 
     ticks = Ticks(240)
-    with SyncProducer([send], period_s, ticks) as sync:
+    with SyncProducer([(send, ticks)], period_s) as sync:
         assert [sent.get(timeout=10) for _ in range(4)] == [1, 2, 3, 4]
     assert sync.stats().missed >= 4
     second, third, fourth = (ticks.find(counter) for counter in (2, 3, 4))
@@ -72,9 +72,24 @@ def test_missed_periods_are_skipped_and_counted_not_sent_in_a_burst() -> None:
 
 def test_nothing_is_sent_after_close() -> None:
     sent: queue.SimpleQueue[int] = queue.SimpleQueue()
-    with SyncProducer([lambda _, data: sent.put(data[0])], 0.001, Ticks(240)):
+    with SyncProducer([(lambda _, data: sent.put(data[0]), Ticks(240))], 0.001):
         sent.get(timeout=10)
     while not sent.empty():
         sent.get()
     threading.Event().wait(0.02)
     assert sent.empty()
+
+
+def test_buses_are_staggered_and_each_has_its_own_time() -> None:
+    """The SYNC of a bus is as much later as was asked; a SYNC that has begun reaches all buses, even at the
+    end."""
+    sent: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+    ticks = [Ticks(240) for _ in range(3)]
+    senders = [lambda _, data, name=name: sent.put((name, data[0])) for name in "abc"]
+    with SyncProducer(list(zip(senders, ticks, strict=True)), 0.8, 0.3):
+        assert [sent.get(timeout=10) for _ in range(4)] == [("a", 1), ("b", 1), ("c", 1), ("a", 2)]
+    assert [sent.get(timeout=10) for _ in range(2)] == [("b", 2), ("c", 2)]
+    times = [each.find(1) for each in ticks]
+    first, second, third = (tick.t_ns for tick in times if tick is not None)
+    assert first < second < third
+    assert third - first > 0.3e9  # it would be 0.6, were the first punctual

@@ -100,7 +100,7 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
             ["sync", "overflow"],
             240,
             "sync.overflow: got a key unknown here, allowed: a key of this table "
-            "(did you mean counter_overflow?): period_ms, counter_overflow",
+            "(did you mean counter_overflow?): period_ms, counter_overflow, stagger_ms",
         ),
         (
             ["patches", 1, "node_id"],
@@ -167,6 +167,7 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
             "allowed: an integer from 10000 to 1000000, as classic CAN has it",
         ),
         (["sync", "period_ms"], 8.5, "sync.period_ms: got 8.5, allowed: an integer from 1 to 60000"),
+        (["sync", "stagger_ms"], -1, "sync.stagger_ms: got -1, allowed: a number of milliseconds from 0 on"),
         (
             ["sync", "counter_overflow"],
             241,

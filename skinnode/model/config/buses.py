@@ -94,6 +94,15 @@ class SyncConfig(Table):
     ] = 240
     """Highest value of the SYNC counter (0x1019), which starts at 1 and names the scan; 0: the SYNC of
     another master has none, and scans are numbered by each patch for itself."""
+    stagger_ms: Annotated[
+        float, Field(ge=0, allow_inf_nan=False), Allowed("a number of milliseconds from 0 on")
+    ] = 0.0
+    """From the SYNC of one bus to that of the next, where the host is the master. At 0 all patches scan at
+    the same instant, their scans end together, and the last field waits for all others to be solved."""
+
+    @property
+    def stagger_s(self) -> float:
+        return self.stagger_ms * 1e-3
 
     @property
     def period_s(self) -> float:

@@ -96,6 +96,13 @@ class HandConfig(Table):
         if overflow == 1 or (overflow == 0 and not guest):
             allowed = "an integer from 2 to 240; 0 where all buses are a guest's"
             raise ConfigError("sync.counter_overflow", overflow, allowed)
+        masters = [bus for bus in self.buses if bus.role == "master"]
+        if (len(masters) - 1) * self.sync.stagger_ms >= self.sync.period_ms:
+            most = self.sync.period_ms / (len(masters) - 1)
+            allowed = (
+                f"below {most:g}: the SYNC of the last of {len(masters)} buses must be out before the next"
+            )
+            raise ConfigError("sync.stagger_ms", self.sync.stagger_ms, allowed)
         for i, bus in enumerate(self.buses):
             node_ids = [patch.node_id for patch in self.patches_on(bus.name)]
             if bus.role == "guest" and bus.heartbeat_node_id is not None:

@@ -138,24 +138,26 @@ class Stream:
 def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool = True) -> Stream:
     """The frames of ``bus`` in ``seconds`` of the hand's life, SYNC among them."""
     scans = round(seconds / hand.sync.period_s)
-    queues = [_syncs(hand, scans)]
+    late_ns = round([each.name for each in hand.buses].index(bus.name) * hand.sync.stagger_s * 1e9)
+    syncs = _syncs(hand, scans, late_ns)
+    queues = [syncs]
     for number, patch in enumerate(hand.patches):
         if patch.bus == bus.name:
-            queues.append(_node_frames(hand, patch, number, scans, touched))
+            queues.append(_node_frames(hand, patch, number, syncs, touched))
     frames = [(*frame, queue) for queue, frames in enumerate(queues) for frame in frames]
     durations = _durations_ns(bus, [frame[:4] for frame in frames])
     return _arbitrate(frames, durations)
 
 
-def _syncs(hand: HandConfig, scans: int) -> list[_Queued]:
+def _syncs(hand: HandConfig, scans: int, late_ns: int) -> list[_Queued]:
     period_ns, overflow = hand.sync.period_ms * 1_000_000, hand.sync.counter_overflow
-    return [(k * period_ns, od.SYNC_COB_ID, bytes([k % overflow + 1]), False) for k in range(scans)]
+    return [(late_ns + k * period_ns, od.SYNC_COB_ID, bytes([k % overflow + 1]), False) for k in range(scans)]
 
 
 def _node_frames(
-    hand: HandConfig, patch: PatchConfig, number: int, scans: int, touched: bool
+    hand: HandConfig, patch: PatchConfig, number: int, syncs: Sequence[_Queued], touched: bool
 ) -> list[_Queued]:
-    """What the node of a patch has ready to send, and when."""
+    """What the node of a patch has ready to send, and when, after these SYNCs."""
     bus, layout = hand.bus(patch.bus), patch.layout.build()
     profile = PatchProfile.from_config(patch, bus)
     source = SimulatedPatch(Scene(layout, hand.simulation, number))
@@ -193,7 +195,6 @@ def _node_frames(
     if touched:
         source.start(0)
     out.clear()
-    syncs = _syncs(hand, scans)
     for now_ns, can_id, counter, _ in syncs:
         node.on_frame(can_id, counter, now_ns)
         end_ns = now_ns + hand.sync.period_ms * 1_000_000

@@ -36,6 +36,18 @@ PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
 """Four patches of 101 frames in 50 ms are 8,080 frames/s beside SYNC and heartbeats."""
 FD_MS: Final = 25
+STAGGER_MS: Final = 3.0
+"""From the SYNC of a bus to that of the next, where they are not sent at the same instant: four patches are
+then solved before the next four are due."""
+SCENES: Final = (
+    (False, True, 0.0),
+    (False, True, STAGGER_MS),
+    (False, False, 0.0),
+    (True, True, 0.0),
+    (True, True, STAGGER_MS),
+    (True, False, 0.0),
+)
+"""CAN FD, touched, and the stagger."""
 DEADLINE_US: Final = 1000
 """For a field. An exact inverse takes 200 µs; one that is put to the posterior as well would take 13 ms."""
 RECEIVE_US: Final = 5.0
@@ -65,11 +77,12 @@ def run(
         if apart:
             stack.callback(os.sched_setaffinity, 0, cores)
             os.sched_setaffinity(0, cores[:1])
-        for fd, touched in ((False, True), (False, False), (True, True), (True, False)):
-            if (short and not touched) or (fd and interface == "socketcan"):
+        for fd, touched, stagger_ms in SCENES:
+            if (short and not touched) or ((fd or stagger_ms) and interface == "socketcan"):
                 continue
-            hand = _hand(fullest, fd, interface, channel, Path(folder), one_worker=apart)
-            fewer = [buses for buses in (1, 2) if buses < fullest and touched and not (fd or short)]
+            hand = _hand(fullest, fd, stagger_ms, interface, channel, Path(folder), one_worker=apart)
+            plain = touched and not (fd or short or stagger_ms)
+            fewer = [buses for buses in (1, 2) if buses < fullest and plain]
             core = cores[-1] if apart else None
             with closing(Generator(hand, seconds, touched=touched, core=core)) as generator, short_pauses():
                 for buses in (*fewer, fullest):
@@ -81,7 +94,14 @@ def run(
 
 
 def _hand(
-    buses: int, fd: bool, interface: str, channel: str, folder: Path, *, one_worker: bool
+    buses: int,
+    fd: bool,
+    stagger_ms: float,
+    interface: str,
+    channel: str,
+    folder: Path,
+    *,
+    one_worker: bool,
 ) -> HandConfig:
     listed = [
         {
@@ -108,7 +128,7 @@ def _hand(
                 }
                 for i in range(buses * PATCHES_A_BUS)
             ],
-            "sync": {"period_ms": FD_MS if fd else CLASSIC_MS},
+            "sync": {"period_ms": FD_MS if fd else CLASSIC_MS, "stagger_ms": stagger_ms},
             "solver": {"deadline_us": DEADLINE_US} | ({"workers": 1} if one_worker else {}),
             "stream": {"capacity_fields": 100_000},
         }
@@ -147,6 +167,7 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
         "buses": len(buses),
         "patches": len(lanes),
         "fd": hand.buses[0].fd,
+        "stagger_ms": hand.sync.stagger_ms,
         "frames_hz": read / seconds,
         "bus_load": max(sent.bus_load.values()),
         "sent": sum(sent.frames.values()),
@@ -187,7 +208,8 @@ def name_of(row: Row) -> str:
     """What the hand of a row is, in a few words."""
     kind = "CAN FD" if row["fd"] else "classic"
     scene = "touched" if row["touched"] else "at rest"
-    return f"{kind}, {row['buses']} x {row['patches'] // row['buses']}, {scene}"
+    apart = f", {row['stagger_ms']:g} ms apart" if row["stagger_ms"] else ""
+    return f"{kind}, {row['buses']} x {row['patches'] // row['buses']}, {scene}{apart}"
 
 
 def _must(rows: list[Row]) -> list[Row]:
@@ -201,7 +223,8 @@ def _must(rows: list[Row]) -> list[Row]:
             asked.append(("received to assembled, µs a frame", row["receive_us"], RECEIVE_US))
         for what, got, most in asked:
             reached = got is not None and got <= most
-            must.append({"what": f"{name_of(row)}: {what}", "got": got, "asked": most, "reached": reached})
+            said = f"{name_of(row)}: {what}"
+            must.append({"what": said, "got": got, "asked": most, "reached": reached, "time": what != "lost"})
     return must
 
 
@@ -263,15 +286,15 @@ def _cpu_s() -> dict[str, float]:
 
 
 HEAD: Final = (
-    f"{'':26}{'frames/s':>9}{'load':>6}{'sent':>9}{'received':>9}{'lost':>6}{'scans/s':>8}{'skipped':>8}"
+    f"{'':39}{'frames/s':>9}{'load':>6}{'sent':>9}{'received':>9}{'lost':>6}{'scans/s':>8}{'skipped':>8}"
     f"{'published, ms':>20}{'read, ms':>14}{'µs':>6}{'receive':>9}{'mainline':>9}{'solve':>7}{'load':>6}"
-    f"\n{'':81}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'share of a core':>24}"
+    f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'share of a core':>24}"
 )
 LEGEND: Final = (
     "lost: frames, chunks and scans, wherever. published, read: from the last frame of a scan, by kernel\n"
     "time, to its field, and to its field in the hands of a program. µs: of threads receive and mainline,\n"
     "their waking included. load: of the bus; of the process that replays. The scans of a SYNC end at the\n"
-    "same time on all patches."
+    "same time on all patches, but where the SYNCs of the buses are some ms apart."
 )
 
 
@@ -283,7 +306,7 @@ def line(row: Row) -> str:
 
     cpu = row["cpu"]
     return (
-        f"{name_of(row):26}{row['frames_hz']:9.0f}{row['bus_load']:6.0%}{row['sent']:9}{row['received']:9}"
+        f"{name_of(row):39}{row['frames_hz']:9.0f}{row['bus_load']:6.0%}{row['sent']:9}{row['received']:9}"
         f"{lost(row):6}{row['scans_hz']:8.0f}{row['scans_skipped']:8}"
         f"  {ms(row['published_ms'], 'p50', 'p99', 'max')}  {ms(row['read_ms'], 'p50', 'p99')}"
         f"{row['receive_us']:6.1f}{cpu['receive']:9.0%}{cpu['mainline']:9.0%}{cpu['solve']:7.0%}"

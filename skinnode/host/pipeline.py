@@ -27,7 +27,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
 from skinnode.solve.tracker import Tracker
 from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.wire.codec import SummaryFlag, decode
+from skinnode.wire.codec import Decoder, SummaryFlag
 
 _log = logging.getLogger(__name__)
 
@@ -60,13 +60,12 @@ class Solver:
             normal_only=config.normal_only,
         )
         self._gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
+        self._decoder = Decoder(facts.baseline_ohm, facts.scale)
         self._quantisation_ohm = facts.scale.relative_std * facts.baseline_ohm
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
         """Resistances of a scan, NaN where there is none."""
-        resistance_ohm, valid = decode(scan.codes, self.facts.baseline_ohm, self.facts.scale)
-        valid &= scan.valid
-        resistance_ohm[~valid] = np.nan
+        resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._gain is not None:
             resistance_ohm *= self._gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
@@ -74,11 +73,8 @@ class Solver:
     def solve(self, frame: ResistanceFrame) -> FieldFrame:
         """Field of a frame, stamped, its arrays read-only. The noise is that of the front end and of the
         codes together."""
-        analogue = self.facts.config.relative_noise
-        noise = np.hypot(analogue, self._quantisation_ohm / frame.resistance_ohm)
-        field: FieldFrame = self._tracker.update(
-            frame.resistance_ohm, frame.valid, np.where(frame.valid, noise, 1.0)
-        )
+        noise = np.hypot(self.facts.config.relative_noise, self._quantisation_ohm / frame.resistance_ohm)
+        field: FieldFrame = self._tracker.update(frame.resistance_ohm, frame.valid, noise)
         contacts = tuple(sealed(contact) for contact in field.contacts)
         stamp = replace(frame.stamp, t_solved_ns=self._clock())
         return sealed(field, contacts=contacts, stamp=stamp)

@@ -111,11 +111,27 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
 
     A reserved code, :data:`MISSING` or a baseline that is not positive and finite gives NaN and False.
     """
-    code = np.asarray(codes)
-    baseline = _baseline(baseline_ohm)
-    valid = (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
-    resistance = np.where(valid, (scale.lo + code * scale.step) * baseline, np.nan)
-    return resistance, valid
+    return Decoder(baseline_ohm, scale).decode(codes)
+
+
+class Decoder:
+    """:func:`decode` for many scans with the same baseline."""
+
+    def __init__(self, baseline_ohm: ArrayLike, scale: CodeScale) -> None:
+        self._baseline, self._scale = _baseline(baseline_ohm), scale
+        known = (self._baseline > 0) & (self._baseline < np.inf)
+        self._known: NDArray[np.bool_] | None = None if known.all() else known
+
+    def decode(self, codes: ArrayLike) -> tuple[Float, NDArray[np.bool_]]:
+        """As :func:`decode`."""
+        code, scale = np.asarray(codes), self._scale
+        valid: NDArray[np.bool_] = code <= scale.steps
+        if self._known is not None:
+            valid = valid & self._known
+        resistance = (scale.lo + code * scale.step) * self._baseline
+        if not valid.all():
+            resistance = np.where(valid, resistance, np.nan)
+        return resistance, valid
 
 
 # --- chunk (TPDO1)

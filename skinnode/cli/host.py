@@ -38,8 +38,8 @@ def host(
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
     Ctrl-C ends it; the nodes are left pre-operational. Exit status 1 if a patch was not operational at the
-    end, a scan was torn or a frame lost, or an interface failed meanwhile; 2 if the hand could not be run, or
-    if a node sent frames that are not what their identifier promises.
+    end, a scan was torn or a frame lost, an interface failed or told of errors meanwhile, or a guest heard no
+    SYNC; 2 if the hand could not be run, or if a node sent frames that are not what their identifier says.
     """
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
@@ -109,9 +109,13 @@ def faults_of(running: Host) -> list[str]:
     from skinnode.host.accounting import losses_of_bus, losses_of_lane
 
     stats = running.stats()
-    found = [
-        f"{name}: {count} {what}" for name, bus in stats.buses.items() for count, what in losses_of_bus(bus)
-    ]
+    found = [f"{name}: {text}" for name, bus in stats.buses.items() for text in losses_of_bus(bus).values()]
+    for name in stats.buses:
+        health = running.bus_health(name)
+        if health.no_sync:
+            found.append(f"{name}: no SYNC of its master is heard")
+        if health.controller in ("error warning", "error passive", "bus-off"):
+            found.append(f"{name}: its controller is {health.controller} at the end")
     for name, lane in stats.patches.items():
         condition = running.health(name).condition
         due = stats.sync.sent + stats.sync.received > _FIRST_SCANS
@@ -119,7 +123,7 @@ def faults_of(running: Host) -> list[str]:
             found.append(f"{name}: {condition} at the end")
         elif due and not lane.solved:
             found.append(f"{name}: no scan was solved")
-        found += [f"{name}: {count} {what}" for count, what in losses_of_lane(lane)]
+        found += [f"{name}: {text}" for text in losses_of_lane(lane).values()]
     return found
 
 

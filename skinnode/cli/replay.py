@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from skinnode.words import counted
+
 if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
     from skinnode.record import Replay
@@ -97,11 +99,13 @@ def _faults(run: Replay) -> list[str]:
         found.append(f"{run.log.path.name} {run.incomplete}")
     found += run.complaints
     if run.dropped:
-        found.append(f"{run.dropped} frames were not recorded: the disk was too slow")
+        found.append(
+            f"{counted(run.dropped, 'frame was', 'frames were')} not recorded: the disk was too slow"
+        )
     if run.strange:
-        found.append(f"{run.strange} frames on channels that no bus of the hand has")
+        found.append(f"{counted(run.strange, 'frame')} on channels that no bus of the hand has")
     for name, lane in run.patch_stats().items():
-        found += [f"{name}: {count} {what}" for count, what in losses_of_lane(lane)]
+        found += [f"{name}: {text}" for text in losses_of_lane(lane).values()]
         if not lane.offered and not run.stopped:
             found.append(f"{name}: no scan that could be decoded")
     return found

@@ -24,14 +24,16 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
 
-    if bus.running and not bus.sync_ours and len(bus.sync_s) == 0 and bus.seconds > 0:
+    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # whose master has to send it
+    if awaited and len(bus.sync_s) == 0 and bus.seconds > 0 and not bus.failure:
         timers = any(p.info and p.info.patch and p.info.patch.period_ms for p in bus.patches)
         if not timers:
             yield found(
                 bus.name,
                 "nobody sends SYNC",
                 Sure.CERTAIN,
-                f"none in {bus.seconds:.1f} s, and nodes are operational",
+                f"none in {bus.seconds:.1f} s, and "
+                + ("nodes are operational" if bus.running else "the host is a guest here"),
                 "is the host, or the robot's master, running? Patches scan at SYNC alone",
             )
     intervals = np.diff(bus.sync_s)

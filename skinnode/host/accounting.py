@@ -7,6 +7,7 @@ from skinnode.host.dealer import BusStats
 from skinnode.host.facade import HostStats
 from skinnode.host.pipeline import LaneStats
 from skinnode.wire.assembler import AssemblerStats
+from skinnode.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:
@@ -37,28 +38,30 @@ def discrepancies(stats: HostStats) -> list[str]:
     return found
 
 
-def losses_of_bus(bus: BusStats) -> list[tuple[int, str]]:
-    """What of a bus did not come in, and how much of it; nothing where nothing was lost."""
+def losses_of_bus(bus: BusStats) -> dict[str, str]:
+    """What of a bus did not come in, and what its interface said of errors, in words by counter; empty
+    where all is well."""
     counts = (
-        (bus.dropped, "frames dropped"),
-        (bus.kernel_dropped, "frames dropped by the kernel"),
-        (bus.outages, "outages of the interface"),
-        (bus.bus_offs, "times bus-off"),
+        ("dropped", "frame dropped", "frames dropped"),
+        ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
+        ("outages", "outage of the interface", "outages of the interface"),
+        ("bus_offs", "time bus-off", "times bus-off"),
+        ("error_frames", "error frame", "error frames"),
     )
-    return [(count, what) for count, what in counts if count]
+    return {name: counted(count, *words) for name, *words in counts if (count := getattr(bus, name))}
 
 
-def losses_of_lane(lane: LaneStats) -> list[tuple[int, str]]:
+def losses_of_lane(lane: LaneStats) -> dict[str, str]:
     """The same of a patch."""
-    counted = lane.assembler
+    assembler = lane.assembler
     counts = (
-        (counted.scans_torn, "scans torn"),
-        (counted.scans_missed, "scans missed"),
-        (counted.scans_mixed, "scans thrown away as mixed"),
-        (counted.chunks_lost, "chunks lost"),
-        (counted.summaries_lost, "summaries lost"),
+        ("scans_torn", "scan torn", "scans torn"),
+        ("scans_missed", "scan missed", "scans missed"),
+        ("scans_mixed", "scan thrown away as mixed", "scans thrown away as mixed"),
+        ("chunks_lost", "chunk lost", "chunks lost"),
+        ("summaries_lost", "summary lost", "summaries lost"),
     )
-    return [(count, what) for count, what in counts if count]
+    return {name: counted(count, *words) for name, *words in counts if (count := getattr(assembler, name))}
 
 
 def frames_counted(assembler: AssemblerStats) -> int:

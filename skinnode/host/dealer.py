@@ -47,6 +47,8 @@ class BusStats:
     """What the interface says of errors on the bus, and of its controller's state."""
     bus_offs: int
     """Times it said that the controller went off the bus."""
+    controller: BusState | None
+    """What it said last of its controller; None where it said nothing."""
     foreign_ids: Mapping[int, int]
     """How many frames of each foreign COB-ID."""
     read: int
@@ -177,6 +179,7 @@ class Dealer:
             ignored=self._ignored,
             error_frames=self._error_frames,
             bus_offs=self._bus_offs,
+            controller=self._bus_state,
             foreign_ids=dict(self._foreign_ids),
             read=self._received + self._ignored + self._error_frames if read is None else read,
             waiting=waiting,

@@ -14,6 +14,7 @@ from typing import Final, Self
 
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.publish import check_capacity
+from skinnode.words import counted
 
 _log = logging.getLogger(__name__)
 
@@ -110,18 +111,24 @@ class Events:
                 subscription._offer(event)
 
 
-_PATCH_COUNTERS: Final = ("boot_ups", "emergencies", "rejoins", "conflicts")
-_BUS_COUNTERS: Final = (
-    "bus_offs",
-    "error_frames",
-    "foreign",
-    "kernel_dropped",
-    "dropped",
-    "malformed",
-    "outages",
-    "other_syncs",
-    "other_masters",
-)
+_PATCH_COUNTERS: Final = {
+    "boot_ups": ("boot-up", ""),
+    "emergencies": ("emergency", "emergencies"),
+    "rejoins": ("rejoin", ""),
+    "conflicts": ("conflict", ""),
+}
+"""Counters, and what is counted: one, and several where that is not one and an s."""
+_BUS_COUNTERS: Final = {
+    "bus_offs": ("bus-off", ""),
+    "error_frames": ("error frame", ""),
+    "foreign": ("foreign frame", ""),
+    "kernel_dropped": ("frame dropped by the kernel", "frames dropped by the kernel"),
+    "dropped": ("frame dropped", "frames dropped"),
+    "malformed": ("malformed frame", ""),
+    "outages": ("outage", ""),
+    "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
+    "other_masters": ("command of another master", "commands of another master"),
+}
 
 
 class HealthWatch:
@@ -167,6 +174,11 @@ class HealthWatch:
             bus_before, self._bus_before[name] = self._bus_before[name], bus
             if bus.away != bus_before.away:
                 self._tell(name, "away" if bus.away else "back", bus.away or "the bus is back")
+            if bus.no_sync != bus_before.no_sync:
+                text = "no SYNC of its master is heard" if bus.no_sync else "SYNC is heard"
+                self._tell(name, "no SYNC" if bus.no_sync else "SYNC", text)
+            if bus.controller is not bus_before.controller and bus.controller is not None:
+                self._tell(name, bus.controller.value, f"the controller is {bus.controller}")
             self._compare_counters(name, bus_before, bus, _BUS_COUNTERS)
 
     def _compare_patch(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
@@ -183,20 +195,21 @@ class HealthWatch:
             self._tell(name, "well", f"{fault.side} wire {fault.number} is not {fault.state} any more")
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
-    def _compare_counters(self, name: str, before: object, now: object, counters: tuple[str, ...]) -> None:
-        for counter in counters:
+    def _compare_counters(
+        self, name: str, before: object, now: object, counters: Mapping[str, tuple[str, str]]
+    ) -> None:
+        for counter, words in counters.items():
             then, count = getattr(before, counter), getattr(now, counter)
             when_ns, told = self._told.get((name, counter), (0, then))
             t_ns = time.monotonic_ns()
             if count > told and t_ns - when_ns > _QUIET_NS:
                 self._told[name, counter] = t_ns, count
-                words = counter.replace("_", " ")
                 detail = ""
                 if isinstance(now, BusHealth) and counter == "foreign":
                     detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
                 elif isinstance(now, PatchHealth) and counter == "emergencies":
                     detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
-                self._tell(name, counter, f"{count - told} {words}{detail}")
+                self._tell(name, counter, f"{counted(count - told, *words)}{detail}")
 
     def _tell(self, subject: str, what: str, text: str) -> None:
         self._events.tell(HealthEvent(time.monotonic_ns(), subject, what, text))

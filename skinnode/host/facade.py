@@ -18,7 +18,7 @@ from skinnode.host.dealer import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthWatch
 from skinnode.host.hand_files import check_files
 from skinnode.host.hand_frame import HandGatherer, HandSubscription
-from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.host.health import SYNCS_MISSED, BusHealth, PatchHealth
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.mainline import Mainline
@@ -104,6 +104,7 @@ class Host:
         self._buses = buses
         self._stations = {station.patch.name: station for station in stations}
         self._sync, self._supervisor, self._publisher = sync, supervisor, publisher
+        self._t_up_ns = time.monotonic_ns()
 
     @classmethod
     @contextlib.contextmanager
@@ -292,7 +293,20 @@ class Host:
             foreign_ids=tuple(sorted(stats.foreign_ids)),
             other_syncs=rivals.syncs,
             other_masters=rivals.nmt_commands + rivals.sdo_requests + rivals.heartbeats,
+            controller=stats.controller,
+            no_sync=self._lacks_sync(self._buses[bus]),
         )
+
+    def _lacks_sync(self, bus: _Bus) -> bool:
+        """Of a bus of guests. By the time that was dealt out: nothing is late because we are. Where patches
+        scan by their own clocks, nobody needs one."""
+        if bus.link.config.role == "master" or bus.link.failure is not None:
+            return False
+        since_ns = max(self._t_up_ns, bus.follower.t_newest_ns)
+        if bus.link.t_dealt_ns - since_ns < SYNCS_MISSED * self.hand.sync.period_ms * 1_000_000:
+            return False
+        lanes = [station.lane for station in self._stations.values() if station.link is bus.link]
+        return bool(self.hand.sync.counter_overflow) or not any(lane.stats().offered for lane in lanes)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
         """What happens to the health of patches, wires and buses from now until the host closes."""

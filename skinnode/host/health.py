@@ -14,6 +14,7 @@ from typing import Final
 
 from skinnode.errors import CodecError
 from skinnode.host.code_watch import CodeWatch, WireFault
+from skinnode.transport.bus_state import BusState
 from skinnode.wire.emergency import error_text
 from skinnode.wire.indices import emcy_cob_id, heartbeat_cob_id
 
@@ -31,6 +32,9 @@ may be late behind a burst of frames and one be hit by a bus error."""
 
 SCANS_MISSED: Final = 3
 """SYNC periods without a scan after which a patch counts as stale."""
+
+SYNCS_MISSED: Final = 5
+"""SYNC periods without one after which a guest says so; a patch is stale by then."""
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
 """How long after the last of its restarts a node that restarts in a loop is said to do so."""
@@ -122,6 +126,10 @@ class BusHealth:
     """SYNC of another producer, where the host is the master."""
     other_masters: int
     """NMT commands, SDO requests to our nodes, or our own heartbeat, from somebody else."""
+    controller: BusState | None = None
+    """What the interface said last of its controller; None where it said nothing, and where it does not."""
+    no_sync: bool = False
+    """Where the host is a guest: none of its master's SYNCs has come for :data:`SYNCS_MISSED` periods."""
 
 
 class NodeMonitor:

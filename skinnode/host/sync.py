@@ -65,10 +65,13 @@ class SyncFollower:
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
         self.received = self.irregular = 0
+        self.t_newest_ns = 0
+        """When the newest was received; 0 before the first."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
         """A SYNC came. Without a counter, where there should be one, it cannot be numbered."""
         self.received += 1
+        self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
         if len(data) != (1 if overflow else 0) or (overflow and not 1 <= data[0] <= overflow):
             self.irregular += 1

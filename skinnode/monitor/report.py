@@ -47,8 +47,8 @@ class FaultBook:
                 self._add(patch.name, patch.condition, patch.condition)
             for key, text in _lasting(patch.health):
                 self._add(patch.name, key, text)
-            for count, what in losses_of_lane(patch.lane):
-                self._add(patch.name, what, f"{count} {what}")
+            for counter, text in losses_of_lane(patch.lane).items():
+                self._add(patch.name, counter, text)
         for bus in view.buses:
             if bus.level == "bad":
                 for word in bus.words:

@@ -247,6 +247,7 @@ class ReplaySource:
                 foreign_ids=tuple(sorted(stats.foreign_ids)),
                 other_syncs=0,
                 other_masters=0,
+                controller=stats.controller,
             )
             for name, stats in self._run.bus_stats().items()
         }

@@ -248,6 +248,10 @@ def _bus_view(
     words = []
     if health.away is not None:
         words.append(f"away: {health.away}")
+    if health.no_sync:
+        words.append("no SYNC of its master")
+    if health.controller not in (None, "error active"):
+        words.append(f"the controller is {health.controller}")
     lost = health.kernel_dropped + health.dropped
     for count, text in (
         (health.bus_offs, "bus-off"),

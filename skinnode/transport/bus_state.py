@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum, auto
+from enum import StrEnum
 from typing import Final
 
 from skinnode.transport.frame import Frame
@@ -12,13 +12,15 @@ _WARNING, _PASSIVE, _ACTIVE = 0x0C, 0x30, 0x40
 _CONTROLLER_BYTE: Final = 1
 
 
-class BusState(Enum):
+class BusState(StrEnum):
     """What a controller may do on the bus."""
 
-    ACTIVE = auto()
-    PASSIVE = auto()
+    ACTIVE = "error active"
+    WARNING = "error warning"
+    """It has met some errors; it is active still."""
+    PASSIVE = "error passive"
     """It has met many errors; it still sends and receives."""
-    OFF = auto()
+    OFF = "bus-off"
     """It neither sends nor receives."""
 
 
@@ -32,6 +34,8 @@ def bus_state(frame: Frame) -> BusState | None:
         bits = frame.data[_CONTROLLER_BYTE]
         if bits & _PASSIVE:
             return BusState.PASSIVE
-        if bits & (_ACTIVE | _WARNING):  # warned is active still
+        if bits & _WARNING:
+            return BusState.WARNING
+        if bits & _ACTIVE:
             return BusState.ACTIVE
     return None

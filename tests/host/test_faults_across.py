@@ -159,10 +159,11 @@ def test_error_frames_of_the_hosts_own_controller(make_hand: Callable[..., HandC
             driver.send(struct.pack("=IB3x8s", can_id, 8, data))
         assert eventually(lambda: host.bus_health("can0").error_frames == 6)
         assert host.bus_health("can0").bus_offs == 2
+        assert host.bus_health("can0").controller == "error active"
         solved = host.stats().patches["p0"].solved
         assert eventually(lambda: host.stats().patches["p0"].solved > solved + 4)
         told = set()
         while (event := events.get(0.2)) is not None:
             told.add((event.subject, event.what))
-    assert {("can0", "bus_offs"), ("can0", "error_frames")} <= told
+    assert {("can0", "bus_offs"), ("can0", "error_frames"), ("can0", "error active")} <= told
     assert discrepancies(host.stats()) == []

@@ -108,6 +108,24 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
     assert joined > 0
 
 
+def test_a_guest_that_hears_no_sync_says_so(hand: HandConfig, rack: Rack, listener: CanPort) -> None:
+    hand = changed(hand, bus={"role": "guest", "guest_sends": "sdo"})
+    for patch in hand.patches:  # their master forgets the SYNC
+        listener.send(0x600 + patch.node_id, bytes.fromhex("2f 19 10 00 f0 00 00 00"))
+    listener.send(0x000, b"\x01\x00")
+    assert eventually(lambda: {n.nmt_state for n in rack.nodes.values()} == {NmtState.OPERATIONAL})
+    with Host.from_config(hand) as host:
+        events = host.events()
+        assert eventually(lambda: host.bus_health("can0").no_sync)
+        assert faults_of(host) == ["can0: no SYNC of its master is heard"]
+        assert "no SYNC" in {told.what for told in iter(lambda: events.get(0.5), None)}
+        with SyncProducer([listener.send], hand.sync.period_s, Ticks(240)):
+            assert eventually(lambda: not host.bus_health("can0").no_sync)
+            take(host.fields(timeout_s=10), 4)
+            assert "can0: no SYNC of its master is heard" not in faults_of(host)
+        assert eventually(lambda: host.bus_health("can0").no_sync)  # and again
+
+
 def test_a_guest_that_may_configure_sends_sdo_and_nothing_else(
     hand: HandConfig, rack: Rack, listener: CanPort
 ) -> None:

@@ -105,6 +105,15 @@ def test_nodes(changes: dict[str, Any], what: str) -> None:
     assert finding.where == "thumb"
 
 
+def test_a_guest_whose_master_sends_no_sync() -> None:
+    """Also where that master has started no node."""
+    idle = replace(WELL, found=node(state="pre-operational"), scans=None)
+    finding = one(bus_of(idle, role="guest", sync_s=np.empty(0)))
+    assert (finding.what, finding.sure) == ("nobody sends SYNC", Sure.CERTAIN)
+    assert finding.evidence == "none in 6.0 s, and the host is a guest here"
+    assert diagnose(bus_of(idle, sync_s=np.empty(0))) == []  # its host does not run
+
+
 def test_a_node_that_is_missing_is_told_from_a_bus_that_is_silent() -> None:
     other = PatchFacts("index", 6, found=node(6))
     gone = PatchFacts("thumb", 5)

@@ -16,7 +16,7 @@ from skinnode.transport.frame import Frame
         (0x100, "00 00 00 00 00 00 00 00", BusState.ACTIVE),  # restarted
         (0x204, "00 20 00 00 00 00 90 00", BusState.PASSIVE),  # transmit errors: 0x90
         (0x204, "00 10 00 00 00 00 00 90", BusState.PASSIVE),
-        (0x204, "00 08 00 00 00 00 60 00", BusState.ACTIVE),  # warning, on the way up or down
+        (0x204, "00 08 00 00 00 00 60 00", BusState.WARNING),  # warning, on the way up or down
         (0x204, "00 40 00 00 00 00 00 00", BusState.ACTIVE),
         (0x004, "00 01 00 00 00 00 00 00", None),  # receive buffer overflow
         (0x004, "", None),

@@ -119,7 +119,7 @@ def test_a_guest_that_hears_no_sync_says_so(hand: HandConfig, rack: Rack, listen
         assert eventually(lambda: host.bus_health("can0").no_sync)
         assert faults_of(host) == ["can0: no SYNC of its master is heard"]
         assert "no SYNC" in {told.what for told in iter(lambda: events.get(0.5), None)}
-        with SyncProducer([listener.send], hand.sync.period_s, Ticks(240)):
+        with SyncProducer([(listener.send, Ticks(240))], hand.sync.period_s):
             assert eventually(lambda: not host.bus_health("can0").no_sync)
             take(host.fields(timeout_s=10), 4)
             assert "can0: no SYNC of its master is heard" not in faults_of(host)

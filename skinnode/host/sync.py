@@ -128,10 +128,11 @@ class SyncProducer:
         number = 0
         while not self._wait(due_ns):
             number += 1
+            now_ns = time.monotonic_ns()
             for i, (send, ticks) in enumerate(self._buses):
                 if i and self._stagger_ns:
                     self._wait(due_ns + i * self._stagger_ns)
-                now_ns = time.monotonic_ns()
+                    now_ns = time.monotonic_ns()
                 self._latest_ns = max(self._latest_ns, now_ns - due_ns - i * self._stagger_ns)
                 payload = bytes([ticks.note(number, now_ns)])  # before it is sent: the answers must find it
                 try:

@@ -105,7 +105,7 @@ class CodeWatch:
     def _compare(self, codes: Codes, last: Codes, before: Codes) -> None:
         changed = codes != last
         if changed.any():
-            self._flickers += bool((codes[changed] == before[changed]).any())
+            self._flickers += bool((changed & (codes == before)).any())
             self._before = np.where(changed, last, before)
             by_itself = not self.frozen or np.abs(codes.astype(np.int64) - last).max() <= 1
             self._longest = max(self._longest, self._run if by_itself else 0)
@@ -166,13 +166,13 @@ class CodeWatch:
         for side, axis in (("upper", 1), ("lower", 0)):
             whole = measured.any(axis=axis)
             level = _of_wires(noise, axis, whole, np.mean, np.nanmean)
-            gain = _of_wires(ratio, axis, whole, np.median, np.nanmedian)
-            off = np.abs(ratio - np.expand_dims(gain, axis))
+            gain = _of_wires(ratio, axis, whole, _median, np.nanmedian)
+            off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
-            quiet = max(expected, float(np.nanmedian(level)))
+            quiet = max(expected, _median_of_known(level))
             # Away from rest too: where a touch has moved the median wire, the others are away from that.
-            away = np.minimum(np.abs(gain - np.nanmedian(gain)), np.abs(gain - 1.0))
-            step = np.pad(np.abs(np.diff(gain)), 1, constant_values=np.inf)
+            away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
+            step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])
             for state, is_so in (
                 (WireState.NOISY, level > NOISY * quiet),
@@ -185,6 +185,19 @@ class CodeWatch:
     def _tell(self) -> None:
         lasting = (fault for fault, windows in self._odd.items() if windows >= WINDOWS)
         self.wires = tuple(sorted({*self._broken, *lasting}))
+
+
+def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """np.median where no value is NaN, in a third of the time that takes for a patch."""
+    ordered, count = np.sort(values, axis=axis), values.shape[axis]
+    middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
+    return 0.5 * middle
+
+
+def _median_of_known(values: NDArray[np.float64]) -> float:
+    """Of those that are not NaN; NaN where all are."""
+    known = values[~np.isnan(values)]
+    return float(_median(known, 0)) if known.size else math.nan
 
 
 def _of_wires(

@@ -207,11 +207,16 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
 def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
     """(U, K) codes from the payloads of all chunks of a scan in ascending order, one after the other."""
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
-    payload = np.frombuffer(frames, dtype=np.uint8).reshape(profile.n_chunks, profile.chunk_bytes)
-    narrow = payload[:, head : head + per * width].reshape(profile.lines, -1, width)
+    payload = np.frombuffer(frames, dtype=np.uint8).reshape(profile.n_chunks, -1)
+    lines, shape = profile.lines, (profile.rows, profile.columns)
+    per_line = profile.n_codes // lines
+    if width == 2:
+        words = payload.view("<u2")[:, head // 2 : head // 2 + per].reshape(lines, -1)
+        return words[:, :per_line].astype(np.uint32).reshape(shape)
+    narrow = payload[:, head : head + per * width].reshape(lines, -1, width)
     wide = np.zeros((profile.n_codes, 4), dtype=np.uint8)
-    wide[:, :width] = narrow[:, : profile.n_codes // profile.lines].reshape(-1, width)
-    codes: Codes = wide.view("<u4").reshape(profile.rows, profile.columns)
+    wide[:, :width] = narrow[:, :per_line].reshape(-1, width)
+    codes: Codes = wide.view("<u4").reshape(shape)
     return codes
 
 

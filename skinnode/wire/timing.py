@@ -39,6 +39,8 @@ _RUN: Final = 5
 _NO_RUN: Final = 0
 _ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
 _STUFF_SHIFT: Final = 12
+_FEW: Final = 8
+"""So many frames of one length are faster one by one than as arrays."""
 
 _Int = NDArray[np.int64]
 
@@ -344,6 +346,11 @@ class BusLoad:
         self._fd.clear()
         for kind in np.unique(lengths << 1 | fd):
             length, rows = int(kind) >> 1, np.flatnonzero((lengths << 1 | fd) == kind)
+            if len(rows) < _FEW and not kind & 1:
+                for row in rows.tolist():
+                    at = int(begins[row])
+                    self._bits += exact_bits(int(ids[row]), joined[at : at + length].tobytes())
+                continue
             payload = joined[begins[rows, None] + np.arange(length)]
             if kind & 1:
                 nominal, fast = fd_bits(ids[rows], payload)

@@ -5,7 +5,6 @@ A :class:`~skinnode.host.link.BusLink` is fed by a bus; a replay feeds a dealer 
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -85,7 +84,6 @@ class Dealer:
         self._foreign_ids: dict[int, int] = {}
         self._bus_state: BusState | None = None
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
-        self._unmetered: list[Sequence[Frame]] = []
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._marks: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=_MARKS)
         self._load = 0.0
@@ -141,7 +139,10 @@ class Dealer:
                 else:
                     self._ignored += 1
         self._received += len(batch)
-        self._unmetered.append(batch)
+        if takes_fd:
+            self._meter.add_all([frame for frame in batch if frame.fd], fd=True)
+            batch = [frame for frame in batch if not frame.fd]
+        self._meter.add_all(batch)
 
     def poll(self, now_ns: int) -> None:
         """Tell the pollers the time, after a batch."""
@@ -201,13 +202,6 @@ class Dealer:
 
     def _mark(self, now_ns: int) -> None:
         """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
-        frames = list(itertools.chain.from_iterable(self._unmetered))
-        self._unmetered.clear()
-        self._meter.add_all(
-            [frame.can_id for frame in frames],
-            [frame.data for frame in frames],
-            [frame.fd for frame in frames],
-        )
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

@@ -35,9 +35,8 @@ _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
 _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that is a time and nothing else
-_STAMP_HEAD: Final = _CONTROL.pack(socket.CMSG_LEN(_STAMPS.size), socket.SOL_SOCKET, _SO_TIMESTAMPING)
-_RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}sqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
-"""A frame and its time as they usually are: identifier, length, 8 bytes, head, software and hardware time."""
+_RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
+"""A frame and its time as they usually are: identifier, length, 8 bytes, software and hardware time."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _FLAGS: Final = _EXTENDED | _REMOTE | _ERROR
@@ -94,12 +93,15 @@ class SocketReader:
         now_ns = time.monotonic_ns()
         wall_to_mono_ns = now_ns - time.time_ns()
         earliest_ns, latest_ns = now_ns - _OLDEST_NS, now_ns + _NEWEST_NS
+        second = second_ns = 0
         frames: list[Frame] = []
         new = tuple.__new__  # a NamedTuple's own __new__ takes twice as long
         for (control, length), record in zip(batch.used(), _RECORD.iter_unpack(batch.taken()), strict=True):
-            word, size, data, head, seconds, nanoseconds, hardware_s = record
-            if control == _STAMPED_BYTES and head == _STAMP_HEAD and seconds and not hardware_s:
-                t_ns = seconds * 1_000_000_000 + nanoseconds + wall_to_mono_ns
+            word, size, data, seconds, nanoseconds, hardware_s = record
+            if control == _STAMPED_BYTES and not hardware_s:
+                if seconds != second:
+                    second, second_ns = seconds, seconds * 1_000_000_000 + wall_to_mono_ns
+                t_ns = second_ns + nanoseconds
                 if not earliest_ns < t_ns < latest_ns:
                     t_ns = now_ns
             else:

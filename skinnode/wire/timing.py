@@ -288,9 +288,8 @@ class BusLoad:
         self._data_bit = bitrate_bps / (data_bitrate_bps or bitrate_bps)
         self._frames = 0
         self._bits = self._fast_bits = 0
-        self._ids: list[int] = []
-        self._data: list[bytes] = []
-        self._fd: list[bool] = []
+        self._classic: tuple[list[int], list[bytes]] = [], []
+        self._fd: tuple[list[int], list[bytes]] = [], []
 
     def add(
         self,
@@ -308,22 +307,20 @@ class BusLoad:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
             self._frames += 1
             return
-        self._ids.append(can_id)
-        self._data.append(data)
-        self._fd.append(fd)
-        if len(self._ids) >= self._BATCH:
-            self._work_off()
+        self.add_all(((can_id, data),), fd=fd)
 
-    def add_all(self, can_ids: Iterable[int], data: Iterable[bytes], fd: Iterable[bool]) -> None:
-        """Count standard data frames, as many as each of the three has."""
-        self._ids.extend(can_ids)
-        self._data.extend(data)
-        self._fd.extend(fd)
+    def add_all(self, frames: Iterable[tuple[int, bytes, *tuple[object, ...]]], *, fd: bool = False) -> None:
+        """Count standard data frames; of each the identifier and the data come first."""
+        ids, data = self._fd if fd else self._classic
+        ids += [frame[0] for frame in frames]
+        data += [frame[1] for frame in frames]
+        if len(ids) >= self._BATCH:
+            self._work_off()
 
     @property
     def frames(self) -> int:
         """Frames added so far."""
-        return self._frames + len(self._ids)
+        return self._frames + len(self._classic[0]) + len(self._fd[0])
 
     @property
     def bits(self) -> int:
@@ -337,24 +334,21 @@ class BusLoad:
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 
     def _work_off(self) -> None:
-        ids, fd = np.array(self._ids, np.int64), np.array(self._fd, bool)
-        lengths = np.array([len(data) for data in self._data], np.int64)
-        joined, begins = np.frombuffer(b"".join(self._data), np.uint8), np.cumsum(lengths) - lengths
-        self._frames += len(ids)
-        self._ids.clear()
-        self._data.clear()
-        self._fd.clear()
-        for kind in np.unique(lengths << 1 | fd):
-            length, rows = int(kind) >> 1, np.flatnonzero((lengths << 1 | fd) == kind)
-            if len(rows) < _FEW and not kind & 1:
-                for row in rows.tolist():
-                    at = int(begins[row])
-                    self._bits += exact_bits(int(ids[row]), joined[at : at + length].tobytes())
-                continue
-            payload = joined[begins[rows, None] + np.arange(length)]
-            if kind & 1:
-                nominal, fast = fd_bits(ids[rows], payload)
-                self._bits += int(nominal.sum())
-                self._fast_bits += int(fast.sum())
-            else:
-                self._bits += int(_bits_of_one_length(ids[rows], length, payload).sum())
+        for can_ids, data in (self._classic, self._fd):
+            ids, lengths = np.array(can_ids, np.int64), np.array([len(each) for each in data], np.int64)
+            joined, begins = np.frombuffer(b"".join(data), np.uint8), np.cumsum(lengths) - lengths
+            self._frames += len(ids)
+            can_ids.clear()
+            data.clear()
+            for length in sorted(set(lengths.tolist())):
+                rows = np.flatnonzero(lengths == length)
+                payload = joined[begins[rows, None] + np.arange(length)]
+                if data is self._fd[1]:
+                    nominal, fast = fd_bits(ids[rows], payload)
+                    self._bits += int(nominal.sum())
+                    self._fast_bits += int(fast.sum())
+                elif len(rows) < _FEW:
+                    alone = zip(ids[rows].tolist(), payload, strict=True)
+                    self._bits += sum(exact_bits(can_id, row.tobytes()) for can_id, row in alone)
+                else:
+                    self._bits += int(_bits_of_one_length(ids[rows], length, payload).sum())

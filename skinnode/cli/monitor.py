@@ -85,6 +85,7 @@ def monitor(
         except BringUpCancelled:
             return
         faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, Path(output))
+        faults = [*faults, *source.flaws]
     for fault in faults:
         print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
     if faults:

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skinnode.words import counted
-
 if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
     from skinnode.record import Replay
@@ -47,7 +45,9 @@ def replay(
         print(json.dumps({"patches": _patches(run, deepest_m), "faults": faults}))
     else:
         for name, facts in _patches(run, deepest_m).items():
-            print(name + "  " + "  ".join(f"{key} {value}" for key, value in facts.items()))
+            depth_m = facts.pop("deepest_m")
+            counts = "  ".join(f"{key} {value}" for key, value in facts.items())
+            print(f"{name}  {counts}  deepest {1e6 * depth_m:.1f} µm")
         for fault in faults:
             print(f"fault: {fault}")
     if faults:
@@ -83,7 +83,7 @@ def _patches(run: Replay, deepest_m: dict[str, float]) -> dict[str, dict[str, An
             "untrusted": lane.untrusted,
             "torn": lane.assembler.scans_torn,
             "missed": lane.assembler.scans_missed,
-            "deepest_um": round(1e6 * deepest_m[name], 1),
+            "deepest_m": deepest_m[name],
         }
         for name, lane in run.patch_stats().items()
     }
@@ -92,18 +92,7 @@ def _patches(run: Replay, deepest_m: dict[str, float]) -> dict[str, dict[str, An
 def _faults(run: Replay) -> list[str]:
     from skinnode.host.accounting import losses_of_lane
 
-    found = [f"{run.log.path.name} {damage}" for damage in run.log.damages]
-    if run.log.damaged > len(found):
-        found.append(f"{run.log.damaged - len(found)} more places like these")
-    if run.incomplete is not None:
-        found.append(f"{run.log.path.name} {run.incomplete}")
-    found += run.complaints
-    if run.dropped:
-        found.append(
-            f"{counted(run.dropped, 'frame was', 'frames were')} not recorded: the disk was too slow"
-        )
-    if run.strange:
-        found.append(f"{counted(run.strange, 'frame')} on channels that no bus of the hand has")
+    found = run.flaws
     for name, lane in run.patch_stats().items():
         found += [f"{name}: {text}" for text in losses_of_lane(lane).values()]
         if not lane.offered and not run.stopped:

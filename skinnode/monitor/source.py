@@ -70,6 +70,10 @@ class Source(Protocol):
     def over(self) -> bool:
         """Whether nothing more will come."""
 
+    @property
+    def flaws(self) -> list[str]:
+        """What of a recording could not be read or is not there, as far as it was played."""
+
     def tare(self, patch: str) -> None:
         """See :meth:`Host.tare`."""
 
@@ -118,6 +122,10 @@ class HostSource:
     @property
     def over(self) -> bool:
         return False
+
+    @property
+    def flaws(self) -> list[str]:
+        return []
 
     def tare(self, patch: str) -> None:
         self._host.tare(patch)
@@ -169,7 +177,7 @@ class ReplaySource:
         self._run = run
         self._failure: SkinError | None = None
         self._running = ExitStack()
-        tell = Events()
+        self._tell = tell = Events()
         self._events: EventSubscription = tell.subscribe(_EVENTS)
         self._running.enter_context(HealthWatch(self._health, self._bus_health, tell))
         self._thread = threading.Thread(target=self._play, name="replay", daemon=True)
@@ -194,6 +202,10 @@ class ReplaySource:
     @property
     def over(self) -> bool:
         return not self._thread.is_alive()
+
+    @property
+    def flaws(self) -> list[str]:
+        return self._run.flaws
 
     def tare(self, patch: str) -> None:
         raise SkinError("a recording cannot be tared")
@@ -225,6 +237,8 @@ class ReplaySource:
         try:
             for _ in self._run:
                 pass
+            for flaw in self._run.flaws:
+                self._tell.tell(HealthEvent(self._run.clock(), self.title, "recording", flaw))
         except Exception as error:  # it must reach the user, not die with the thread
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 

@@ -30,6 +30,7 @@ from skinnode.record.journal import SUFFIX, facts_of, read_journal
 from skinnode.record.recorder import channels
 from skinnode.transport.frame_log_reader import FrameLogReader
 from skinnode.wire.indices import SYNC_COB_ID
+from skinnode.words import counted
 
 LONGEST_SILENCE_S: Final = 60.0
 """A longer one is played as one of this length: it may be a damaged time."""
@@ -135,6 +136,23 @@ class Replay:
         if self._recorded is None or self._read == self._recorded:
             return None
         return f"has {self._read} frames of the {self._recorded} that were recorded"
+
+    @property
+    def flaws(self) -> list[str]:
+        """What of the recording could not be read or is not there, a line each; all of it after an iteration
+        to the end."""
+        found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
+        if self.log.damaged > len(found):
+            found.append(f"{self.log.damaged - len(found)} more places like these")
+        if self.incomplete is not None:
+            found.append(f"{self.log.path.name} {self.incomplete}")
+        found += self.complaints
+        if self.dropped:
+            lost = counted(self.dropped, "frame was", "frames were")
+            found.append(f"{lost} not recorded: the disk was too slow")
+        if self.strange:
+            found.append(f"{counted(self.strange, 'frame')} on channels that no bus of the hand has")
+        return found
 
     def stop(self) -> None:
         """End the iteration soon; from any thread."""

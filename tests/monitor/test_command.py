@@ -60,6 +60,25 @@ def test_json_of_a_recording(tmp_path: Path) -> None:
     assert solved > 4
 
 
+def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
+    """As `skinnode replay` says of it: killed, and damaged."""
+    hand, path = a_hand(1, sync={"period_ms": 100}), tmp_path / "run.log"
+    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
+        time.sleep(1.0)
+    journal = path.with_suffix(".jsonl")
+    lines = journal.read_text().splitlines(keepends=True)
+    journal.write_text("".join(line for line in lines if '"ended"' not in line))
+    path.write_text(path.read_text() + "no frame\n")
+    done = run("--replay", str(path), "--speed", "4", "--json")
+    said = [line for line in done.stderr.splitlines() if "run.log" in line]
+    assert done.returncode == 1
+    assert len(said) == 2
+    assert said[0].startswith("fault: run.log line ")
+    assert said[1].startswith("fault: run.log was not ended: reads up to ")
+    played = run(str(path), "--fast", program=[*PROGRAM[:-1], "replay"])
+    assert played.stdout.splitlines()[1:] == said
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

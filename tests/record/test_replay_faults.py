@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from skinnode.cli._usage import run
@@ -52,6 +53,7 @@ class Played:
     fields: list[Table]
     faults: list[str]
     error: str
+    patches: Table
 
 
 Play = Callable[..., Played]
@@ -72,7 +74,13 @@ def play(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Play:
             status = int(end.code or 0)
         said = capsys.readouterr()
         told = [json.loads(line) for line in said.out.splitlines()]
-        return Played(status, told[:-1], told[-1]["faults"] if told else [], said.err)
+        return Played(
+            status,
+            told[:-1],
+            told[-1]["faults"] if told else [],
+            said.err,
+            told[-1]["patches"] if told else {},
+        )
 
     return play
 
@@ -81,6 +89,9 @@ def test_a_whole_recording_has_no_fault(recorded: Recorded, play: Play) -> None:
     played = play(recorded.log, recorded.journal)
     assert (played.status, played.faults, played.error) == (0, [], "")
     assert len(played.fields) > 60
+    for name, facts in played.patches.items():  # in metres, as the fields are
+        fields = [field["displacement_m"] for field in played.fields if field["patch"] == name]
+        assert facts["deepest_m"] == max(0.0, *(-np.array(field)[..., 2].min() for field in fields))
 
 
 def test_a_log_cut_between_two_lines_lacks_frames(recorded: Recorded, play: Play) -> None:

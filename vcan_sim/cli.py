@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from vcan_sim.fleet import Fleet, NodeReport
 
 app = typer.Typer(
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

@@ -7,8 +7,40 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from skinnode.errors import SkinError
+
 if TYPE_CHECKING:
-    from skinnode.model.config import BusConfig, HandConfig
+    from skinnode.model.config import BusConfig, HandConfig, PatchConfig
+
+
+def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+    """What a shell offers for a node-ID: those of the hand, --hand or hand.toml where there is one, with the
+    names of their patches; else all."""
+    patches = _patches(ctx)
+    offered = [(str(patch.node_id), patch.name) for patch in patches]
+    return _beginning(incomplete, offered or [(str(node_id), "") for node_id in range(1, 128)])
+
+
+def nodes(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+    """The same, and the names of patches where --hand is given."""
+    named = _patches(ctx) if ctx.params.get("hand") is not None else []
+    return node_ids(ctx, incomplete) + _beginning(incomplete, [(p.name, f"node {p.node_id}") for p in named])
+
+
+def _patches(ctx: typer.Context) -> list[PatchConfig]:
+    from skinnode.model.config import load_hand
+
+    bus = ctx.params.get("bus")
+    try:
+        hand = load_hand(ctx.params.get("hand") or "hand.toml")
+    except (SkinError, OSError):  # a shell cannot be told what is wrong
+        return []
+    return [patch for patch in hand.patches if bus in (None, patch.bus)]
+
+
+def _beginning(incomplete: str, offered: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    return [(value, text) for value, text in offered if value.startswith(incomplete)]
+
 
 Interface = Annotated[
     str | None, typer.Option(help="python-can interface; default socketcan.", metavar="NAME")
@@ -26,7 +58,10 @@ Hand = Annotated[
     Path | None, typer.Option(help="Take the bus from this hand; patches by name.", metavar="HAND.toml")
 ]
 Bus = Annotated[str | None, typer.Option(help="Which bus of the hand.", metavar="NAME")]
-Node = Annotated[str, typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE")]
+Node = Annotated[
+    str,
+    typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE", autocompletion=nodes),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 

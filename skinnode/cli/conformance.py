@@ -7,12 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skinnode.cli._bus import node_ids
+
 if TYPE_CHECKING:
     from skinnode.conformance import Report
 
 
 def conformance(
-    node_id: Annotated[int | None, typer.Option(min=1, max=127, help="The node.", metavar="N")] = None,
+    node_id: Annotated[
+        int | None,
+        typer.Option(min=1, max=127, help="The node.", metavar="N", autocompletion=node_ids),
+    ] = None,
     interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",
     channel: Annotated[str, typer.Option(help="Channel of the interface.", metavar="NAME")] = "can0",
     bitrate: Annotated[int, typer.Option(help="Bits per second.", metavar="BPS")] = 1_000_000,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
+from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, node_ids
 
 if TYPE_CHECKING:
     from skinnode.technician.commission import Commissioned
@@ -55,7 +55,10 @@ def set_node(
         int | None,
         typer.Option(min=0, max=0xFFFF_FFFF, help="Which; default: the only one without a node-ID."),
     ] = None,
-    node_id: Annotated[int | None, typer.Option(min=1, max=127, help="Its new node-ID.", metavar="N")] = None,
+    node_id: Annotated[
+        int | None,
+        typer.Option(min=1, max=127, help="Its new node-ID.", metavar="N", autocompletion=node_ids),
+    ] = None,
     bit_rate: Annotated[
         int | None, typer.Option(help="Its bit rate from its next power-on on.", metavar="BPS")
     ] = None,

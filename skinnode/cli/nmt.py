@@ -7,13 +7,23 @@ from typing import Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
+from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
 
 _COMMANDS = "start stop pre-operational reset-node reset-communication"
 
 
+def _nodes_or_all(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+    everybody = [("all", "every node of the bus")] if "all".startswith(incomplete) else []
+    return nodes(ctx, incomplete) + everybody
+
+
 def nmt(
-    node: Annotated[str, typer.Argument(help="Node-ID, patch of --hand, or all.", metavar="NODE|all")],
+    node: Annotated[
+        str,
+        typer.Argument(
+            help="Node-ID, patch of --hand, or all.", metavar="NODE|all", autocompletion=_nodes_or_all
+        ),
+    ],
     command: Annotated[
         str, typer.Argument(help=_COMMANDS.replace(" ", ", "), metavar="COMMAND", show_default=False)
     ],

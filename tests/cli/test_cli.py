@@ -97,10 +97,66 @@ def test_completion_is_written_for_the_shell() -> None:
     assert asked.split() == ["doctor"]
 
 
-def completion(**environment: str) -> str:
+HAND = """
+[[buses]]
+name = "left"
+[[buses]]
+name = "right"
+channel = "can1"
+[[patches]]
+name = "thumb"
+node_id = 11
+bus = "left"
+[[patches]]
+name = "palm"
+node_id = 12
+bus = "right"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("skinnode info ", [str(node_id) for node_id in range(1, 128)]),  # no hand anywhere
+        ("skinnode od 12", ["12", "120", "121", "122", "123", "124", "125", "126", "127"]),
+        ("skinnode nmt a", ["all"]),
+        ("skinnode info --hand two.toml ", ["11", "12", "thumb", "palm"]),
+        ("skinnode od --hand two.toml --bus right ", ["12", "palm"]),
+        ("skinnode nmt --hand two.toml t", ["thumb"]),
+        ("skinnode lss set --hand two.toml --node-id ", ["11", "12"]),
+        ("skinnode info --hand broken.toml 9", ["9", *map(str, range(90, 100))]),
+    ],
+)
+def test_nodes_are_offered_where_one_is_asked_for(tmp_path: Path, words: str, offered: list[str]) -> None:
+    (tmp_path / "two.toml").write_text(HAND)
+    (tmp_path / "broken.toml").write_text("[[patches]")
+    assert offers(words, tmp_path) == offered
+
+
+def test_nodes_are_those_of_the_hand_that_lies_there(tmp_path: Path) -> None:
+    (tmp_path / "hand.toml").write_text(HAND)
+    assert offers("skinnode info ", tmp_path) == ["11", "12"]  # by name only with --hand
+
+
+def test_the_simulator_is_completed_too(tmp_path: Path) -> None:
+    program = SKINNODE.with_name("vcan-sim")
+    script = completion(program, _VCAN_SIM_COMPLETE="source_bash")
+    assert "_VCAN_SIM_COMPLETE=complete_bash" in script
+    assert offers("vcan-sim --fa", tmp_path, program) == ["--fault"]
+
+
+def offers(words: str, folder: Path, program: Path = SKINNODE) -> list[str]:
+    """What a shell offers for the last word of a line."""
+    variable = f"_{program.name.upper().replace('-', '_')}_COMPLETE"
+    count = str(len(words.split(" ")) - 1)
+    asked = {variable: "complete_bash", "COMP_WORDS": words, "COMP_CWORD": count}
+    return completion(program, folder, **asked).split()
+
+
+def completion(program: Path = SKINNODE, folder: Path | None = None, **environment: str) -> str:
     environment = {**os.environ, **environment}
     return subprocess.run(
-        [str(SKINNODE)], capture_output=True, text=True, env=environment, check=False
+        [str(program)], capture_output=True, text=True, env=environment, check=False, cwd=folder
     ).stdout
 
 

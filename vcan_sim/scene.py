@@ -100,7 +100,8 @@ class Scene:
             room = float(np.min((high - low) / np.abs(heading)))
         slide_m = min(options.slide_speed_m_per_s * (1.0 - _RAMP) * slide_s, room)
         way = slide_m * heading
-        start = random.uniform(low - np.minimum(way, 0.0), high - np.maximum(way, 0.0))
+        first, last = low - np.minimum(way, 0.0), high - np.maximum(way, 0.0)
+        start = random.uniform(first, np.maximum(first, last))  # a way as long as the room rounds to more
         return Stroke(
             radius_m=options.indenter_radius_m,
             depth_m=options.depth * self.layout.height_m,

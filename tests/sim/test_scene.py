@@ -112,3 +112,15 @@ def test_a_patch_too_small_to_slide_on_is_still_pressed(wires: int, electrodes: 
         end = np.array(stroke.start_m) + stroke.slide_m * np.array(stroke.heading)
         assert (np.minimum(stroke.start_m, end) >= low - 1e-12).all()
         assert (np.maximum(stroke.start_m, end) <= high + 1e-12).all()
+
+
+def test_a_slide_as_long_as_the_patch_has_room_for() -> None:
+    """Of a slow cycle: where it may begin is one place, of which rounding must not make none."""
+    slow = OPTIONS.model_copy(update={"cycle_s": 20.0})
+    layout = PatchLayout.preset("staggered")
+    low, high = layout.upper_m[..., :2].min(axis=(0, 1)), layout.upper_m[..., :2].max(axis=(0, 1))
+    for seed in range(100):
+        stroke = Scene(layout, slow.model_copy(update={"seed": seed})).stroke(0)
+        end = np.array(stroke.start_m) + stroke.slide_m * np.array(stroke.heading)
+        assert (np.minimum(stroke.start_m, end) >= low).all()
+        assert (np.maximum(stroke.start_m, end) <= high).all()

@@ -138,7 +138,7 @@ class ExactTracker:
         self.stiffness_n_per_m = stiffness_n_per_m
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
-        self._hold = hold
+        self._first = wires.HOLD if hold else wires.PREDICT  # where a wire can be predicted
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
         self._active_only = active_only
         self._in_order = np.arange(layout.shape[0])
@@ -159,6 +159,7 @@ class ExactTracker:
         self._rest_branch = self._solver.solve_rest()
         self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
         self._rest_inverse = self._solver.inverse.copy()
+        self._all_unknown = np.asarray(self._solver.each * self._solver.free)
         # ∂r/∂x at rest of every coordinate, (U, 3N, K), and what an unknown left out may move by unnoticed
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * self._problem.a_rest[:, :, None]).transpose(0, 2, 1))
@@ -206,8 +207,10 @@ class ExactTracker:
         frame = self._begin(frame_ohm, valid, relative_noise, start)
         if self._leaves_out:
             self._leave_out(frame)
-        solver, good, first = self._solver, self._good, wires.HOLD if self._hold else wires.PREDICT
-        around.choose(self._predictable, first, self._unknowns, frame.used, self._weight, self._todo)
+            around.choose(
+                self._predictable, self._first, self._unknowns, frame.used, self._weight, self._todo
+            )
+        solver, good = self._solver, self._good
         self._solve(self._todo, frame)
         easy = self._reached(good, self.status_codes) and not self._active_only
         if easy:
@@ -360,6 +363,8 @@ class ExactTracker:
     @property
     def _unknowns(self) -> NDArray[np.int64]:
         """(U,) unknowns of each wire."""
+        if not self._leaves_out:
+            return self._all_unknown
         return np.asarray(self._solver.each * self._solver.free)
 
     def _solvable(self, frame: _Frame) -> NDArray[np.bool_]:
@@ -514,7 +519,7 @@ class ExactTracker:
     def _begin(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None, start: float
     ) -> _Frame:
-        """The frame, checked, and a solver that has not begun with it."""
+        """The frame, checked, and all ready to solve it."""
         # copies, for kernels are compiled for each kind of memory: what others give may be read-only
         self._ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         self._noise_now[:] = (
@@ -522,12 +527,28 @@ class ExactTracker:
         )
         self._valid[:] = True if valid is None else checked_mask(valid, self.layout)
         a, weight, used, solver = self._a_now, self._weight_now, self._used, self._solver
-        sigma = around.take(
-            self._ohm, self._problem.gain, self._noise_now, self._sigma, self._valid, a, weight, used
+        sigma = around.begin(
+            self._ohm,
+            self._problem.gain,
+            self._noise_now,
+            self._sigma,
+            self._valid,
+            a,
+            weight,
+            used,
+            DEADLINE,  # of all that get no turn
+            self._x,
+            solver.x,
+            solver.report,
+            solver.measure,
+            solver.std,
+            solver.tally,
+            self._predictable,
+            self._first,
+            self._unknowns,
+            self._weight,
+            self._todo,
         )
-        around.clear(
-            DEADLINE, self._x, solver.x, solver.report, solver.measure, solver.std, solver.tally
-        )  # that of all that get no turn
         return _Frame(a, weight, used, sigma, start + self._seconds)
 
 

@@ -23,8 +23,8 @@ STALE: Final = 2.0
 Flags = NDArray[np.bool_]
 
 
-@njit_brief
-def take(
+@njit_part
+def _take(
     frame_ohm: Float,
     gain: Float,
     noise: Float,
@@ -53,8 +53,8 @@ def take(
     return least
 
 
-@njit_brief
-def clear(
+@njit_part
+def _clear(
     status: int, x: Float, start: Float, report: Index, measure: Float, std: Float, tally: Index
 ) -> None:
     """A solver that starts from ``x`` and has nothing to report of any wire but ``status``."""
@@ -78,8 +78,8 @@ def _stale(weight: Float, before: Float) -> bool:
     return stale
 
 
-@njit_brief
-def choose(
+@njit_part
+def _choose(
     predictable: Flags, first: int, unknowns: Index, used: Float, weight: Float, todo: NDArray[np.uint8]
 ) -> None:
     """What to do with each wire into ``todo`` (U,): ``first`` where its inverse is that of its position, but
@@ -88,6 +88,46 @@ def choose(
         todo[u] = first if predictable[u] else wires.SOLVE
         if 0 < unknowns[u] < used.shape[1] and _stale(used[u], weight[u]):
             todo[u] = wires.SOLVE
+
+
+@njit_brief
+def begin(
+    frame_ohm: Float,
+    gain: Float,
+    noise: Float,
+    sigma: float,
+    valid: Flags,
+    a: Float,
+    weight: Float,
+    used: Float,
+    status: int,
+    x: Float,
+    start: Float,
+    report: Index,
+    measure: Float,
+    std: Float,
+    tally: Index,
+    predictable: Flags,
+    first: int,
+    unknowns: Index,
+    solved_weight: Float,
+    todo: NDArray[np.uint8],
+) -> float:
+    """All that comes before the solve: the frame in the units of the problem, a solver that starts from ``x``
+    with nothing to report but ``status``, and what to do with each wire. Returns σ."""
+    _clear(status, x, start, report, measure, std, tally)
+    least = _take(frame_ohm, gain, noise, sigma, valid, a, weight, used)
+    _choose(predictable, first, unknowns, used, solved_weight, todo)
+    return least
+
+
+@njit_brief
+def choose(
+    predictable: Flags, first: int, unknowns: Index, used: Float, weight: Float, todo: NDArray[np.uint8]
+) -> None:
+    """What to do with each wire into ``todo`` (U,), as :func:`begin` has it: where electrodes were left out
+    since."""
+    _choose(predictable, first, unknowns, used, weight, todo)
 
 
 @njit_part

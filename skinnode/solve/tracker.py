@@ -185,7 +185,8 @@ class Tracker:
                     self._pause = PAUSE
                 field = self._refer(field, doubtful, guide)
         self._pause = max(0, self._pause - 1)
-        field = self._keep_apart(field, ~doubtful)
+        if self._any_apart:
+            field = self._keep_apart(field, ~doubtful)
         self._last_m[:] = field.displacement_m
         return field
 
@@ -219,7 +220,7 @@ class Tracker:
 
     def _keep_apart(self, field: FieldFrame, unasked: NDArray[np.bool_]) -> FieldFrame:
         """A wire that is held is no better known than when the posterior confirmed it."""
-        if field.held is None or not self._any_apart:
+        if field.held is None:
             return field
         self._apart[unasked & ~field.held] = 0.0
         apart_now = self._apart[:, 0, 0] > 0.0

@@ -23,7 +23,7 @@ _POLL_S: Final = 0.02
 """How long a thread waits for a frame before it says that there is none, and sees whether it should end."""
 
 
-GATHER_S: Final = 1e-3
+GATHER_S: Final = 1.25e-3
 """Pause after a batch, as a network card moderates its interrupts: a thread that woke for each of 8,000
 frames a second would spend more on waking than on frames. The first frame after a silence does not wait for
 it, and each has the time of its arrival."""

@@ -35,10 +35,15 @@ _EXPLAINED: Final = 2.0
 """How much larger the motion of a crossing is, if touched, than what other wires leave of it unexplained. Of
 noise with 25 degrees of freedom one in a million looks like that."""
 _TOUCHED: Final = 2
+"""Crossings that have to move together before the skin counts as touched: a loose contact moves one."""
 _STEP: Final = 20.0
+"""Least height of a jump, in units of the noise told."""
 _STAYS: Final = 0.3
+"""Share of a jump by which the medians before and after may differ from it."""
 _STILL: Final = 0.1
+"""Most deviation of a crossing beside its jump, as a share of that."""
 _EVEN: Final = 0.2
+"""Most noise of a crossing beside what all have in common, as a share of that, where the supply is noisy."""
 
 Mask = NDArray[np.bool_]
 

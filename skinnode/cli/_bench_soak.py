@@ -40,6 +40,8 @@ RESIDENT_MB: Final = 8.0
 """Of the allocator of C, which gives memory back as it likes."""
 BACK_S: Final = 15.0
 """A stream that is not back by then is lost. It should take one; a loaded machine may need more."""
+SLOW_S: Final = 1.0
+"""Rounds that took longer are told."""
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 
@@ -143,7 +145,7 @@ def _soak(
         rounds += 1
         slowest_s = max(slowest_s, back_s)
         lost += back_s >= BACK_S
-        if rounds % 20 == 0 or back_s >= BACK_S:
+        if rounds % 20 == 0 or back_s >= SLOW_S:
             report(f"{time.monotonic() - begin_s:6.0f} s: round {rounds}, {what}; back after {back_s:.2f} s")
     time.sleep(CALM_S)
     last = _size()

@@ -7,11 +7,12 @@ makes sure that at most one worker is in it.
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -126,8 +127,9 @@ class LaneTap(Protocol):
     def polled(self, patch: str, t_ns: int) -> None:
         """:meth:`Lane.poll` ended a scan."""
 
-    def overtaken(self, patch: str, scan: int) -> None:
-        """A scan, of this number, was overtaken by a newer one before a worker was free."""
+    def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
+        """A scan, of this number and whose last frame came then, was overtaken by a newer one before a worker
+        was free."""
 
 
 class Lane:
@@ -157,7 +159,8 @@ class Lane:
         self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
         self.tap: LaneTap | None = None
-        self._left_out: Set[int] = frozenset()
+        self._left_out: list[int] = []
+        self._left_out_within_ns = 0
         self.withholdings = 0
         """How often scans began to be withheld."""
         self.doubtful = False
@@ -257,18 +260,26 @@ class Lane:
             self._partial += 1
             return
         self._offered += 1
-        if stamp.scan in self._left_out:
+        if self._is_left_out(stamp.t_receive_ns):
             return
         with contextlib.suppress(IndexError):
             _, older, _ = self._box.popleft()
             if self.tap is not None:
-                self.tap.overtaken(self._patch, older.scan)
+                self.tap.overtaken(self._patch, older.scan, older.t_receive_ns)
         self._box.append((scan, stamp, solver))
         self._call_worker()
 
-    def leave_out(self, scans: Set[int]) -> None:
-        """Skip the scans of these numbers, as those that were overtaken when a recording was made."""
-        self._left_out = scans
+    def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
+        """Skip the scans whose last frames came at these times, or so little off, as those that were
+        overtaken when a recording was made. Their numbers would not do: after a pause the halves of a scan
+        may be two of one number."""
+        self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
+
+    def _is_left_out(self, t_ns: int) -> bool:
+        if not self._left_out:
+            return False
+        i = bisect.bisect_left(self._left_out, t_ns - self._left_out_within_ns)
+        return i < len(self._left_out) and self._left_out[i] <= t_ns + self._left_out_within_ns
 
     def settled(self, scan: int) -> bool:
         """Whether ``scan`` or a newer one has come, or none is let through, and nothing is left to solve."""

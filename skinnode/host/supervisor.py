@@ -53,8 +53,10 @@ _PROBE_NS: Final = 250_000_000
 heartbeat would never be noticed. 0.1 % of a bus for four."""
 _SEARCH_NS: Final = 1_000_000_000
 """Pause between two searches by LSS for a node that is not there."""
-_RETRY_NS: Final = 1_000_000_000
-"""Pause after a bring-up that failed."""
+_RETRY_NS: Final = 400_000_000
+"""Pause after a bring-up that failed: the stream is to be back within a second of the cause going away."""
+_FORGET_NS: Final = 2_000_000_000
+"""A node that has been silent for so long is no longer said to be refused."""
 _LEAST_NS: Final = 300_000_000
 """Least time from one bring-up of a node to the next, for nodes that restart in a loop."""
 _DOUBT_NS: Final = 2_000_000_000
@@ -223,7 +225,7 @@ class Supervisor:
         if booted or heard_ns > node.since_ns:
             self._begin(node, now_ns)
             return
-        if now_ns - max(heard_ns, node.since_ns) > 2 * _RETRY_NS:
+        if now_ns - max(heard_ns, node.since_ns) > _FORGET_NS:
             monitor.refusal = None  # whatever it was, it is gone
         if station.is_silent or station.link.failure is not None:
             return

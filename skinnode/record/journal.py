@@ -12,7 +12,7 @@ bus it happened, ``t_ns`` when (monotonic clock of the host).
                without ``facts``: with the same solver as before
 ``withheld``   scans of ``patch`` do not go through any more
 ``polled``     a scan that lacked something was ended by the clock
-``overtaken``  ``scan`` of ``patch`` was skipped for a newer one
+``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
 ``dropped``    ``frames`` that were not written, because the disk was too slow
 ``ended``      the recording was ended, with ``frames`` in the log; without it, its process was killed or the
                disk full
@@ -168,6 +168,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])
+                _whole(event["received_ns"])
         case _:
             raise ValueError
     return event

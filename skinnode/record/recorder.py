@@ -120,8 +120,8 @@ class Recorder:
     def polled(self, patch: str, t_ns: int) -> None:
         self._event(patch, "polled", t_ns=t_ns)
 
-    def overtaken(self, patch: str, scan: int) -> None:
-        self._event(patch, "overtaken", scan=scan)
+    def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
+        self._event(patch, "overtaken", scan=scan, received_ns=t_receive_ns)
 
     def close(self) -> None:
         """Write what is waiting, end and join the thread, close the files. What comes later is ignored."""

@@ -238,8 +238,8 @@ class _Bus:
             for patch in hand.patches_on(config.name)
         }
         for name, heard in self.patches.items():
-            skipped = [e["scan"] for e in events if e["event"] == "overtaken" and e["patch"] == name]
-            heard.lane.leave_out(frozenset(skipped))
+            mine = [e for e in events if e["event"] == "overtaken" and e["patch"] == name]
+            heard.lane.leave_out([e["received_ns"] for e in mine], _ROUNDING_NS)
         self._events = deque(events)
         self._solvers: dict[str, Solver | None] = {}
         self._received = self._sent = 0

@@ -104,6 +104,25 @@ def test_overload_skips_to_the_newest_scan(
     assert fields.get(0.05) is None
 
 
+def test_what_a_replay_leaves_out_is_told_by_its_time_not_its_number(
+    lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
+) -> None:
+    """After a long pause a counter may come again, and both scans are that of one SYNC."""
+    stub.go.set()
+    fields = publisher.subscribe(10, 10.0, None)
+    ticks.note(5, 0)
+    lane.leave_out([1000 * MS + 1500], 2000)
+    feed(lane, 5, 0)
+    first = fields.get(10)
+    feed(lane, 5, 1000 * MS)
+    assert fields.get(0.05) is None
+    feed(lane, 5, 2000 * MS)
+    third = fields.get(10)
+    numbers = [field.stamp.scan for field in (first, third) if field and field.stamp]
+    assert numbers == [5, 5]
+    assert (lane.stats().offered, lane.stats().skipped) == (3, 1)
+
+
 def test_scan_number_and_time_are_those_of_the_sync(
     lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
 ) -> None:

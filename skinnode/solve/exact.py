@@ -170,6 +170,8 @@ class ExactTracker:
             for z in (wires.Z_HOLD, Z_WIDEN, wires.Z_REFUSE)
         )
         self.reset()
+        self.update(self._problem.a_rest / self._problem.gain)  # compiles what has not been, before a stream
+        self.reset()
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""

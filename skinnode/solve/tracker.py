@@ -140,6 +140,8 @@ class Tracker:
         self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
         rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
         self._folded = folded_wires(layout, normal_only) | rough_noise
+        self._doubtful(self._exact.update(problem.a_rest / problem.gain))  # compiles the rest of it
+        self.reset()
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""

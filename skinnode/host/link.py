@@ -123,6 +123,10 @@ class BusLink(Dealer):
 
     # --- the mainline's
 
+    def expect(self, what: str, t_ns: int) -> None:
+        """As :meth:`Intake.expect`."""
+        self.intake.expect(what, t_ns)
+
     def begin(self, resume: Callable[[], None]) -> None:
         """Before the first turn. ``resume``: receives again on an interface that was opened again."""
         self._resume = resume

@@ -63,16 +63,19 @@ def receive_patch(
 ) -> PatchReception:
     """From now on frames of the patch go to its monitor and its lane, which withholds scans until it is told
     how to decode them: a node that an earlier host left operational may be sending already."""
+    period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
     monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject, watch)
 
     def on_scan(scan: Scan) -> None:
         monitor.on_scan(scan.t_last_ns)
+        if scan.complete:
+            dealer.expect(patch.name, scan.t_last_ns + period_ns)
 
     assembler = ScanAssembler(
         PatchProfile.from_config(patch, dealer.config),
         counter_overflow=ticks.counter_overflow,
-        period_ns=hand.sync.period_ms * 1_000_000,
+        period_ns=period_ns,
         grace_ns=max(LEAST_GRACE_NS, hand.sync.period_ms * 500_000),
         node_id=patch.node_id,
         on_reject=dealer.reject,

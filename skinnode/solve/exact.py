@@ -1,8 +1,9 @@
 """The path of the paper run for ever: a live stream of frames, each solved from the one before.
 
-rest       a wire whose resistances have not changed beyond their noise keeps its position (see ``wires``)
-predict    x + (∂x/∂R) ΔR with the J⁻¹ of the last frame, which its covariance needed anyway
-correct    the operator, to a tolerance far below any noise
+rest       a wire whose resistances have not changed beyond their noise keeps its position (see ``follow``)
+predict    x + (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which its covariance needed anyway
+follow     simplified Newton steps with the same J⁻¹, while it is still nearly that of the position
+correct    the operator, where it is not, to a tolerance far below any noise
 bridge     a wire that fails: its R interpolated from the last trusted frame to the new one
 restart    the same from the rest position
 give up    a wire that still fails keeps its last trusted position, with an infinite deviation and a status
@@ -42,6 +43,7 @@ from skinnode.model.status import Status, as_statuses
 from skinnode.solve import frame as around
 from skinnode.solve import operators as op
 from skinnode.solve import wires
+from skinnode.solve.follow import Z_HOLD, chi2_quantile
 from skinnode.solve.frame import STALE
 from skinnode.solve.inputs import broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.problem import PatchProblem
@@ -166,8 +168,8 @@ class ExactTracker:
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         # limits of χ² by degrees of freedom
         self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
-            np.array([wires.chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
-            for z in (wires.Z_HOLD, Z_WIDEN, wires.Z_REFUSE)
+            np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
+            for z in (Z_HOLD, Z_WIDEN, wires.Z_REFUSE)
         )
         self.reset()
         self.update(self._problem.a_rest / self._problem.gain)  # compiles what has not been, before a stream
@@ -178,6 +180,7 @@ class ExactTracker:
         self._x = self._problem.rest.copy()  # last trusted position of each wire, and its a
         self._a = self._problem.a_rest.copy()
         self._solver.inverse[:] = self._rest_inverse
+        self._solver.turn = 0
         self._solver.a_solved[:] = self._a
         self._solver.noise[:] = 0.0
         self._weight = np.ones(self.layout.shape)  # at which the inverse of each wire was made
@@ -242,13 +245,13 @@ class ExactTracker:
         if incomplete:
             self._complete(frame)
         displacement = moved.reshape(self.layout.upper_m.shape)
-        evaluations, steps = solver.tally.tolist()
+        evaluations, jacobians, steps = solver.tally.tolist()
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=std.reshape(displacement.shape),
             status=self._all_converged if easy else as_statuses(self.status_codes.tolist()),
             residual=residual,
-            stats=SolveStats(evaluations, evaluations, steps, perf_counter() - start),
+            stats=SolveStats(evaluations, jacobians, steps, perf_counter() - start),
             force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
             held=held,
         )
@@ -335,7 +338,7 @@ class ExactTracker:
             todo,
             frame.a if a is None else a,
             frame.weight,
-            wires.COVARIANCE if last else 0,
+            wires.COVARIANCE | wires.REUSE if last else 0,
             TOLERANCE if last else BRIDGE_TOLERANCE,
             TOLERANCE if last else BRIDGE_TOLERANCE,
             most,
@@ -479,7 +482,7 @@ class ExactTracker:
             starts.append(rest)
         for substeps in BRIDGES:
             for x_from, a_from in starts:
-                if self._solver.tally[1] >= RECOVERY_STEPS:
+                if self._solver.tally[2] >= RECOVERY_STEPS:
                     return False
                 if not self._bridge(u, x_from, a_from, frame, substeps):
                     self._solver.report[u, wires.STATUS] = DEADLINE
@@ -529,6 +532,7 @@ class ExactTracker:
         )
         self._valid[:] = True if valid is None else checked_mask(valid, self.layout)
         a, weight, used, solver = self._a_now, self._weight_now, self._used, self._solver
+        solver.turn += 1
         sigma = around.begin(
             self._ohm,
             self._problem.gain,

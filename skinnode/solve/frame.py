@@ -67,7 +67,7 @@ def _clear(
         report[u, wires.STATUS] = status
         for i in range(wires.MEASURES):
             measure[u, i] = math.inf
-    tally[0] = tally[1] = 0
+    tally[:] = 0
 
 
 @njit_part

@@ -6,18 +6,7 @@ whose χ² = Σ (ρ_k/σ_k)² at the minimum is a test: above its 1 − 1e-9 qua
 frame, and the wire is ILL_CONDITIONED; from the 95 % quantile on the deviations grow by √(χ²/dof) (Birge,
 Phys. Rev. 40, 207, 1932). This stands for the sign of det J, which only a square system has.
 
-Before that a wire can be held: ρ_k = a_k F_k(x) − 1 at its last position is known without evaluating F,
-which the last solve did, and within noise when Σ (ρ_k/σ_k)² is below its 99 % quantile. In ρ the noise of the
-new frame, variance σ², meets the error of x, which is s² = the noise solved into it and lies in the n
-directions of the range of J. With t = s²/σ² the sum has mean K + n t and half its variance is
-K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, t = 0), and the quantile is that of the c χ²_ν
-with the same two (Satterthwaite 1946).
-
-A slow move can hide in that sum, most of all in the direction a wire knows least, one of K. So a held
-coordinate owns up to it: its correction c = Σ_k (∂x_j/∂r_k) ρ_k is the move and twice its deviation, and
-where c² is more than noise, the rest is added. Coverage of the 95 % intervals, staggered h = 0.5, noise
-1e-5: 98 % unmoved (99 % of the frames held), 97 % on a press growing by 5 % of h in 100 to 1600 frames,
-96 % on a move along the direction known least by 40 deviations in 200 or 800 frames; there 86 % without.
+Before that a wire can be held where it is, or followed with the inverse at hand (see ``follow``).
 """
 
 from __future__ import annotations
@@ -31,6 +20,7 @@ from numpy.typing import NDArray
 from skinnode.jit import njit, njit_part
 from skinnode.model.kernels import potential_jacobian
 from skinnode.model.layout import Float
+from skinnode.solve.follow import FRESH, chi2_quantile_part, deviations, follow, step_back, within_noise
 from skinnode.solve.linear import Index, dot, largest
 from skinnode.solve.operators import (
     ACCEPTED,
@@ -82,6 +72,10 @@ COVARIANCE: Final = 1
 """Compute J⁻¹, and with it the deviation of x and whether rounding leaves x open."""
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
+REUSE: Final = 4
+"""Follow a wire that moved a little with the inverse at hand, which is kept."""
+REFRESH: Final = 8
+"""Calls after which a wire that is followed has a new inverse at the latest, each wire in its turn."""
 
 
 COVARIANCE_UNITS: Final = 3.0
@@ -94,23 +88,8 @@ DATA_ROUNDING: Final = 2.0
 
 # Normal deviates of the quantiles used
 Z_95: Final = 1.645
-Z_HOLD: Final = 2.326
-"""99 %: an unmoved wire is solved for nothing once in a hundred frames."""
 Z_REFUSE: Final = 5.998
 """1 − 1e-9: once in four months at 100 frames/s, and below what a wrong root or a wrong value causes."""
-FRESHER: Final = 2.0
-"""A frame whose noise has less than 1/2 of the variance solved into x is worth a solve."""
-
-
-def chi2_quantile(dof: float, z: float) -> float:
-    """Quantile of χ² at normal deviate ``z`` (Wilson & Hilferty 1931); within 1 % at 99 % from 3 degrees on,
-    never too small far out."""
-    spread = 2.0 / (9.0 * dof)
-    root = 1.0 - spread + z * math.sqrt(spread)
-    return dof * root * root * root
-
-
-_chi2_quantile = njit_part(chi2_quantile)
 
 
 @njit_part
@@ -162,50 +141,6 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 
 @njit_part
-def _within_noise(
-    a: Float, weight: Float, sigma: float, tol: float, a_solved: Float, noise: Float, inverse: Float,
-    unknowns: int, rho: Float, variance: Float, std: Float,
-) -> float:  # fmt: skip
-    """RMS of w ρ where the wire can be held, −1 where not; ``std`` (n,) of the unknowns of a held wire.
-
-    ``noise`` (K,) is the variance solved into x; ``rho`` and ``variance`` (K,) are room to work in. What a
-    held coordinate may be off by is the largest of the noise solved into it, that of the frame which saw it
-    unmoved, and what its correction has beyond both.
-    """
-    count, square, weighted, total, squares = 0, 0.0, 0.0, 0.0, 0.0
-    for k in range(a.size):
-        rho[k] = variance[k] = 0.0
-        if weight[k] > 0.0:
-            count += 1
-            rho[k] = a[k] / a_solved[k] - 1.0
-            deviation = sigma / weight[k]
-            variance[k] = deviation * deviation + tol * tol
-            ratio = noise[k] / variance[k]
-            total += ratio
-            squares += ratio * ratio
-            square += rho[k] * rho[k] / variance[k]
-            weighted += weight[k] * weight[k] * rho[k] * rho[k]
-    if not total <= FRESHER * count:
-        return -1.0
-    share = unknowns / count
-    mean = count + share * total
-    half = count + share * (2.0 * total + squares)
-    if not square <= half / mean * _chi2_quantile(mean * mean / half, Z_HOLD):
-        return -1.0
-    for j in range(unknowns):
-        row = inverse[j]
-        before, now = 0.0, 0.0
-        for k in range(a.size):
-            if weight[k] > 0.0:
-                slope = row[k] * row[k]
-                now += slope * variance[k]
-                before += slope * noise[k]
-        correction = dot(row, rho) ** 2
-        std[j] = math.sqrt(max(before, max(now, correction - before - now)))
-    return math.sqrt(weighted / count)
-
-
-@njit_part
 def _coordinate(electrodes: Index, j: int, each: int) -> int:
     """Where unknown ``j`` is in the 3N coordinates of a wire, with three or one (z) unknowns an electrode."""
     if each == 3:
@@ -241,6 +176,7 @@ def solve_wires(
     measure: Float,
     order: Index,
     units: float,
+    turn: int,
     tally: Index,
 ) -> float:
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo`` (U,).
@@ -255,7 +191,7 @@ def solve_wires(
     equations than unknowns keeps its x and is ILL_CONDITIONED, or NON_FINITE where an ``a`` lost its weight.
     Wires have their turn in ``order`` (U,), until one may need more than what is left of ``units``,
     evaluations of F and J with all that goes with them. Returns how many were needed, by estimate; to
-    ``tally`` (2,) the evaluations and steps are added.
+    ``tally`` (3,) the evaluations of F, those of J and the steps are added. ``turn`` counts the calls.
     """
     unknowns = w.x.size
     equations = a.shape[1]
@@ -281,7 +217,7 @@ def solve_wires(
             w_u[k] = 0.0
         if count < unknowns or count == 0:
             status = ILL_CONDITIONED if lost == 0 else NON_FINITE
-        evaluations, steps, skipped, held = 0, 0, False, -1.0
+        evaluations, jacobians, steps, skipped, followed, held = 0, 0, 0, False, False, -1.0
         report[u, BRANCH] = 0
         report[u, SPARE] = count - unknowns
         measure[u, CHI2] = math.inf
@@ -291,9 +227,10 @@ def solve_wires(
         for j in range(x_u.size):
             std[u, j] = math.inf
         if status == TRY and todo[u] == HOLD:
-            held = _within_noise(
-                a_u, w_u, sigma, tol_f, a_solved[u], noise[u], inverse_u, unknowns, w.e, w.r, w.newton
-            )
+            held = within_noise(
+                a_u, w_u, sigma, tol_f, a_solved[u], noise[u], inverse_u, unknowns,
+                w.e, w.r, w.r_trial, w.newton,
+            )  # fmt: skip
             if held >= 0.0:
                 status = CONVERGED
                 measure[u, RESIDUAL] = held
@@ -310,11 +247,36 @@ def solve_wires(
             if todo[u] != SOLVE:
                 for k in range(equations):
                     w.e[k] = a_u[k] / a_solved[u, k] - 1.0 if w_u[k] > 0.0 else 0.0
+                moved = step_back(inverse_u, w.e, w.newton)
                 for j in range(unknowns):
-                    w.x[j] -= dot(inverse_u[j], w.e)
+                    w.x[j] += w.newton[j]
+                if tasks & REUSE and not tall and unknowns == point.size == x_u.size:
+                    evaluations, first = follow(
+                        w.x, lower, a_u, inverse_u, moved, tol_f, tol_x, w.e, w.newton
+                    )
+                    followed = evaluations > 0 and first <= FRESH and (turn + u) % REFRESH != 0
+                    if evaluations > 0 and not followed:
+                        for j in range(unknowns):
+                            w.x[j] += w.newton[j]
+                    evaluations = abs(evaluations)
+                    steps = evaluations - 1
+            if followed:
+                status = CONVERGED
+                for j in range(unknowns):
+                    x_u[j] = w.x[j] + w.newton[j]
+                measure[u, ERROR_ESTIMATE] = largest(w.newton)
+                measure[u, CHI2] = 0.0
+                for k in range(equations):
+                    w.r[k] = w_u[k] * w.e[k]
+                    a_solved[u, k] = a_u[k]
+                    noise[u, k] = (sigma / w_u[k]) ** 2
+                measure[u, RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)
+                deviations(inverse_u, noise[u], std[u])
+        if status == TRY:
             _evaluate(w.x, point, still[u], lower, a_u, w_u, w.r, raw)
             _take_jacobian(raw, a_u, w_u, w.jt)
-            evaluations = 1
+            evaluations += 1
+            jacobians = 1
             w.s[LIMIT] = step_limit
             status = begin(w)
             if tasks & SKIP and status == TRY:
@@ -340,6 +302,7 @@ def solve_wires(
                     break
                 steps += 1
                 evaluations += 1
+                jacobians += 1
                 _evaluate(w.trial, point, still[u], lower, a_u, w_u, w.r_trial, raw)
                 status = judge(operator, w, tol_r, tol_x)
                 if status == ACCEPTED:
@@ -375,9 +338,9 @@ def solve_wires(
                         spare = count - unknowns
                         scale = sigma
                         if spare > 0 and sigma > 0.0:
-                            if square > _chi2_quantile(spare, Z_95):  # Birge's ratio
+                            if square > chi2_quantile_part(spare, Z_95):  # Birge's ratio
                                 scale *= math.sqrt(square / spare)
-                            if not square <= _chi2_quantile(spare, Z_REFUSE):
+                            if not square <= chi2_quantile_part(spare, Z_REFUSE):
                                 status = ILL_CONDITIONED
                         for j in range(x_u.size):
                             std[u, j] = still_std[u, j]
@@ -390,11 +353,12 @@ def solve_wires(
         report[u, EVALUATIONS] = evaluations
         report[u, STEPS] = steps
         tally[0] += evaluations
-        tally[1] += steps
+        tally[1] += jacobians
+        tally[2] += steps
         if held >= 0.0:
             spent += HELD_UNITS
         elif evaluations > 0:
-            spent += evaluations + COVARIANCE_UNITS
+            spent += evaluations + (0.0 if followed else COVARIANCE_UNITS)
     return spent
 
 
@@ -415,8 +379,10 @@ class Solver:
         """(U, 3N) pitches."""
         self.report = np.zeros((wires, REPORT), np.int64)
         self.measure = np.zeros((wires, MEASURES))
-        self.tally = np.zeros(2, np.int64)
-        """Evaluations and steps of all calls since its owner set it to zero."""
+        self.tally = np.zeros(3, np.int64)
+        """Evaluations of F, of J and steps of all calls since its owner set it to zero."""
+        self.turn = 0
+        """Counted by the owner: says whose turn it is to have a new inverse, where it is reused."""
         self.still_std = np.full((wires, unknowns), np.inf)
         """(U, 3N) deviation of what is no unknown, pitches."""
         self.each = 1 if normal_only else 3
@@ -505,5 +471,6 @@ class Solver:
                 self.measure,
                 self._in_turn if order is None else order,
                 units,
+                self.turn,
                 self.tally,
             )

@@ -23,10 +23,17 @@ _POLL_S: Final = 0.02
 """How long a thread waits for a frame before it says that there is none, and sees whether it should end."""
 
 
-GATHER_S: Final = 1.25e-3
+GATHER_S: Final = 1.5e-3
 """Pause after a batch, as a network card moderates its interrupts: a thread that woke for each of 8,000
 frames a second would spend more on waking than on frames. The first frame after a silence does not wait for
 it, and each has the time of its arrival."""
+
+_SHORT_S: Final = 0.2e-3
+"""Least pause, when something is expected."""
+_LATE_NS: Final = 1_000_000
+"""For how long something overdue is still waited for with short pauses."""
+_LAG_NS: Final = 50_000
+"""A frame is there to be read that long after the time of its arrival."""
 
 
 class Intake:
@@ -46,6 +53,7 @@ class Intake:
         self._queue: deque[list[Frame]] = deque()
         self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the receiver's
         self._error: Exception | None = None
+        self._expected: dict[str, int] = {}
 
     @property
     def dropped(self) -> int:
@@ -72,7 +80,21 @@ class Intake:
         self._taken += len(frames)
         return frames
 
+    def expect(self, what: str, t_ns: int) -> None:
+        """The last frame of ``what`` should come at ``t_ns``, monotonic, and is not to wait for others then.
+        Holds until the same is expected at another time."""
+        self._expected[what] = t_ns
+
     # --- the receiver's
+
+    def pause_s(self, now_ns: int) -> float:
+        """How long to let frames gather."""
+        pause_s = GATHER_S
+        for t_ns in tuple(self._expected.values()):
+            ahead_ns = t_ns + _LAG_NS - now_ns
+            if -_LATE_NS < ahead_ns < pause_s * 1e9:
+                pause_s = max(_SHORT_S, ahead_ns * 1e-9)
+        return pause_s
 
     @property
     def failed(self) -> bool:
@@ -174,7 +196,8 @@ class Receiver:
                 intakes = {intake: None for intake in intakes if not intake.failed}
                 poll = _poll_of(intakes)
             self._tell()
-            time.sleep(GATHER_S)
+            now_ns = time.monotonic_ns()
+            time.sleep(min([intake.pause_s(now_ns) for intake in intakes], default=GATHER_S))
 
     def _receive_alone(self, intake: Intake) -> None:
         while not (self._stop.is_set() or intake.failed):

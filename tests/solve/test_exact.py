@@ -13,6 +13,7 @@ from scipy.stats import chi2, norm
 import skinnode as sk
 from skinnode.solve import exact, wires
 from skinnode.solve.exact import ExactTracker
+from skinnode.solve.follow import chi2_quantile
 
 from .press import frame_ohm, hertz_press
 
@@ -180,8 +181,8 @@ def test_bad_frames_get_a_status_and_leave_no_trace(staggered, stream, kind, sta
         again, unspoilt = tracker.update(frame), witness.update(frame)
         assert again.trusted
         np.testing.assert_allclose(again.displacement_m, unspoilt.displacement_m, atol=1e-12)
-        # the deviation belongs to the last factored J, one step before the solution
-        np.testing.assert_allclose(again.displacement_std_m, unspoilt.displacement_std_m, rtol=1e-2)
+        # the deviation is that of an inverse up to eight frames old, and not of the same frame in both
+        np.testing.assert_allclose(again.displacement_std_m, unspoilt.displacement_std_m, rtol=5e-2)
 
 
 def test_a_wire_with_equations_to_spare_loses_some(staggered):
@@ -328,8 +329,44 @@ def relative_slopes(layout: sk.PatchLayout, moved: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("probability", [0.95, 0.99, 1 - 1e-4, 1 - 1e-9])
 def test_quantiles_of_chi_squared(probability):
     for dof in (2, 3, 9, 20, 30, 60, 200):
-        ratio = wires.chi2_quantile(dof, norm.ppf(probability)) / chi2.ppf(probability, dof)
+        ratio = chi2_quantile(dof, norm.ppf(probability)) / chi2.ppf(probability, dof)
         assert 0.99 < ratio < (1.05 if dof >= 9 else 1.2)
+
+
+class TestFollow:
+    """A wire that moved a little is solved with the inverse of an earlier frame."""
+
+    def test_position_and_deviation_are_those_of_an_inverse_made_there(self, staggered):
+        """The truth is NumPy's: the position that made the frame, and the inverse of J there."""
+        tracker = ExactTracker(staggered, relative_noise=1e-5, hold=False)
+        jacobians, ratios = 0, []
+        for depth in np.linspace(0.0, 0.3, 60):
+            moved = hertz_press(staggered, depth)
+            field = tracker.update(frame_ohm(staggered, moved))
+            assert field.trusted
+            assert np.abs(field.displacement_m - moved).max() < 5e-11  # 1e-9 of the largest coordinate
+            std = 1e-5 * np.sqrt((np.linalg.inv(relative_slopes(staggered, moved)) ** 2).sum(axis=2))
+            ratios.append(field.displacement_std_m / std.reshape(moved.shape))
+            jacobians += field.stats.jacobians
+            assert field.stats.evaluations >= field.stats.jacobians
+        assert jacobians < 60 * 10 / 2  # less than one for two solves
+        np.testing.assert_allclose(ratios, 1.0, atol=0.04)
+        assert abs(np.mean(ratios) - 1.0) < 2e-3
+
+    def test_a_jump_is_solved_anew(self, staggered):
+        tracker = ExactTracker(staggered, hold=False)
+        tracker.update(frame_ohm(staggered, np.zeros_like(staggered.upper_m)))
+        field = tracker.update(frame_ohm(staggered, hertz_press(staggered, 0.3)))
+        assert field.trusted
+        assert field.stats.jacobians >= 10
+
+    def test_every_wire_has_a_new_inverse_after_eight_frames(self, staggered):
+        tracker, counts = ExactTracker(staggered, hold=False), []
+        for n in range(1, 17):
+            frame = frame_ohm(staggered, hertz_press(staggered, 0.1 + 1e-5 * n))
+            counts.append(tracker.update(frame).stats.jacobians)
+        assert sum(counts[-8:]) == 10  # a wire each, in its turn
+        assert max(counts[-8:]) <= 2
 
 
 class TestHold:
@@ -415,7 +452,7 @@ class TestHold:
         np.testing.assert_allclose(unsure.displacement_std_m, 100 * sure.displacement_std_m, rtol=1e-3)
         better = tracker.update(frame, relative_noise=1e-7)
         assert not better.held.any()
-        np.testing.assert_allclose(better.displacement_std_m, 1e-2 * sure.displacement_std_m, rtol=1e-3)
+        np.testing.assert_allclose(better.displacement_std_m, 1e-2 * sure.displacement_std_m, rtol=5e-2)
 
     def test_tall_patches_hold_and_lost_equations_are_noticed(self):
         layout = sk.PatchLayout.preset(
@@ -578,7 +615,7 @@ class TestNormalOnly:
     def test_deviations_are_those_of_least_squares_and_of_the_test(self, staggered, rest):
         """At rest by NumPy: z from (JᵀJ)⁻¹ σ², x and y from the move that takes χ² to where it refuses."""
         field = ExactTracker(staggered, normal_only=True, hold=False).update(rest)
-        limit = wires.chi2_quantile(20, norm.ppf(1 - 1e-9)) - 20
+        limit = chi2_quantile(20, norm.ppf(1 - 1e-9)) - 20
         for u, slopes in enumerate(relative_slopes(staggered, np.zeros_like(staggered.upper_m))):
             z, xy = slopes[:, 2::3], np.delete(slopes, np.s_[2::3], axis=1)
             expected = 1e-5 * np.sqrt(np.diag(np.linalg.inv(z.T @ z)))
@@ -741,7 +778,10 @@ def test_corrupt_frames_leave_no_trace(small, options, corruptions):
             field, expected = tracker.update(frame), witness.update(frame)
             assert field.trusted
             scale = np.abs(moved).max()
-            np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=1e-6 * scale)
+            least = exact.TOLERANCE * small.pitch_m  # either may be off by as much
+            np.testing.assert_allclose(
+                field.displacement_m, expected.displacement_m, atol=max(1e-6 * scale, least)
+            )
             np.testing.assert_allclose(field.displacement_m, moved, atol=1e-6 * scale)
 
 

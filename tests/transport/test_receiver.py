@@ -14,6 +14,7 @@ from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Intake, Receiver
 from skinnode.transport.datagram import DatagramPort, datagram, free_channel
+from skinnode.transport.receiver import GATHER_S
 
 
 @pytest.fixture(autouse=True)
@@ -253,3 +254,17 @@ def test_frames_that_wait_are_not_yet_seen(any_bus: BusConfig) -> None:
             receiver.wait(5.0)
             seen_ns = intake.seen_ns
             assert ids(intake.take()) == [1] or seen_ns < sent_ns
+
+
+def test_what_is_expected_does_not_wait_for_more_frames() -> None:
+    intake = Intake(Script(0))
+    now_ns = 5_000_000_000
+    assert intake.pause_s(now_ns) == GATHER_S
+    intake.expect("thumb", now_ns + 1_000_000)
+    intake.expect("index", now_ns + 900_000)
+    assert 0.9e-3 < intake.pause_s(now_ns) < 1e-3  # until the first of them
+    assert intake.pause_s(now_ns + 1_200_000) < 0.3e-3  # overdue
+    assert intake.pause_s(now_ns + 5_000_000) == GATHER_S  # it does not come any more
+    intake.expect("thumb", now_ns + 50_000_000)
+    assert intake.pause_s(now_ns + 10_000_000) == GATHER_S
+    assert intake.pause_s(now_ns + 49_000_000) < GATHER_S

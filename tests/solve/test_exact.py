@@ -182,7 +182,7 @@ def test_bad_frames_get_a_status_and_leave_no_trace(staggered, stream, kind, sta
         assert again.trusted
         np.testing.assert_allclose(again.displacement_m, unspoilt.displacement_m, atol=1e-12)
         # the deviation is that of an inverse up to eight frames old, and not of the same frame in both
-        np.testing.assert_allclose(again.displacement_std_m, unspoilt.displacement_std_m, rtol=5e-2)
+        np.testing.assert_allclose(again.displacement_std_m, unspoilt.displacement_std_m, rtol=4e-2)
 
 
 def test_a_wire_with_equations_to_spare_loses_some(staggered):
@@ -452,7 +452,7 @@ class TestHold:
         np.testing.assert_allclose(unsure.displacement_std_m, 100 * sure.displacement_std_m, rtol=1e-3)
         better = tracker.update(frame, relative_noise=1e-7)
         assert not better.held.any()
-        np.testing.assert_allclose(better.displacement_std_m, 1e-2 * sure.displacement_std_m, rtol=5e-2)
+        np.testing.assert_allclose(better.displacement_std_m, 1e-2 * sure.displacement_std_m, rtol=3e-2)
 
     def test_tall_patches_hold_and_lost_equations_are_noticed(self):
         layout = sk.PatchLayout.preset(
@@ -778,11 +778,9 @@ def test_corrupt_frames_leave_no_trace(small, options, corruptions):
             field, expected = tracker.update(frame), witness.update(frame)
             assert field.trusted
             scale = np.abs(moved).max()
-            least = exact.TOLERANCE * small.pitch_m  # either may be off by as much
-            np.testing.assert_allclose(
-                field.displacement_m, expected.displacement_m, atol=max(1e-6 * scale, least)
-            )
-            np.testing.assert_allclose(field.displacement_m, moved, atol=1e-6 * scale)
+            atol = max(1e-6 * scale, exact.TOLERANCE * small.pitch_m)  # a solve is no more exact
+            np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=atol)
+            np.testing.assert_allclose(field.displacement_m, moved, atol=atol)
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-12, 0.0])

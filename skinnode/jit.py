@@ -25,7 +25,7 @@ import numba as typed_numba
 
 numba: Any = typed_numba  # its type hints leave out configuration and options that are used here
 _F = TypeVar("_F", bound=Callable[..., Any])
-_KERNEL_FILES = ("jit.py", "simd.py", "model/kernels.py", "solve/*.py")
+_KERNEL_FILES = ("jit.py", "simd.py", "model/kernels.py", "solve/*.py", "wire/stuffing.py")
 
 
 def _writable(folder: Path) -> bool:

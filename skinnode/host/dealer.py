@@ -153,6 +153,10 @@ class Dealer:
             self._polled_ns = now_ns
             for poll in self._pollers:
                 poll(now_ns)
+
+    def measure(self, now_ns: int) -> None:
+        """Work out the load, when that is due. It takes as long as forty frames do, so whoever has several
+        buses lets one of them at a time."""
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
 

@@ -37,6 +37,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
 from skinnode.wire.plan import check_plan
+from skinnode.wire.stuffing import load_kernels
 
 _log = logging.getLogger(__name__)
 
@@ -165,6 +166,7 @@ class Host:
         hand = hand.on(interface, channel)
         check_plan(hand)
         check_files(hand)
+        load_kernels()  # of the load of a bus: the mainline could not stop for that
         publisher, callbacks = Publisher(tuple(patch.name for patch in hand.patches)), Callbacks()
         with contextlib.ExitStack() as stack:
             stack.callback(callbacks.join)

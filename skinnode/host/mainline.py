@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import threading
 from collections.abc import Sequence
 from types import TracebackType
@@ -48,7 +49,10 @@ class Mainline:
         self.stop()
 
     def _run(self) -> None:
-        while not self._stop.is_set():
+        for measured in itertools.cycle(self._links):
+            if self._stop.is_set():
+                return
             self._receiver.wait(_WAIT_S)
             for link in self._links:
                 link.turn()
+            measured.measure_load()

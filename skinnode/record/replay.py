@@ -259,7 +259,7 @@ class _Bus:
         if not whole:
             for heard in self.patches.values():
                 heard.lane.poll(frame.t_ns)
-        self._dealer.poll(frame.t_ns)
+        self._dealer.measure(frame.t_ns)
 
     def finish(self) -> None:
         """What happened after the last frame."""

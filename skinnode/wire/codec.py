@@ -206,18 +206,25 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
 
 def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
     """(U, K) codes from the payloads of all chunks of a scan in ascending order, one after the other."""
-    width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
-    payload = np.frombuffer(frames, dtype=np.uint8).reshape(profile.n_chunks, -1)
-    lines, shape = profile.lines, (profile.rows, profile.columns)
-    per_line = profile.n_codes // lines
-    if width == 2:
-        words = payload.view("<u2")[:, head // 2 : head // 2 + per].reshape(lines, -1)
-        return words[:, :per_line].astype(np.uint32).reshape(shape)
-    narrow = payload[:, head : head + per * width].reshape(lines, -1, width)
-    wide = np.zeros((profile.n_codes, 4), dtype=np.uint8)
-    wide[:, :width] = narrow[:, :per_line].reshape(-1, width)
-    codes: Codes = wide.view("<u4").reshape(shape)
+    places = _places_of_codes(profile)
+    if profile.code_bits == 16:
+        return np.frombuffer(frames, "<u2").take(places).astype(np.uint32)
+    codes: Codes = np.frombuffer(frames + b"\0", np.uint8).take(places).view("<u4")[:, :, 0]
     return codes
+
+
+@functools.lru_cache(maxsize=64)
+def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
+    """Where each code is in the payloads of a scan: (U, K) words of 16 bits, or (U, K, 4) bytes of codes of
+    24, the last of which is a zero after the payloads."""
+    width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
+    lines, shape = profile.lines, (profile.rows, profile.columns)
+    numbers = np.arange(profile.n_chunks * profile.chunk_bytes).reshape(profile.n_chunks, -1)
+    first = numbers[:, head : head + per * width : width].reshape(lines, -1)  # byte of each code
+    first = first[:, : profile.n_codes // lines].reshape(shape)
+    if width == 2:
+        return first // 2
+    return np.stack([first, first + 1, first + 2, np.full(shape, numbers.size)], axis=-1)
 
 
 @functools.lru_cache(maxsize=64)

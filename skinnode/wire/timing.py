@@ -19,6 +19,7 @@ bits inter-frame space) at the nominal one.
 from __future__ import annotations
 
 import functools
+from array import array
 from collections.abc import Iterable
 from typing import Final
 
@@ -26,28 +27,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skinnode.errors import ConfigError
+from skinnode.wire import stuffing
+from skinnode.wire.stuffing import (
+    ALTERNATING,
+    CRC_BITS,
+    FD_NOMINAL_BITS,
+    HEAD_BITS,
+    TAIL_BITS,
+    tables,
+)
 
-TAIL_BITS: Final = 13
-_CRC_BITS: Final = 15
-_CRC_POLYNOMIAL: Final = 0x4599
-_HEAD_BITS: Final = 19  # SOF, 11 bits identifier, RTR, IDE, r0, 4 bits DLC
 _EXTENDED_HEAD_BITS: Final = 39  # SOF, 11 bits, SRR, IDE, 18 bits, RTR, r1, r0, 4 bits DLC
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Bytes that a CAN FD frame can have, by its length code."""
-_FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11 bits identifier, RRS, IDE, FDF, res, BRS; and the tail
 _RUN: Final = 5
 _NO_RUN: Final = 0
-_ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
-_STUFF_SHIFT: Final = 12
-_FEW: Final = 8
-"""So many frames of one length are faster one by one than as arrays."""
+_FEW: Final = 32
+"""So many frames are not worth to load a kernel for, as a command that listens for a second would."""
 
 _Int = NDArray[np.int64]
 
 
 def nominal_bits(dlc: int, *, extended: bool = False) -> int:
     """Bits of a frame without any stuff bit."""
-    return (_EXTENDED_HEAD_BITS if extended else _HEAD_BITS) + 8 * dlc + _CRC_BITS + TAIL_BITS
+    return (_EXTENDED_HEAD_BITS if extended else HEAD_BITS) + 8 * dlc + CRC_BITS + TAIL_BITS
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
@@ -81,17 +84,17 @@ def exact_bits(
         head_bits = _EXTENDED_HEAD_BITS
     else:
         head = can_id << 7 | remote << 6 | code
-        head_bits = _HEAD_BITS
+        head_bits = HEAD_BITS
     head_bytes = -(-head_bits // 8)
-    crc_table, next_run, stuffed = _tables()
+    crc_table, next_run, stuffed = tables()
     crc = 0
     for byte in head.to_bytes(head_bytes, "big") + data:
         crc = (crc << 8 & 0x7FFF) ^ crc_table[crc >> 7 ^ byte]
 
-    n_bits = head_bits + 8 * len(data) + _CRC_BITS
-    bits = (head << 8 * len(data) | int.from_bytes(data, "big")) << _CRC_BITS | crc
+    n_bits = head_bits + 8 * len(data) + CRC_BITS
+    bits = (head << 8 * len(data) | int.from_bytes(data, "big")) << CRC_BITS | crc
     n_bytes = -(-n_bits // 8)
-    filler = _ALTERNATING & ((1 << 8 * n_bytes - n_bits) - 1)
+    filler = ALTERNATING & ((1 << 8 * n_bytes - n_bits) - 1)
     run, stuff = _NO_RUN, 0
     for byte in (filler << n_bits | bits).to_bytes(n_bytes, "big"):
         at = run << 8 | byte
@@ -120,18 +123,10 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
     length = payload.shape[1]
     if length not in FD_LENGTHS or np.any((ids < 0) | (ids > 0x7FF)):
         raise ValueError(f"can_id, data: got {length} bytes, must be one of {FD_LENGTHS}, and 11-bit numbers")
-    # 22 bits up to the length code are two less than three bytes, and the data follow bytewise. FDF, res and
-    # BRS alternate: no stuff bit stands between the first two bytes (nominal) and ESI.
-    stream = np.empty((3 + length, len(ids)), np.int64)
-    stream[:3] = _three_bytes(0b01 << 22 | ids << 10 | 0b10100000 | FD_LENGTHS.index(length))
-    stream[3:] = payload.T
-    last = stream[-1] & 1
-    nominal, fast, run = _stuff_bits(stream, 2)
-    # A stuff bit due after the last bit is not sent: the first fixed one stands there.
-    fast -= (run - 1 >> 2) != last
-    crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
-    data_bits = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1  # ESI, DLC, data, count, CRC, delimiter
-    return _FD_NOMINAL_BITS + nominal, data_bits + fast
+    nominal, fast = np.empty((2, len(ids)), np.int64)
+    lengths = np.full(len(ids), length, np.uint8)
+    stuffing.fd_bits(ids.astype(np.uint32), lengths, payload.flatten(), nominal, fast)
+    return nominal, fast
 
 
 @functools.cache
@@ -163,7 +158,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
         stuff = after
     crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
     data_bits = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1
-    return _FD_NOMINAL_BITS + (14 - 1) // (_RUN - 1), data_bits + max(stuff.values())
+    return FD_NOMINAL_BITS + (14 - 1) // (_RUN - 1), data_bits + max(stuff.values())
 
 
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
@@ -182,94 +177,9 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
         raise ValueError(f"can_id, dlc, data: got shapes {shapes}, must be (n,), (n,), (n, 8)")
     if np.any((ids < 0) | (ids > 0x7FF) | (lengths < 0) | (lengths > 8)):
         raise ValueError("can_id, dlc: got a number out of range, must be 0 to 0x7FF and 0 to 8")
-    bits = np.empty(n, dtype=np.int64)
-    for length in np.unique(lengths):
-        chosen = lengths == length
-        bits[chosen] = _bits_of_one_length(ids[chosen], int(length), payload[chosen])
+    bits = np.empty(n, np.int64)
+    stuffing.classic_bits(ids.astype(np.uint32), lengths.astype(np.uint8), payload.flatten(), 8, bits)
     return bits
-
-
-def _bits_of_one_length(ids: _Int, length: int, payload: NDArray[np.uint8]) -> _Int:
-    head = ids << 7 | length
-    columns = np.empty((3 + length, len(ids)), np.int64)
-    columns[:3] = _three_bytes(head)
-    columns[3:] = payload[:, :length].T
-    # The CRC is linear: that of a frame is the sum of those that its bytes would have alone.
-    of_byte, place = _crc_by_place(), np.arange(2 + length, -1, -1)
-    crc = np.bitwise_xor.reduce(of_byte.take(columns + 256 * place[:, None]), axis=0)
-
-    # 19 + 15 bits of head and CRC are two more than four bytes: six bits of filler make it five. The bytes
-    # of the stuffed region straddle those of the payload, so they are cut from pairs of neighbours.
-    stream = np.empty((5 + length, len(ids)), np.int64)
-    stream[:3] = _three_bytes((_ALTERNATING & 0x3F) << 18 | head >> 1)  # 6 + 18 bits
-    stream[3:-2] = (columns[2:-1] & 1) << 7 | columns[3:] >> 1
-    last = (columns[-1] & 1) << 15 | crc
-    stream[-2], stream[-1] = last >> 8, last & 0xFF
-    stuff, _, _ = _stuff_bits(stream, len(stream))
-    return _HEAD_BITS + 8 * length + _CRC_BITS + TAIL_BITS + stuff
-
-
-def _three_bytes(number: _Int) -> tuple[_Int, _Int, _Int]:
-    return number >> 16, number >> 8 & 0xFF, number & 0xFF
-
-
-def _stuff_bits(stream: _Int, first: int) -> tuple[_Int, _Int, _Int]:
-    """Of (bytes, n) stuffed from the first bit on, which it overwrites: how many stuff bits are in the
-    ``first`` bytes and in the others, and the run that they end with."""
-    after, run = _run_and_stuff(), np.full(stream.shape[1], _NO_RUN << 8, np.int64)
-    for byte in stream:  # three calls a byte: with a few hundred frames it is the calls that cost
-        byte |= run
-        after.take(byte, out=byte, mode="clip")
-        np.bitwise_and(byte, 0xF00, out=run)
-    stream >>= _STUFF_SHIFT
-    return stream[:first].sum(axis=0), stream[first:].sum(axis=0), run >> 8
-
-
-@functools.cache
-def _tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """CRC of a byte; and for run << 8 | byte: the run after the byte and the stuff bits in it.
-
-    A run is 0 before the first bit, else value << 2 | (length − 1) + 1, with lengths 1 … 4: a fifth equal bit
-    brings the stuff bit, which begins a run of its own.
-    """
-    crc_table = []
-    for byte in range(256):
-        crc = byte << 7
-        for _ in range(8):
-            crc = crc << 1 ^ (_CRC_POLYNOMIAL if crc & 0x4000 else 0)
-        crc_table.append(crc & 0x7FFF)
-    next_run, stuffed = [], []
-    for run in range(9):
-        for byte in range(256):
-            value, length = ((run - 1) >> 2, (run - 1 & 3) + 1) if run else (-1, 0)
-            stuff = 0
-            for shift in range(7, -1, -1):
-                bit = byte >> shift & 1
-                length = length + 1 if bit == value else 1
-                value = bit
-                if length == _RUN:
-                    stuff += 1
-                    value, length = 1 - bit, 1
-            next_run.append((value << 2 | length - 1) + 1)
-            stuffed.append(stuff)
-    return tuple(crc_table), tuple(next_run), tuple(stuffed)
-
-
-@functools.cache
-def _run_and_stuff() -> _Int:
-    """For run << 8 | byte: the run after the byte << 8, and the stuff bits in it << :data:`_STUFF_SHIFT`."""
-    _, next_run, stuffed = (np.array(table, dtype=np.int64) for table in _tables())
-    return next_run << 8 | stuffed << _STUFF_SHIFT
-
-
-@functools.cache
-def _crc_by_place() -> _Int:
-    """For place << 8 | byte: the CRC of that byte with as many zero bytes after it."""
-    crc_table = np.array(_tables()[0], dtype=np.int64)
-    rows = [crc_table]
-    for _ in range(2 + 8):  # a head of three bytes and eight of data
-        rows.append((rows[-1] << 8 & 0x7FFF) ^ crc_table[rows[-1] >> 7])
-    return np.concatenate(rows)
 
 
 class BusLoad:
@@ -334,21 +244,29 @@ class BusLoad:
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 
     def _work_off(self) -> None:
-        for can_ids, data in (self._classic, self._fd):
-            ids, lengths = np.array(can_ids, np.int64), np.array([len(each) for each in data], np.int64)
-            joined, begins = np.frombuffer(b"".join(data), np.uint8), np.cumsum(lengths) - lengths
-            self._frames += len(ids)
-            can_ids.clear()
-            data.clear()
-            for length in sorted(set(lengths.tolist())):
-                rows = np.flatnonzero(lengths == length)
-                payload = joined[begins[rows, None] + np.arange(length)]
-                if data is self._fd[1]:
-                    nominal, fast = fd_bits(ids[rows], payload)
-                    self._bits += int(nominal.sum())
-                    self._fast_bits += int(fast.sum())
-                elif len(rows) < _FEW:
-                    alone = zip(ids[rows].tolist(), payload, strict=True)
-                    self._bits += sum(exact_bits(can_id, row.tobytes()) for can_id, row in alone)
-                else:
-                    self._bits += int(_bits_of_one_length(ids[rows], length, payload).sum())
+        ids, data = self._classic
+        self._frames += len(ids)
+        if len(ids) < _FEW:
+            self._bits += sum(map(exact_bits, ids, data))
+        else:
+            self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
+        ids.clear()
+        data.clear()
+        ids, data = self._fd
+        self._frames += len(ids)
+        if ids:
+            nominal, fast = np.empty((2, len(ids)), np.int64)
+            stuffing.fd_bits(*_packed(ids, data), nominal, fast)
+            self._bits += int(nominal.sum())
+            self._fast_bits += int(fast.sum())
+        ids.clear()
+        data.clear()
+
+
+def _packed(
+    ids: list[int], data: list[bytes]
+) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
+    """(n,) identifiers and lengths, and the data one after the other, in memory that can be written: kernels
+    are compiled for each kind."""
+    lengths, joined = bytearray(map(len, data)), bytearray().join(data)
+    return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

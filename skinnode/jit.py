@@ -25,7 +25,7 @@ import numba as typed_numba
 
 numba: Any = typed_numba  # its type hints leave out configuration and options that are used here
 _F = TypeVar("_F", bound=Callable[..., Any])
-_KERNEL_FILES = ("jit.py", "simd.py", "model/kernels.py", "solve/*.py", "wire/stuffing.py")
+_KERNEL_FILES = ("jit.py", "simd.py", "bundle.py", "model/kernels.py", "solve/*.py", "wire/stuffing.py")
 
 
 def _writable(folder: Path) -> bool:
@@ -56,7 +56,7 @@ def cache_dir() -> Path | None:
     return next((folder for folder in candidates if _writable(folder)), None)
 
 
-def is_cold(kernel: str = "solve_wires") -> bool:
+def is_cold(kernel: str = "solve_patch") -> bool:
     """True when ``kernel`` still has to be compiled, so that a command can say why it takes its time."""
     folder = cache_dir()
     return folder is None or not any(folder.rglob(f"*.{kernel}-*.nbc"))

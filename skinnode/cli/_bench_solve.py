@@ -20,6 +20,7 @@ from skinnode.model.kernels import potential, potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve import wires
 from skinnode.solve.operators import OPERATORS
+from skinnode.solve.patch_solver import PatchSolver
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.system import solve_system
 
@@ -72,7 +73,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
     """Every solver by name: (case, tolerance) to x. Ours come first."""
     from scipy import optimize
 
-    solver = wires.Solver(problem, 0)
+    solver = PatchSolver(problem, 0)
     weight = np.ones_like(solver.a_solved)
     frame = np.ones_like(weight)
     todo = np.zeros(len(frame), np.uint8)

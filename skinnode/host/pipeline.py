@@ -13,7 +13,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
@@ -26,9 +26,10 @@ from skinnode.host.workers import Inline, Workers
 from skinnode.model.config import Partial, PatchConfig, SolverConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
+from skinnode.solve.inputs import CodeMap
 from skinnode.solve.tracker import Tracker
 from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.wire.codec import Decoder, SummaryFlag
+from skinnode.wire.codec import Decoder, SummaryFlag, as_baseline
 
 _log = logging.getLogger(__name__)
 
@@ -47,6 +48,17 @@ class Solver:
         self.facts = facts
         self._clock = clock
         calibration = facts.config.calibration
+        gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
+        scale = facts.scale
+        self._codes = CodeMap(
+            baseline_ohm=as_baseline(facts.baseline_ohm),
+            lo=scale.lo,
+            step=scale.step,
+            steps=scale.steps,
+            rounding_ohm=scale.relative_std * facts.baseline_ohm,
+            relative_noise=facts.config.relative_noise,
+            gain=gain,
+        )
         self._tracker = Tracker(
             facts.layout,
             method=config.method,
@@ -59,26 +71,29 @@ class Solver:
             estimate_noise=config.estimate_noise,
             drift=config.drift,
             normal_only=config.normal_only,
+            codes=self._codes,
         )
-        self._gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
-        self._decoder = Decoder(facts.baseline_ohm, facts.scale)
-        self._quantisation_ohm = facts.scale.relative_std * facts.baseline_ohm
+        self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
         """Resistances of a scan, NaN where there is none."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
-        if self._gain is not None:
-            resistance_ohm *= self._gain
+        if self._codes.gain is not None:
+            resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
-    def solve(self, frame: ResistanceFrame) -> FieldFrame:
-        """Field of a frame, stamped, its arrays read-only. The noise is that of the front end and of the
-        codes together."""
-        noise = np.hypot(self.facts.config.relative_noise, self._quantisation_ohm / frame.resistance_ohm)
-        field: FieldFrame = self._tracker.update(frame.resistance_ohm, frame.valid, noise)
+    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+        """Field of a scan, stamped, its arrays read-only, and how many codes were no measurement. The noise
+        is that of the front end and of the codes together."""
+        if self._tracker.method == "posterior":
+            frame, codes = self.decode(scan, stamp), self._codes
+            noise = np.hypot(codes.relative_noise, codes.rounding_ohm / frame.resistance_ohm)
+            field = self._tracker.update(frame.resistance_ohm, frame.valid, noise)
+            invalid = frame.valid.size - int(np.count_nonzero(frame.valid))
+        else:
+            field, invalid = self._tracker.update_codes(scan.codes)
         contacts = tuple(sealed(contact) for contact in field.contacts)
-        stamp = replace(frame.stamp, t_solved_ns=self._clock())
-        return sealed(field, contacts=contacts, stamp=stamp)
+        return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
@@ -302,11 +317,10 @@ class Lane:
             self._taken -= 1
             return
         try:
-            frame = solver.decode(scan, stamp)
-            field = solver.solve(frame)
+            field, invalid = solver.solve(scan, stamp)
             self._solved += 1
             self._untrusted += not field.trusted
-            self._invalid += int(frame.valid.size - np.count_nonzero(frame.valid))
+            self._invalid += invalid
             self._publisher.publish(field, stamp.patch)
         except Exception as error:  # a defect of ours: it must reach the user, not die with the job
             _log.debug("patch %s", stamp.patch, exc_info=True)

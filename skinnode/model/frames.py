@@ -33,6 +33,12 @@ class ScanStamp:
     t_solved_ns: int = 0
     """When the field was ready; 0 before that."""
 
+    def solved_at(self, t_ns: int) -> ScanStamp:
+        """The same, of a field that was ready at ``t_ns``."""
+        return ScanStamp(
+            self.patch, self.scan, self.counter, self.device_time_us, self.t_sync_ns, self.t_receive_ns, t_ns
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResistanceFrame:
@@ -131,7 +137,7 @@ def sealed(record: _Record, **changes: Any) -> _Record:
     twin = object.__new__(type(record))  # once a field: ``replace`` takes five times as long
     for name in _NAMES[type(record)]:
         value = changes[name] if name in changes else getattr(record, name)
-        if isinstance(value, np.ndarray):
+        if isinstance(value, np.ndarray) and value.flags.writeable:
             value = value.view()
             value.flags.writeable = False
         object.__setattr__(twin, name, value)

@@ -39,17 +39,17 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.forward import jacobian
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
-from skinnode.model.status import Status, as_statuses
-from skinnode.solve import frame as around
+from skinnode.model.status import as_statuses
 from skinnode.solve import operators as op
+from skinnode.solve import patch_solver as call
 from skinnode.solve import wires
 from skinnode.solve.follow import Z_HOLD, chi2_quantile
-from skinnode.solve.frame import STALE
-from skinnode.solve.inputs import broadcast_noise, checked_mask, checked_noise
+from skinnode.solve.frame import DEADLINE, STALE, FrameArrays
+from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_mask, checked_noise
+from skinnode.solve.patch_solver import PatchSolver
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.system import operator_code
 
-DEADLINE: Final = int(Status.DEADLINE)
 TOLERANCE: Final = 1e-9
 """Of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from 1e-5."""
 BRIDGE_TOLERANCE: Final = 1e-6
@@ -109,6 +109,7 @@ class ExactTracker:
             no turn is DEADLINE with an infinite deviation; it is first in the next frame.
         normal_only: only z is unknown.
         active_only: only the electrodes that contacts move are unknown.
+        codes: what the codes given to :meth:`update_codes` mean.
 
     Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
     """
@@ -125,6 +126,7 @@ class ExactTracker:
         deadline_us: float | None = None,
         normal_only: bool = False,
         active_only: bool = False,
+        codes: CodeMap | None = None,
     ) -> None:
         for name, value in (("stiffness_n_per_m", stiffness_n_per_m), ("deadline_us", deadline_us)):
             if value is not None and not (math.isfinite(value) and value > 0):
@@ -145,23 +147,18 @@ class ExactTracker:
         self._active_only = active_only
         self._in_order = np.arange(layout.shape[0])
         self._leaves_out = active_only or normal_only
-        # of the frame at hand
-        self._ohm, self._noise_now, self._a_now, self._weight_now, self._used = np.empty((5, *layout.shape))
-        self._valid = np.empty(layout.shape, np.bool_)
         self._todo = np.empty(layout.shape[0], np.uint8)
-        self._good = np.empty(layout.shape[0], np.bool_)
-        self._now = (
-            np.empty(layout.shape[0], np.bool_),
-            np.empty(layout.shape[0], np.int64),
-        )  # to look between
-        self.status_codes = np.zeros(layout.shape[0], np.int64)
-        """(U,) status of each wire in the last frame."""
         self._all_converged = as_statuses([op.CONVERGED] * layout.shape[0])
-        self._solver = wires.Solver(self._problem, operator_code(operator), normal_only)
+        self._solver = PatchSolver(self._problem, operator_code(operator), normal_only)
         self._rest_branch = self._solver.solve_rest()
         self._rest_known = self._solver.report[:, wires.STATUS] == op.CONVERGED
         self._rest_inverse = self._solver.inverse.copy()
-        self._all_unknown = np.asarray(self._solver.each * self._solver.free)
+        self.arrays = FrameArrays(self._problem, self._rest_branch, self._solver.each * self._solver.free)
+        """Of the stream and the frame at hand."""
+        if codes is not None:
+            self.arrays.set_codes(codes)
+        self.invalid_codes = 0
+        """Of the last scan of codes, how many were no measurement."""
         # ∂r/∂x at rest of every coordinate, (U, 3N, K), and what an unknown left out may move by unnoticed
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * self._problem.a_rest[:, :, None]).transpose(0, 2, 1))
@@ -177,20 +174,20 @@ class ExactTracker:
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
-        self._x = self._problem.rest.copy()  # last trusted position of each wire, and its a
-        self._a = self._problem.a_rest.copy()
+        its = self.arrays
+        its.x[:], its.a_solved[:] = self._problem.rest, self._problem.a_rest
         self._solver.inverse[:] = self._rest_inverse
         self._solver.turn = 0
-        self._solver.a_solved[:] = self._a
+        self._solver.a_solved[:] = self._problem.a_rest
         self._solver.noise[:] = 0.0
-        self._weight = np.ones(self.layout.shape)  # at which the inverse of each wire was made
+        its.weight_solved[:] = 1.0
         self._unnoticed_weight = np.zeros(self.layout.shape)  # for which self._unnoticed was made
-        self._predictable = self._rest_known.copy()  # wires whose inverse in the solver belongs to their x
+        its.predictable[:] = self._rest_known
         self._order = self._in_order  # whose turn it is, where there is a deadline
         if self._active_only:
             for u in self._in_order.tolist():
                 self._set_electrodes(u, np.arange(0))
-            self._predictable[:] = True
+            its.predictable[:] = True
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -209,57 +206,84 @@ class ExactTracker:
         there, and inf where the deadline left no time to. Raises ValueError for wrong shapes.
         """
         start = perf_counter()
-        frame = self._begin(frame_ohm, valid, relative_noise, start)
+        its = self.arrays
+        # copies, for the kernel has the addresses of these
+        its.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        its.noise[:] = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
+        its.valid[:] = True if valid is None else checked_mask(valid, self.layout)
+        return self._advance(call.TAKE, start)
+
+    def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
+        """The field of a scan of (U, K) codes, as :meth:`update` makes it of the resistances and the noise
+        that they stand for. Afterwards :attr:`arrays` has those, and :attr:`invalid_codes` counts what was
+        none."""
+        start = perf_counter()
+        self.arrays.codes[:] = codes
+        return self._advance(call.DECODE | call.TAKE, start)
+
+    def _advance(self, stages: int, start: float) -> FieldFrame:
+        solver, its = self._solver, self.arrays
+        solver.turn += 1
+        sigma, until, units = self._sigma, start + self._seconds, math.inf
         if self._leaves_out:
-            self._leave_out(frame)
-            around.choose(
-                self._predictable, self._first, self._unknowns, frame.used, self._weight, self._todo
+            sigma, self.invalid_codes, _ = self._call_stages(stages, sigma, units)
+            self._leave_out(sigma)
+            stages = 0
+        if until < math.inf:
+            units = max(WIRE_UNITS, (until - perf_counter()) / UNIT_S)
+        if self._active_only:  # wires may differ in the number of their unknowns
+            self._call_stages(stages | call.CHOOSE, sigma, units)
+            found = 0
+        else:
+            sigma, invalid, found = self._call_stages(
+                stages | call.CHOOSE | call.SOLVE | call.REACH | call.FINISH, sigma, units
             )
-        solver, good = self._solver, self._good
-        self._solve(self._todo, frame)
-        easy = self._reached(good, self.status_codes) and not self._active_only
+            self.invalid_codes = invalid if stages & call.DECODE else self.invalid_codes
+        easy = found & call.ALL_GOOD != 0
         if easy:
             self._order = self._in_order
             residual = solver.measure[:, wires.RESIDUAL].copy()
         else:
+            frame = _Frame(its.a, its.weight, its.used, sigma, until)
+            if self._active_only:
+                self._solve(self._todo, frame)
+            elif until < math.inf:
+                self._solve_rest_of(self._todo, frame)
             residual = self._rescue(frame)
-        size = self._x.shape
-        moved, std, held = np.empty(size), np.empty(size), np.empty(size[0], np.bool_)
-        incomplete = around.finish(
-            solver.report,
-            good,
-            solver.x,
-            solver.a_solved,
-            solver.std,
-            frame.used,
-            self._x,
-            self._a,
-            self._weight,
-            self._predictable,
-            self._problem.rest,
-            self.layout.pitch_m,
-            moved,
-            std,
-            held,
-        )
-        if incomplete:
-            self._complete(frame)
-        displacement = moved.reshape(self.layout.upper_m.shape)
+            _, _, found = self._call_stages(call.FINISH, sigma, math.inf)
+        if found & call.INCOMPLETE:
+            self._complete()
+        displacement, std = its.outcome_m.copy()
         evaluations, jacobians, steps = solver.tally.tolist()
         return FieldFrame(
             displacement_m=displacement,
-            displacement_std_m=std.reshape(displacement.shape),
-            status=self._all_converged if easy else as_statuses(self.status_codes.tolist()),
+            displacement_std_m=std,
+            status=self._all_converged if easy else as_statuses(its.status.tolist()),
             residual=residual,
             stats=SolveStats(evaluations, jacobians, steps, perf_counter() - start),
             force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
-            held=held,
+            held=its.held.copy(),
+        )
+
+    def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int, int]:
+        """As :meth:`PatchSolver.advance` does them for a frame."""
+        return self._solver.advance(
+            stages,
+            self.arrays,
+            self._first,
+            self._todo,
+            wires.COVARIANCE | wires.REUSE,
+            TOLERANCE,
+            FRAME_STEPS,
+            sigma,
+            self._order,
+            units,
         )
 
     def _rescue(self, frame: _Frame) -> Float:
         """Try what is left to try on wires that were not brought to a root: their status and whether they are
         good, and (U,) residuals."""
-        solver, good, status = self._solver, self._good, self.status_codes
+        solver, good, status = self._solver, self.arrays.good, self.arrays.status
         turns = solver.report[:, wires.TURN] == 1
         exhausted = np.zeros_like(turns)  # whatever could be tried has been
         if self._active_only:
@@ -268,7 +292,8 @@ class ExactTracker:
                 turns[u] = not frame.expired
                 self._widen(u, frame)
                 exhausted[u] = True
-        if not self._reached(good, status):
+        good[:], status[:] = self._roots(), solver.report[:, wires.STATUS]
+        if not good.all():
             status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
             lost = ~good & (status != DEADLINE) & self._solvable(frame)
             for u in [u for u in self._order.tolist() if lost[u] and not exhausted[u]]:
@@ -279,7 +304,7 @@ class ExactTracker:
                 ended = int(solver.report[u, wires.STATUS])
                 status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
             solver.std[~good] = np.inf
-            self._predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
+            self.arrays.predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
         residual = solver.measure[:, wires.RESIDUAL].copy()
         for u in np.flatnonzero(~good).tolist():
             known = status[u] != DEADLINE and not frame.expired
@@ -290,44 +315,51 @@ class ExactTracker:
         )
         return residual
 
-    def _complete(self, frame: _Frame) -> None:
+    def _complete(self) -> None:
         """The ``a`` of equations that solved wires did not have: what they would have been."""
-        solved = self._good & (self._solver.report[:, wires.HELD] == 0)
-        for u in np.flatnonzero(solved & (frame.used == 0).any(axis=1)).tolist():
-            missing = frame.used[u] == 0
-            self._a[u, missing] = 1.0 / (
-                1.0 + self._relative_residual(self._x[u], np.ones(len(missing)))[missing]
+        its = self.arrays
+        solved = its.good & (self._solver.report[:, wires.HELD] == 0)
+        for u in np.flatnonzero(solved & (its.used == 0).any(axis=1)).tolist():
+            missing = its.used[u] == 0
+            its.a_solved[u, missing] = 1.0 / (
+                1.0 + self._relative_residual(its.x[u], np.ones(len(missing)))[missing]
             )
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
         """Go on from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
-        moved = (displacement_m / self.layout.pitch_m).reshape(self._x.shape)
+        its = self.arrays
+        moved = (displacement_m / self.layout.pitch_m).reshape(self.arrays.x.shape)
         if self._active_only:  # with every electrode an unknown again, as the displacement has them all
             for u in np.flatnonzero(wires_).tolist():
                 self._set_electrodes(u, np.arange(self.layout.unknowns // 3))
         for u in np.flatnonzero(wires_).tolist():
-            self._x[u] = self._problem.rest[u] + moved[u]
-            self._a[u] = 1.0 / (1.0 + self._relative_residual(self._x[u], np.ones(self.layout.shape[1])))
-            self._predictable[u] = False
+            its.x[u] = self._problem.rest[u] + moved[u]
+            its.a_solved[u] = 1.0 / (1.0 + self._relative_residual(its.x[u], np.ones(self.layout.shape[1])))
+            its.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
         """Solve these wires (U,) from rest in the next frame, whatever they came to in this one."""
-        self._x[wires_], self._a[wires_] = self._problem.rest[wires_], self._problem.a_rest[wires_]
-        self._predictable[wires_] = False
+        its = self.arrays
+        its.x[wires_], its.a_solved[wires_] = self._problem.rest[wires_], self._problem.a_rest[wires_]
+        its.predictable[wires_] = False
 
     def _solve(self, todo: NDArray[np.uint8], frame: _Frame) -> None:
         """Solve the wires in ``todo`` for the frame, in turn where there is a deadline: one at least, lest
         the stream stand still."""
         units = math.inf
+        if frame.until < math.inf:
+            units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
+        self._call(todo, frame, units=units)
+        if units < math.inf:
+            self._solve_rest_of(todo, frame)
+
+    def _solve_rest_of(self, todo: NDArray[np.uint8], frame: _Frame) -> None:
+        """The wires in ``todo`` that had no turn, while there is time."""
         while True:
-            if frame.until < math.inf:
-                units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
-            self._call(todo, frame, units=units)
-            if units == math.inf:
-                return
             todo[self._solver.report[:, wires.TURN] == 1] = wires.LEAVE
             if not todo.any() or frame.expired:
                 return
+            self._call(todo, frame, units=max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S))
 
     def _call(
         self, todo: NDArray[np.uint8], frame: _Frame, a: Float | None = None, last: bool = True,
@@ -353,23 +385,16 @@ class ExactTracker:
         todo[u] = task
         return todo
 
-    def _reached(self, good: NDArray[np.bool_], status: NDArray[np.int64]) -> bool:
-        """Whether the solver brought all wires to a root on the branch of the rest position; into ``good``
-        (U,) which, and into ``status`` (U,) what it says of each."""
-        solver, problem = self._solver, self._problem
-        return around.reach(
-            solver.report, solver.x, self._rest_branch, problem.rest, problem.clearance, good, status
-        )
-
-    def _has_root(self, u: int) -> bool:
-        self._reached(*self._now)
-        return bool(self._now[0][u])
+    def _roots(self) -> NDArray[np.bool_]:
+        """(U,) wires that the solver brought to a root on the branch of the rest position, within reach."""
+        solver = self._solver
+        converged = solver.report[:, wires.STATUS] == op.CONVERGED
+        same_branch = solver.report[:, wires.BRANCH] * self._rest_branch >= 0
+        return np.asarray(converged & same_branch & ~self._problem.out_of_reach(solver.x))
 
     @property
     def _unknowns(self) -> NDArray[np.int64]:
         """(U,) unknowns of each wire."""
-        if not self._leaves_out:
-            return self._all_unknown
         return np.asarray(self._solver.each * self._solver.free)
 
     def _solvable(self, frame: _Frame) -> NDArray[np.bool_]:
@@ -377,31 +402,32 @@ class ExactTracker:
         count = np.count_nonzero(frame.used, axis=1)
         return np.asarray((count > 0) & (count >= self._unknowns))
 
-    def _leave_out(self, frame: _Frame) -> None:
+    def _leave_out(self, sigma: float) -> None:
         """Put wires to rest where that explains the frame; what χ² may miss of all that is no unknown."""
-        solver, layout = self._solver, self.layout
+        solver, layout, its = self._solver, self.layout, self.arrays
         if self._active_only:
-            usable = np.where(frame.used > 0, frame.a, 1.0)
-            square = (frame.used * (usable / self._problem.a_rest - 1.0)) ** 2
-            chi2 = square.sum(axis=1) / (frame.sigma**2 + TOLERANCE**2)
-            count = np.count_nonzero(frame.used, axis=1)
+            usable = np.where(its.used > 0, its.a, 1.0)
+            square = (its.used * (usable / self._problem.a_rest - 1.0)) ** 2
+            chi2 = square.sum(axis=1) / (sigma**2 + TOLERANCE**2)
+            count = np.count_nonzero(its.used, axis=1)
             known = (chi2 <= self._chi2_hold[count]) & (count >= solver.each * layout.unknowns // 3)
             for u in np.flatnonzero(known & (solver.free > 0)).tolist():
                 self._set_electrodes(u, np.arange(0))
                 self._unnoticed_weight[u] = 0.0  # to be measured below
+        its.unknowns[:] = self._unknowns
         if solver.each * solver.free.min() < layout.unknowns:
-            for u in np.flatnonzero(_changed(frame.used, self._unnoticed_weight)).tolist():
-                self._measure_unnoticed(u, frame.used[u])
-            solver.still_std[:] = frame.sigma * self._unnoticed
+            for u in np.flatnonzero(_changed(its.used, self._unnoticed_weight)).tolist():
+                self._measure_unnoticed(u, its.used[u])
+            solver.still_std[:] = sigma * self._unnoticed
 
     def _set_electrodes(self, u: int, electrodes: NDArray[np.int64]) -> None:
         """Give unknowns to these electrodes of wire u only."""
-        solver = self._solver
+        solver, its = self._solver, self.arrays
         solver.set_electrodes(u, electrodes)
-        self._predictable[u] = len(electrodes) == 0
-        if self._predictable[u]:  # then rest is known to be the solution, without noise
-            self._x[u], self._a[u] = self._problem.rest[u], self._problem.a_rest[u]
-            solver.a_solved[u], solver.noise[u] = self._a[u], 0.0
+        its.predictable[u] = len(electrodes) == 0
+        if its.predictable[u]:  # then rest is known to be the solution, without noise
+            its.x[u], its.a_solved[u] = self._problem.rest[u], self._problem.a_rest[u]
+            solver.a_solved[u], solver.noise[u] = its.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
         """How far each coordinate that is no unknown moves before χ² notices, pitches a unit of σ."""
@@ -433,8 +459,7 @@ class ExactTracker:
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
         content = (solver.report[:, wires.HELD] == 1) | (solver.measure[:, wires.CHI2] <= limit)
         whole = 3 * solver.free == self.layout.unknowns
-        self._reached(*self._now)
-        return np.asarray(whole | (self._now[0] & content))
+        return np.asarray(whole | (self._roots() & content))
 
     def _widen(self, u: int, frame: _Frame) -> None:
         """Let electrodes of wire u join until they explain the frame; undone where not even all do."""
@@ -450,11 +475,11 @@ class ExactTracker:
                 joined = np.union1d(solver.electrodes(u), self._suspects(u, frame))
                 electrodes = electrodes if 2 * len(joined) > most else joined
             self._set_electrodes(u, electrodes)
-            solver.x[u] = self._x[u]
+            solver.x[u] = self.arrays.x[u]
             self._call(self._only(u, wires.SOLVE), frame)
-            if len(electrodes) == most and not self._has_root(u) and self._solvable(frame)[u]:
+            if len(electrodes) == most and not self._roots()[u] and self._solvable(frame)[u]:
                 self._recover(u, frame)
-        if len(solver.electrodes(u)) > len(before) and not self._has_root(u):
+        if len(solver.electrodes(u)) > len(before) and not self._roots()[u]:
             self._set_electrodes(u, before)
         if len(solver.electrodes(u)) > len(before):
             self._measure_unnoticed(u, frame.used[u])
@@ -476,7 +501,7 @@ class ExactTracker:
 
     def _recover(self, u: int, frame: _Frame) -> bool:
         """Bridge wire u from its last trusted position, then from rest; whether that brought it to a root."""
-        starts = [(self._x[u].copy(), self._a[u].copy())]
+        starts = [(self.arrays.x[u].copy(), self.arrays.a_solved[u].copy())]
         rest = self._problem.rest[u], self._problem.a_rest[u]
         if not np.array_equal(starts[0][0], rest[0]):
             starts.append(rest)
@@ -487,7 +512,7 @@ class ExactTracker:
                 if not self._bridge(u, x_from, a_from, frame, substeps):
                     self._solver.report[u, wires.STATUS] = DEADLINE
                     return False
-                if self._has_root(u):
+                if self._roots()[u]:
                     return True
         return False
 
@@ -519,43 +544,7 @@ class ExactTracker:
         used = frame.used[u] > 0
         if not used.any():
             return math.inf
-        return float(np.sqrt(np.mean(self._relative_residual(self._x[u], frame.a[u])[used] ** 2)))
-
-    def _begin(
-        self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None, start: float
-    ) -> _Frame:
-        """The frame, checked, and all ready to solve it."""
-        # copies, for kernels are compiled for each kind of memory: what others give may be read-only
-        self._ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        self._noise_now[:] = (
-            self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
-        )
-        self._valid[:] = True if valid is None else checked_mask(valid, self.layout)
-        a, weight, used, solver = self._a_now, self._weight_now, self._used, self._solver
-        solver.turn += 1
-        sigma = around.begin(
-            self._ohm,
-            self._problem.gain,
-            self._noise_now,
-            self._sigma,
-            self._valid,
-            a,
-            weight,
-            used,
-            DEADLINE,  # of all that get no turn
-            self._x,
-            solver.x,
-            solver.report,
-            solver.measure,
-            solver.std,
-            solver.tally,
-            self._predictable,
-            self._first,
-            self._unknowns,
-            self._weight,
-            self._todo,
-        )
-        return _Frame(a, weight, used, sigma, start + self._seconds)
+        return float(np.sqrt(np.mean(self._relative_residual(self.arrays.x[u], frame.a[u])[used] ** 2)))
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +12,23 @@ from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
 """A relative deviation above is no knowledge, and its square must not overflow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CodeMap:
+    """What the codes of a converter mean: R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
+
+    baseline_ohm: Float
+    """(U, K) R0; a code whose R0 is not positive and finite is no measurement."""
+    lo: float
+    step: float
+    steps: int
+    rounding_ohm: Float
+    """(U, K) standard deviation of a code, as a resistance."""
+    relative_noise: float
+    """Of what comes before the converter."""
+    gain: Float | None = None
+    """(U, K), or (U, 1)."""
 
 
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:

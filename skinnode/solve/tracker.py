@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skinnode.bundle import Bundle
 from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
@@ -35,6 +36,7 @@ from skinnode.solve.branch import (
     wire_deviations,
 )
 from skinnode.solve.exact import ExactTracker
+from skinnode.solve.inputs import CodeMap
 from skinnode.solve.posterior import Posterior
 from skinnode.solve.problem import PatchProblem
 
@@ -68,6 +70,7 @@ class Tracker:
             DEADLINE, holds its last trusted position and has an infinite deviation.
         rubber, estimate_noise, drift, drift_std, model_error: see :class:`Posterior`. ``auto`` takes it where
             one of the last four asks for what only the posterior can give.
+        codes: what the codes given to :meth:`update_codes` mean.
 
     Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
     """
@@ -90,6 +93,7 @@ class Tracker:
         drift: str = "none",
         drift_std: float = 0.02,
         model_error: float = 0.0,
+        codes: CodeMap | None = None,
     ) -> None:
         if method not in METHODS:
             raise ValueError(f"method: got {method!r}, must be one of {', '.join(METHODS)}")
@@ -125,14 +129,14 @@ class Tracker:
             deadline_us=deadline_us,
             normal_only=normal_only,
             active_only=active_only,
+            codes=codes,
         )
         problem = PatchProblem.of(layout, baseline_ohm)
-        self._whitening, self._rough_limit = Smoothness(problem).whitening, ROUGH / problem.step_limit
+        self._rough_limit = ROUGH / problem.step_limit
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
         self._far_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
-        self._none_held = np.zeros(layout.shape[0], np.bool_)
         self._pause = 0  # frames until the posterior is asked again
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # what its confirmation left open of a wire
@@ -140,7 +144,15 @@ class Tracker:
         self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
         rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
         self._folded = folded_wires(layout, normal_only) | rough_noise
-        self._doubtful(self._exact.update(problem.a_rest / problem.gain))  # compiles the rest of it
+        its = self._exact.arrays
+        whitening = np.array(Smoothness(problem).whitening, order="C")
+        self._judgement = Bundle(
+            [
+                its.outcome_m[0], self._last_m, its.status, its.held, self._folded.copy(), whitening,
+                self._lost, self._unsure, self._rough,
+            ]
+        )  # fmt: skip
+        self._doubtful()  # compiles it
         self.reset()
 
     def reset(self) -> None:
@@ -170,55 +182,60 @@ class Tracker:
         if self._exact is None:
             return self._posterior.update(frame_ohm, valid, relative_noise)
         start = perf_counter()
-        field = self._exact.update(frame_ohm, valid, relative_noise)
-        lost, unsure = self._doubtful(field)
-        doubtful = lost | unsure
-        if doubtful.any():
-            until, anew = start + self._seconds, bool(unsure.any())
+        return self._judged(self._exact.update(frame_ohm, valid, relative_noise), start)
+
+    def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
+        """The field of a scan of (U, K) codes, as :meth:`update` makes it of the resistances and the noise
+        that they stand for, in a fraction of the time; and how many of them were no measurement. Raises
+        ValueError where :attr:`method` is ``posterior``."""
+        if self._exact is None:
+            raise ValueError("method: got 'posterior', must be exact to take codes")
+        start = perf_counter()
+        field = self._judged(self._exact.update_codes(codes), start)
+        return field, self._exact.invalid_codes
+
+    def _judged(self, field: FieldFrame, start: float) -> FieldFrame:
+        """The field of the exact inverse after a look at every wire that may be wrong."""
+        assert self._exact is not None
+        doubtful: NDArray[np.bool_] | None = None
+        if self._doubtful():
+            doubtful = self._lost | self._unsure
+            until, anew = start + self._seconds, bool(self._unsure.any())
             if self._pause or (anew and perf_counter() + self._posterior.from_rest_s > until):
                 field = self._give_up(field, doubtful)
             else:
                 if anew:
                     self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
-                noise = np.maximum(self._noise if relative_noise is None else relative_noise, REFEREE_NOISE)
+                its = self._exact.arrays
                 self._posterior.stop_at(until)
-                guide = self._posterior.update(frame_ohm, valid, noise)
+                noise = np.maximum(its.noise, REFEREE_NOISE)
+                guide = self._posterior.update(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in guide.status:
                     self._pause = PAUSE
                 field = self._refer(field, doubtful, guide)
         self._pause = max(0, self._pause - 1)
         if self._any_apart:
-            field = self._keep_apart(field, ~doubtful)
+            field = self._keep_apart(
+                field, np.ones(len(self._apart), np.bool_) if doubtful is None else ~doubtful
+            )
         self._last_m[:] = field.displacement_m
         return field
 
-    def _doubtful(self, field: FieldFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(U,) wires without a root, and (U,) those whose root may not be the right one: where the layout has
-        folds all that were solved, elsewhere those that jumped and the rough ones."""
+    def _doubtful(self) -> bool:
+        """Whether there is any wire without a root (``_lost``), or one whose root may not be the right one
+        (``_unsure``): where the layout has folds all that were solved, elsewhere those that jumped and the
+        rough ones."""
         assert self._exact is not None
-        moved, held = field.displacement_m, self._none_held if field.held is None else field.held
-        some_rough = frame.judge(
-            moved,
-            self._last_m,
-            self._exact.status_codes,
-            held,
-            self._folded,
-            self._jump_m,
-            self._far_m,
-            int(Status.DEADLINE),
-            self.layout.pitch_m,
-            self._whitening,
-            self._rough_limit,
-            self._lost,
-            self._unsure,
-            self._rough,
+        found = frame.judge(
+            self._judgement.table, self._jump_m, self._far_m, self.layout.pitch_m, self._rough_limit
         )
-        if some_rough:
+        if found & frame.SOME_ROUGH:
             if self._confirmed is not None:  # what was confirmed a moment ago is not asked again
+                moved = self._exact.arrays.outcome_m[0]
                 change = np.abs(moved - self._confirmed).max(axis=(1, 2))
                 self._rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
             self._unsure |= self._rough
-        return self._lost, self._unsure
+        return found & frame.SOME_DOUBT != 0 or bool(found & frame.SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: NDArray[np.bool_]) -> FieldFrame:
         """A wire that is held is no better known than when the posterior confirmed it."""

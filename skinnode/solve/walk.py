@@ -15,6 +15,7 @@ from skinnode.solve import operators as op
 from skinnode.solve import wires
 from skinnode.solve.branch import AGREE, Smoothness, guided_start, near_twin
 from skinnode.solve.linear import Index
+from skinnode.solve.patch_solver import PatchSolver
 from skinnode.solve.problem import PatchProblem
 
 Mask = NDArray[np.bool_]
@@ -51,7 +52,7 @@ class Walk:
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
         self.problem = problem
-        self.solver = wires.Solver(problem, operator)
+        self.solver = PatchSolver(problem, operator)
         self.wires = len(problem.rest)
         self.samples = len(a)
         self.cycle: int | None = None

@@ -12,12 +12,13 @@ Before that a wire can be held where it is, or followed with the inverse at hand
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.jit import njit, njit_part
+from skinnode.bundle import cube, int_matrix, int_vector, matrix, vector
+from skinnode.jit import njit_part
 from skinnode.model.kernels import potential_jacobian
 from skinnode.model.layout import Float
 from skinnode.solve.follow import FRESH, chi2_quantile_part, deviations, follow, step_back, within_noise
@@ -42,9 +43,27 @@ from skinnode.solve.operators import (
     judge,
     propose,
     shorten,
-    workspace,
 )
-from skinnode.solve.problem import PatchProblem
+
+# The arrays of a solver, by their number in its bundle
+(
+    X,
+    INVERSE,
+    A_SOLVED,
+    NOISE,
+    STD,
+    REPORTS,
+    MEASURE,
+    TALLY,
+    LOWER,
+    ELECTRODES,
+    STILL,
+    STILL_STD,
+    POINT,
+    RAW,
+    WORK,
+) = range(15)
+"""``WORK`` is the first of those of :class:`Work`."""
 
 # Columns of the integer report of a wire
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
@@ -148,51 +167,58 @@ def _coordinate(electrodes: Index, j: int, each: int) -> int:
     return int(3 * electrodes[j] + 2)
 
 
-@njit
+@njit_part
+def _work(own: Index) -> Work:
+    """The workspace in the bundle of a solver."""
+    return Work(
+        vector(own, WORK), vector(own, WORK + 1), vector(own, WORK + 2), vector(own, WORK + 3),
+        vector(own, WORK + 4), vector(own, WORK + 5), vector(own, WORK + 6), vector(own, WORK + 7),
+        vector(own, WORK + 8), vector(own, WORK + 9), vector(own, WORK + 10), vector(own, WORK + 11),
+        vector(own, WORK + 12), vector(own, WORK + 13), vector(own, WORK + 14),
+        vector(own, WORK + 15), vector(own, WORK + 16), vector(own, WORK + 17), vector(own, WORK + 18),
+        matrix(own, WORK + 19), matrix(own, WORK + 20), matrix(own, WORK + 21), matrix(own, WORK + 22),
+        matrix(own, WORK + 23), vector(own, WORK + 24),
+        int_vector(own, WORK + 25), vector(own, WORK + 26), int_vector(own, WORK + 27),
+    )  # fmt: skip
+
+
+@njit_part
 def solve_wires(
+    own: Index,
     operator: int,
     tasks: int,
     todo: NDArray[np.uint8],
-    x: Float,
     a: Float,
     weight: Float,
+    order: Index,
     sigma: float,
-    lower: Float,
     tol_f: float,
     tol_x: float,
     max_steps: int,
     step_limit: float,
-    electrodes: Index,
-    still: Float,
-    still_std: Float,
-    w: Work,
-    point: Float,
-    raw: Float,
-    inverse: Float,
-    a_solved: Float,
-    noise: Float,
-    std: Float,
-    report: Index,
-    measure: Float,
-    order: Index,
     units: float,
     turn: int,
-    tally: Index,
 ) -> float:
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo`` (U,).
 
-    ``x`` (U, 3N) start, then solution, pitches; ``a`` and ``weight`` (U, K), where an ``a`` that is no
-    resistance loses its weight; ``sigma`` deviation of a residual of weight 1, 0 where not known. The
-    unknowns are those of ``electrodes`` (U, N), as many of a row as ``point`` (3 E,) holds, three or one
-    (z) each as ``w`` has; ``still`` (U, K) is the potential of the others and ``still_std`` (U, 3N)
-    what is not known of all that is no unknown, pitches. ``inverse`` (U, n, K), ``a_solved`` and ``noise``
-    (U, K) keep ∂x/∂r, 1/F and the variance of a of the last converged solve of each wire for the next
-    frame, 1 and inf where it had no equation; ``std`` (U, 3N) is inf where not known. A wire with fewer
-    equations than unknowns keeps its x and is ILL_CONDITIONED, or NON_FINITE where an ``a`` lost its weight.
-    Wires have their turn in ``order`` (U,), until one may need more than what is left of ``units``,
-    evaluations of F and J with all that goes with them. Returns how many were needed, by estimate; to
-    ``tally`` (3,) the evaluations of F, those of J and the steps are added. ``turn`` counts the calls.
+    ``a`` and ``weight`` (U, K), where an ``a`` that is no resistance loses its weight; ``sigma`` deviation of
+    a residual of weight 1, 0 where not known. Of the solver's ``own``: ``x`` (U, 3N) start, then solution,
+    pitches. The unknowns are those of ``electrodes`` (U, N), as many of a row as ``point`` (3 E,) holds,
+    three or one (z) each as the workspace has; ``still`` (U, K) is the potential of the others and
+    ``still_std`` (U, 3N) what is not known of all that is no unknown, pitches. ``inverse`` (U, n, K),
+    ``a_solved`` and ``noise`` (U, K) keep ∂x/∂r, 1/F and the variance of a of the last converged solve of
+    each wire for the next frame, 1 and inf where it had no equation; ``std`` (U, 3N) is inf where not known.
+    A wire with fewer equations than unknowns keeps its x and is ILL_CONDITIONED, or NON_FINITE where an ``a``
+    lost its weight. Wires have their turn in ``order`` (U,), until one may need more than what is left of
+    ``units``, evaluations of F and J with all that goes with them. Returns how many were needed, by estimate;
+    to ``tally`` (3,) the evaluations of F, those of J and the steps are added. ``turn`` counts the calls.
     """
+    w: Any = _work(own)
+    x, lower, point, raw = matrix(own, X), cube(own, LOWER), vector(own, POINT), matrix(own, RAW)
+    electrodes, still, still_std = int_matrix(own, ELECTRODES), matrix(own, STILL), matrix(own, STILL_STD)
+    inverse, a_solved, noise = cube(own, INVERSE), matrix(own, A_SOLVED), matrix(own, NOISE)
+    std, report, measure = matrix(own, STD), int_matrix(own, REPORTS), matrix(own, MEASURE)
+    tally = int_vector(own, TALLY)
     unknowns = w.x.size
     equations = a.shape[1]
     tall = equations > unknowns
@@ -360,117 +386,3 @@ def solve_wires(
         elif evaluations > 0:
             spent += evaluations + (0.0 if followed else COVARIANCE_UNITS)
     return spent
-
-
-class Solver:
-    """The buffers of one patch around :func:`solve_wires`. One owner, no threads."""
-
-    def __init__(self, problem: PatchProblem, operator: int, normal_only: bool = False) -> None:
-        wires, lower = problem.layout.shape
-        unknowns = problem.layout.unknowns
-        self.problem = problem
-        self.operator = operator
-        self.x = problem.rest.copy()
-        """(U, 3N) the iterate of each wire, pitches."""
-        self.inverse = np.zeros((wires, unknowns, lower))
-        self.a_solved = np.ones((wires, lower))
-        self.noise = np.zeros((wires, lower))
-        self.std = np.full((wires, unknowns), np.inf)
-        """(U, 3N) pitches."""
-        self.report = np.zeros((wires, REPORT), np.int64)
-        self.measure = np.zeros((wires, MEASURES))
-        self.tally = np.zeros(3, np.int64)
-        """Evaluations of F, of J and steps of all calls since its owner set it to zero."""
-        self.turn = 0
-        """Counted by the owner: says whose turn it is to have a new inverse, where it is reused."""
-        self.still_std = np.full((wires, unknowns), np.inf)
-        """(U, 3N) deviation of what is no unknown, pitches."""
-        self.each = 1 if normal_only else 3
-        """Unknowns an electrode."""
-        most = unknowns // 3
-        self.free = np.full(wires, most)
-        """(U,) number of electrodes with unknowns."""
-        self._sizes: list[int] | None = [most]  # of ``free``, None where they have to be looked for
-        self._in_turn = np.arange(wires)
-        self._electrodes = np.tile(np.arange(most), (wires, 1))
-        self._still = np.zeros((wires, lower))
-        self._work: dict[int, tuple[Work, Float, Float]] = {}
-        self.step_limit = problem.step_limit
-
-    def electrodes(self, u: int) -> Index:
-        """The electrodes of wire u that have unknowns."""
-        return self._electrodes[u, : self.free[u]]
-
-    def set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Give unknowns to these electrodes of wire u only; the others go to rest. ``inverse`` and all that
-        belongs to it is void until the next converged solve."""
-        n = self.problem.layout.unknowns // 3
-        rest = np.setdiff1d(np.arange(n), electrodes)
-        self.free[u], self._sizes = len(electrodes), None
-        self._electrodes[u, : len(electrodes)] = electrodes
-        self.x[u].reshape(n, 3)[rest] = self.problem.rest[u].reshape(n, 3)[rest]
-        self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
-
-    def solve_rest(self) -> Index:
-        """Solve the rest position itself, for its inverse; sign of det J (U,) there, 0 where it has none."""
-        todo, weight = np.full(len(self.x), SOLVE, np.uint8), np.ones_like(self.a_solved)
-        self.x[:] = self.problem.rest
-        self.solve(todo, self.problem.a_rest.copy(), weight, COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
-        self.x[:] = self.problem.rest
-        return self.report[:, BRANCH].copy()
-
-    def solve(
-        self,
-        todo: NDArray[np.uint8],
-        a: Float,
-        weight: Float,
-        tasks: int,
-        tol_f: float,
-        tol_x: float,
-        max_steps: int,
-        sigma: float = 0.0,
-        operator: int | None = None,
-        order: Index | None = None,
-        units: float = math.inf,
-    ) -> None:
-        """Solve the wires in ``todo`` from :attr:`x` on, into :attr:`x`, :attr:`std`, :attr:`report` and
-        :attr:`measure`. ``a`` and ``weight`` (U, K) may be overwritten. ``order`` and ``units`` as in
-        :func:`solve_wires`; who had a turn has TURN 1 in its report."""
-        sizes = self._sizes or sorted(set(self.free[todo != LEAVE].tolist()))
-        for size in sizes:  # all the same, unless electrodes are left out
-            if size not in self._work:
-                lower = self.problem.layout.shape[1]
-                self._work[size] = (
-                    workspace(self.each * size, lower), np.zeros(3 * size), np.zeros((3 * size, lower)),
-                )  # fmt: skip
-            work, point, raw = self._work[size]
-            units -= solve_wires(
-                self.operator if operator is None else operator,
-                tasks,
-                todo if len(sizes) == 1 else np.where(self.free == size, todo, LEAVE).astype(np.uint8),
-                self.x,
-                a,
-                weight,
-                sigma,
-                self.problem.lower,
-                tol_f,
-                tol_x,
-                max_steps,
-                self.step_limit,
-                self._electrodes,
-                self._still,
-                self.still_std,
-                work,
-                point,
-                raw,
-                self.inverse,
-                self.a_solved,
-                self.noise,
-                self.std,
-                self.report,
-                self.measure,
-                self._in_turn if order is None else order,
-                units,
-                self.turn,
-                self.tally,
-            )

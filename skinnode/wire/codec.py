@@ -84,7 +84,7 @@ class CodeScale:
         return self.step / math.sqrt(12.0)
 
 
-def _baseline(baseline_ohm: ArrayLike) -> Float:
+def as_baseline(baseline_ohm: ArrayLike) -> Float:
     """R0 as both ends of the bus know it: REAL32."""
     return np.asarray(baseline_ohm, dtype=np.float32).astype(np.float64)
 
@@ -96,7 +96,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
     without a baseline (R0 not positive and finite). A value within half a step of the range is in the range.
     """
     resistance = np.asarray(resistance_ohm, dtype=np.float64)
-    baseline = _baseline(baseline_ohm)
+    baseline = as_baseline(baseline_ohm)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         code = np.rint((resistance / baseline - scale.lo) / scale.step)
         measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
@@ -118,7 +118,7 @@ class Decoder:
     """:func:`decode` for many scans with the same baseline."""
 
     def __init__(self, baseline_ohm: ArrayLike, scale: CodeScale) -> None:
-        self._baseline, self._scale = _baseline(baseline_ohm), scale
+        self._baseline, self._scale = as_baseline(baseline_ohm), scale
         known = (self._baseline > 0) & (self._baseline < np.inf)
         self._known: NDArray[np.bool_] | None = None if known.all() else known
 

@@ -15,7 +15,7 @@ from skinnode.host.publish import Publisher
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Workers
 from skinnode.model.forward import resistance_ohm
-from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, SolveStats
+from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
 from skinnode.wire.assembler import Scan, ScanAssembler
@@ -37,10 +37,7 @@ class Stub:
         self.entered, self.go = threading.Event(), threading.Event()
         self.error: Exception | None = None
 
-    def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        return ResistanceFrame(REST_OHM, scan.valid, stamp)
-
-    def solve(self, frame: ResistanceFrame) -> FieldFrame:
+    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
         self.entered.set()
         self.go.wait(10)
         if self.error is not None:
@@ -48,7 +45,7 @@ class Stub:
         zero = np.zeros_like(LAYOUT.upper_m)
         status = (Status.CONVERGED,) * len(zero)
         field = FieldFrame(zero, zero, status, np.zeros(len(zero)), SolveStats(0, 0, 0, 0.0))
-        return replace(field, stamp=frame.stamp)
+        return replace(field, stamp=stamp), scan.valid.size - np.count_nonzero(scan.valid)
 
 
 @pytest.fixture

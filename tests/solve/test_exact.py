@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ import skinnode as sk
 from skinnode.solve import exact, wires
 from skinnode.solve.exact import ExactTracker
 from skinnode.solve.follow import chi2_quantile
+from skinnode.solve.patch_solver import TAKE, PatchSolver
 
 from .press import frame_ohm, hertz_press
 
@@ -482,16 +485,22 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, call_s: float) -> None:
         self.now, self.call_s = 0.0, call_s
-        solve = wires.Solver.solve
-
-        def timed(solver: wires.Solver, todo: np.ndarray, *args: object, **kwargs: object) -> None:
-            asked = todo != wires.LEAVE
-            solver.report[asked, wires.TURN] = 0
-            solve(solver, todo, *args, **kwargs)
-            self.now += self.call_s * np.count_nonzero(solver.report[asked, wires.TURN])
-
         monkeypatch.setattr(exact, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(wires.Solver, "solve", timed)
+        monkeypatch.setattr(PatchSolver, "solve", self._timed(PatchSolver.solve))
+        monkeypatch.setattr(PatchSolver, "advance", self._timed(PatchSolver.advance, clears=TAKE))
+
+    def _timed(self, call: Callable[..., Any], clears: int = 0) -> Callable[..., Any]:
+        def timed(solver: PatchSolver, *args: Any, **kwargs: Any) -> Any:
+            turns = solver.report[:, wires.TURN]
+            before = turns.copy()
+            turns[:] = 0
+            result = call(solver, *args, **kwargs)
+            self.now += self.call_s * np.count_nonzero(turns)
+            if not (clears and args[0] & clears):
+                turns |= before
+            return result
+
+        return timed
 
 
 class TestDeadline:

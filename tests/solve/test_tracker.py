@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import skinnode as sk
 from skinnode.model.elastic import Rubber
 from skinnode.solve.exact import ExactTracker
+from skinnode.solve.inputs import CodeMap
+from skinnode.wire.codec import MISSING, CodeScale, as_baseline, decode, encode
 
 from .press import frame_ohm, hertz_press
 
@@ -261,6 +266,14 @@ def test_what_a_confirmation_left_open_stays_while_a_wire_is_held():
     assert (still > 0.5 * wide).all()
 
 
+def doubt_of_the_first_wire(tracker: sk.Tracker) -> Callable[[], bool]:
+    def doubtful() -> bool:
+        tracker._lost[:], tracker._unsure[:] = False, [True, False, False, False]
+        return True
+
+    return doubtful
+
+
 def test_a_posterior_that_cannot_answer_by_the_deadline_is_not_asked(layout, monkeypatch):
     """A field in doubt takes no time that cannot help it; with time enough it is put right."""
     moved = hertz_press(layout, 0.1, centre_m=(6e-3, 6e-3))
@@ -270,9 +283,7 @@ def test_a_posterior_that_cannot_answer_by_the_deadline_is_not_asked(layout, mon
         tracker._posterior.from_rest_s = shortest_s
         asked, ask = [], tracker._posterior.update
         monkeypatch.setattr(tracker._posterior, "update", lambda *args: asked.append(1) or ask(*args))  # noqa: B023
-        monkeypatch.setattr(
-            tracker, "_doubtful", lambda field: (np.zeros(4, bool), np.array([True, False, False, False]))
-        )
+        monkeypatch.setattr(tracker, "_doubtful", doubt_of_the_first_wire(tracker))
         for _ in range(3):
             field = tracker.update(frame_ohm(layout, moved))
             assert field.trusted == (asks > 0)
@@ -290,11 +301,8 @@ def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout,
         field = ask(*arguments)
         return field if answers else dataclasses.replace(field, status=(sk.Status.DEADLINE,) * 4)
 
-    def doubtful(field: sk.FieldFrame) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros(4, bool), np.array([True, False, False, False])
-
     monkeypatch.setattr(tracker._posterior, "update", update)
-    monkeypatch.setattr(tracker, "_doubtful", doubtful)
+    monkeypatch.setattr(tracker, "_doubtful", doubt_of_the_first_wire(tracker))
     moved = hertz_press(layout, 0.1, centre_m=(6e-3, 6e-3))
     for number in range(40):
         answers = number >= 32
@@ -306,3 +314,54 @@ def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout,
     assert asked == [0, 16, *range(32, 40)]
     assert field.trusted
     np.testing.assert_allclose(field.displacement_m, moved, atol=1e-3 * layout.height_m)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([16, 24]), st.booleans(), st.booleans())
+def test_codes_are_solved_as_the_resistances_that_they_stand_for(
+    seed: int, bits: int, gained: bool, rough: bool
+) -> None:
+    """The decoder of the wire format is the other way: a stream of codes, some of them none, by both."""
+    rng = np.random.default_rng(seed)
+    layout = sk.PatchLayout.preset("staggered", upper_wires=4, upper_electrodes=4, lower_electrodes=4)
+    scale = CodeScale(bits)
+    baseline = frame_ohm(layout, np.zeros_like(layout.upper_m)) * rng.uniform(0.9, 1.1, layout.shape)
+    gain = rng.uniform(0.99, 1.01, (layout.shape[0], 1)) if gained else None
+    if rough:
+        baseline[0, 0] = np.nan  # a crossing without a baseline
+    meaning = CodeMap(
+        baseline_ohm=as_baseline(baseline),
+        lo=scale.lo,
+        step=scale.step,
+        steps=scale.steps,
+        rounding_ohm=scale.relative_std * baseline,
+        relative_noise=1e-5,
+        gain=gain,
+    )
+    options = {"method": "exact", "relative_noise": 1e-5}
+    one, two = sk.Tracker(layout, codes=meaning, **options), sk.Tracker(layout, **options)
+    for n in range(4):
+        ohm = frame_ohm(layout, hertz_press(layout, 0.05 * n, centre_m=(6e-3, 6e-3)))
+        codes = encode(ohm * rng.normal(1.0, 1e-5, ohm.shape), baseline, scale)
+        if rough:
+            codes[rng.random(codes.shape) < 0.02] = rng.choice([scale.open, scale.short, MISSING])
+        resistance, valid = decode(codes, baseline, scale)
+        if gain is not None:
+            resistance = resistance * gain
+        noise = np.hypot(1e-5, scale.relative_std * baseline / resistance)
+        field, invalid = one.update_codes(codes)
+        expected = two.update(resistance, valid, noise)
+        assert invalid == np.count_nonzero(~valid)
+        assert field.status == expected.status
+        np.testing.assert_array_equal(field.held, expected.held)
+        np.testing.assert_allclose(
+            field.displacement_m, expected.displacement_m, atol=1e-9 * layout.pitch_m, rtol=0
+        )
+        np.testing.assert_allclose(field.displacement_std_m, expected.displacement_std_m, rtol=1e-6)
+        np.testing.assert_allclose(field.residual, expected.residual, rtol=1e-3, atol=1e-9)
+
+
+def test_a_posterior_takes_no_codes(layout: sk.PatchLayout) -> None:
+    tracker = sk.Tracker(layout, method="posterior")
+    with pytest.raises(ValueError, match="got 'posterior', must be exact"):
+        tracker.update_codes(np.zeros(layout.shape, np.uint32))

@@ -43,10 +43,10 @@ class Bundle:
             row[1 : 1 + array.ndim] = array.shape
 
 
-def _taker(kind: Any, axes: int) -> Any:
+def _taker(kind: Any, axes: int, *, fixed: bool = False) -> Any:
     @intrinsic  # type: ignore[untyped-decorator]
     def take(typing: Any, table: Any, number: Any) -> Any:
-        array = types.Array(kind, axes, "C")
+        array = types.Array(kind, axes, "C", readonly=fixed)
 
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             rows = arrayobj.make_array(table)(context, builder, arguments[0])
@@ -73,6 +73,8 @@ def _taker(kind: Any, axes: int) -> Any:
 
 vector, matrix, cube = (_taker(types.float64, axes) for axes in (1, 2, 3))
 """Arrays of doubles; known to compiled code only."""
+fixed_cube = _taker(types.float64, 3, fixed=True)
+"""One that kernels know from elsewhere as read-only, and are compiled for as such."""
 int_vector, int_matrix = (_taker(types.int64, axes) for axes in (1, 2))
 byte_vector, byte_matrix = (_taker(types.uint8, axes) for axes in (1, 2))
 code_matrix = _taker(types.uint32, 2)

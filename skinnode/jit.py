@@ -74,6 +74,13 @@ def njit_part(function: _F) -> _F:
     return compiled
 
 
+def njit_body(function: _F) -> _F:
+    """Copy ``function`` into the one kernel that calls it, before anything is compiled: to compile both, one
+    linked into the other, takes half as long again."""
+    compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
+    return compiled
+
+
 def njit(function: _F) -> _F:
     """Compile ``function`` on its first call; the compiled code is kept in :func:`cache_dir`."""
     return _kept(function, nogil=True)

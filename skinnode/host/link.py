@@ -15,7 +15,7 @@ from skinnode.host.dealer import BusStats, Dealer, Handler
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Intake
-from skinnode.wire.indices import sdo_response_cob_id
+from skinnode.wire.indices import SYNC_COB_ID, sdo_response_cob_id
 
 _log = logging.getLogger(__name__)
 
@@ -62,6 +62,8 @@ class BusLink(Dealer):
         """Send a data frame, from any thread. Raises BusError."""
         t_ns = time.monotonic_ns()
         self._port.send(can_id, data)
+        if can_id != SYNC_COB_ID:
+            self.intake.asked(t_ns)
         self.count_sent(can_id, data)
         for listener in self._sent_listeners:
             listener(Frame(can_id, data, t_ns, fd=len(data) > 8))
@@ -83,6 +85,7 @@ class BusLink(Dealer):
         """Send a remote frame, as guarding does, from any thread. Raises BusError."""
         t_ns = time.monotonic_ns()
         self._port.send(can_id, b"", remote=True)
+        self.intake.asked(t_ns)
         for listener in self._sent_listeners:
             listener(Frame(can_id, b"", t_ns, remote=True))
 

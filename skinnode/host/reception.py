@@ -69,8 +69,7 @@ def receive_patch(
 
     def on_scan(scan: Scan) -> None:
         monitor.on_scan(scan.t_last_ns)
-        if scan.complete:
-            dealer.expect(patch.name, scan.t_last_ns + period_ns)
+        dealer.expect(patch.name, scan.t_last_ns + period_ns)
 
     assembler = ScanAssembler(
         PatchProfile.from_config(patch, dealer.config),

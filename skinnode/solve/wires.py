@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.bundle import cube, int_matrix, int_vector, matrix, vector
-from skinnode.jit import njit_part
+from skinnode.bundle import cube, fixed_cube, int_matrix, int_vector, matrix, vector
+from skinnode.jit import njit_body, njit_part
 from skinnode.model.kernels import potential_jacobian
 from skinnode.model.layout import Float
 from skinnode.solve.follow import FRESH, chi2_quantile_part, deviations, follow, step_back, within_noise
@@ -182,7 +182,7 @@ def _work(own: Index) -> Work:
     )  # fmt: skip
 
 
-@njit_part
+@njit_body
 def solve_wires(
     own: Index,
     operator: int,
@@ -214,7 +214,7 @@ def solve_wires(
     to ``tally`` (3,) the evaluations of F, those of J and the steps are added. ``turn`` counts the calls.
     """
     w: Any = _work(own)
-    x, lower, point, raw = matrix(own, X), cube(own, LOWER), vector(own, POINT), matrix(own, RAW)
+    x, lower, point, raw = matrix(own, X), fixed_cube(own, LOWER), vector(own, POINT), matrix(own, RAW)
     electrodes, still, still_std = int_matrix(own, ELECTRODES), matrix(own, STILL), matrix(own, STILL_STD)
     inverse, a_solved, noise = cube(own, INVERSE), matrix(own, A_SOLVED), matrix(own, NOISE)
     std, report, measure = matrix(own, STD), int_matrix(own, REPORTS), matrix(own, MEASURE)

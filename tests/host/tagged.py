@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from skinnode.host.pipeline import Solver
-from skinnode.model.frames import FieldFrame, ResistanceFrame
+from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
+from skinnode.wire.assembler import Scan
 from vcan_sim.sensor import SimulatedPatch
 
 STEP = 1.0 / 65532
@@ -30,9 +31,9 @@ class Tags:
         self._looking = threading.Lock()
         solve = Solver.solve
 
-        def look(solver: Solver, frame: ResistanceFrame) -> FieldFrame:
-            self._look(frame, solver.facts.baseline_ohm)
-            return solve(solver, frame)
+        def look(solver: Solver, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+            self._look(solver.decode(scan, stamp), solver.facts.baseline_ohm)
+            return solve(solver, scan, stamp)
 
         monkeypatch.setattr(Solver, "solve", look)
 

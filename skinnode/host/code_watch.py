@@ -82,11 +82,12 @@ class CodeWatch:
         self._needed: float = math.inf
         self._broken: tuple[WireFault, ...] = ()
         self._odd: dict[WireFault, int] = {}  # windows running in which a wire was noisy or drifted
-        self._clear()
+        self._window: list[Codes] = []
+        self._measured: NDArray[np.bool_] | None = None  # which codes were in all of its scans; None: all
 
     def on_scan(self, scan: Scan) -> None:
         """The next scan."""
-        if not scan.complete or scan.flags & SummaryFlag.CHANGED_ONLY:
+        if not scan.complete or (scan.flags and scan.flags & SummaryFlag.CHANGED_ONLY):
             return
         codes, last = scan.codes, self._last
         self._last = codes
@@ -94,8 +95,11 @@ class CodeWatch:
             self._before = codes
             return
         self._compare(codes, last, self._before)
-        broken = () if scan.valid.all() else self._find_broken(codes)
-        self._accumulate(codes, scan.valid)
+        whole = bool(scan.valid.all())
+        broken = () if whole else self._find_broken(codes)
+        if not whole:
+            self._measured = scan.valid if self._measured is None else self._measured & scan.valid
+        self._accumulate(codes)
         if broken != self._broken:
             self._broken = broken
             self._tell()
@@ -105,8 +109,9 @@ class CodeWatch:
     def _compare(self, codes: Codes, last: Codes, before: Codes) -> None:
         changed = codes != last
         if changed.any():
-            self._flickers += bool((changed & (codes == before)).any())
-            self._before = np.where(changed, last, before)
+            if self._flickers < FLICKERS:  # more are not asked for
+                self._flickers += bool((changed & (codes == before)).any())
+                self._before = np.where(changed, last, before)
             by_itself = not self.frozen or np.abs(codes.astype(np.int64) - last).max() <= 1
             self._longest = max(self._longest, self._run if by_itself else 0)
             self._run, self.frozen = 0, False
@@ -140,19 +145,15 @@ class CodeWatch:
                 found += [WireFault(side, int(i), state) for i in np.flatnonzero(is_so.all(axis=axis))]
         return tuple(sorted(found))
 
-    def _clear(self) -> None:
-        self._window: list[Codes] = []
-        self._measured: Any = True
-
-    def _accumulate(self, codes: Codes, valid: NDArray[np.bool_]) -> None:
+    def _accumulate(self, codes: Codes) -> None:
         self._window.append(codes)
-        self._measured = self._measured & valid
         if len(self._window) == WINDOW:
             self._judge_window()
-            self._clear()
+            self._window, self._measured = [], None
 
     def _judge_window(self) -> None:
-        scale, measured = self._scale, self._measured
+        scale, every = self._scale, np.ones(self._window[0].shape, np.bool_)
+        measured = every if self._measured is None else self._measured
         if not measured.any():
             self._odd = {}
             return
@@ -164,7 +165,7 @@ class CodeWatch:
         expected = (self._relative_noise / scale.step) ** 2 + 1.0 / 12.0
         odd: set[WireFault] = set()
         for side, axis in (("upper", 1), ("lower", 0)):
-            whole = measured.any(axis=axis)
+            whole = np.asarray(measured.any(axis=axis))
             level = _of_wires(noise, axis, whole, np.mean, np.nanmean)
             gain = _of_wires(ratio, axis, whole, _median, np.nanmedian)
             off = np.abs(ratio - (gain[:, None] if axis else gain))

@@ -253,7 +253,9 @@ class Lane:
     def _offer(self, scan: Scan) -> None:
         self._on_scan(scan)
         self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
-        if scan.flags & SummaryFlag.BASELINE_CHANGED:  # this scan is the first with the new one
+        if (
+            scan.flags and scan.flags & SummaryFlag.BASELINE_CHANGED
+        ):  # this scan is the first with the new one
             self.withhold()
         elif scan.device_time_us is None:
             self.doubtful = True

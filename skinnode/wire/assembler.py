@@ -392,8 +392,9 @@ class ScanAssembler:
             return None
         expected, complete = self._n, self._received == self._n
         if summary is not None:
-            self._changed_only = bool(summary.flags & SummaryFlag.CHANGED_ONLY)
-            overrun = bool(summary.flags & SummaryFlag.OVERRUN)
+            flags = summary.flags  # mostly 0; to look for a flag in it takes as long as a chunk does
+            self._changed_only = flags != 0 and bool(flags & SummaryFlag.CHANGED_ONLY)
+            overrun = flags != 0 and bool(flags & SummaryFlag.OVERRUN)
             expected = summary.chunks
             complete |= self._received == expected and self._changed_only and not overrun
         if self._joined_late and not complete:
@@ -430,13 +431,10 @@ class ScanAssembler:
         self._held = frames
 
     def _decode(self) -> tuple[Codes, NDArray[np.bool_]]:
-        known = [frame for frame in self._held if frame is not None]
-        if len(known) == self._n:
-            codes = unpack_scan(b"".join(known), self._profile)
-        else:
-            blank = bytes(self._chunk_bytes)
-            payload = b"".join([blank if frame is None else frame for frame in self._held])
-            codes = unpack_scan(payload, self._profile)
+        blank = bytes(self._chunk_bytes)
+        payload = b"".join([frame or blank for frame in self._held])
+        codes = unpack_scan(payload, self._profile)
+        if None in self._held:
             unknown = np.array([frame is None for frame in self._held])
             codes[unknown[chunk_of_code(self._profile)]] = MISSING
         valid = codes <= self._steps

@@ -13,7 +13,9 @@ used. Nothing is allocated.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from skinnode.jit import njit, njit_part
 from skinnode.model.layout import Float
@@ -111,10 +113,11 @@ def cholesky(a: Float, n: int) -> int:
 
     Only what is on and above the diagonal is read. 1, or 0 where ``a`` is not positive definite.
     """
+    first: Any = np.int64(0)  # a literal 0 would have what it is given to compiled once more
     for r in range(0, n, ROWS):
         rows = min(ROWS, n - r)
         end = r + rows
-        _tile(a, r, rows, a, a, 0, r, r, rows, True)
+        _tile(a, r, rows, a, a, first, r, r, rows, True)
         for i in range(r, end):
             upper = a[i]
             for k in range(r, i):
@@ -130,7 +133,7 @@ def cholesky(a: Float, n: int) -> int:
                 upper[j] /= root
                 a[j, i] = upper[j]
         for col in range(end, n, TILE):
-            _forward(a, a, r, rows, 0, col, min(TILE, n - col))
+            _forward(a, a, r, rows, first, col, min(TILE, n - col))
         for j in range(end, n):
             lower = a[j]
             for i in range(r, end):
@@ -141,9 +144,10 @@ def cholesky(a: Float, n: int) -> int:
 @njit
 def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
     """L⁻¹ B in place of the leading (n, cols) of ``b``; of ``l`` the lower triangle is read."""
+    first: Any = np.int64(0)
     for col in range(0, cols, TILE):
         for r in range(0, n, ROWS):
-            _forward(l, b, r, min(ROWS, n - r), 0, col, min(TILE, cols - col))
+            _forward(l, b, r, min(ROWS, n - r), first, col, min(TILE, cols - col))
 
 
 @njit_part
@@ -201,9 +205,10 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 def multiply(a: Float, b: Float, c: Float) -> None:
     """``c`` (m, n) = ``a`` (m, k) · ``b`` (k, n)."""
     (rows, inner), cols = a.shape, b.shape[1]
+    first: Any = np.int64(0)
     for col in range(0, cols, TILE):
         for r in range(0, rows, ROWS):
-            _tile(c, r, min(ROWS, rows - r), a, b, 0, inner, col, min(TILE, cols - col), False)
+            _tile(c, r, min(ROWS, rows - r), a, b, first, inner, col, min(TILE, cols - col), False)
 
 
 @njit

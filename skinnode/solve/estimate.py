@@ -125,7 +125,7 @@ class Estimator:
         self._reach = NEAR * float(problem.clearance.min())
         self._enough = math.inf  # RMS of a correction that is small against the deviation
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
-        kernels.potentials(np.arange(wires), problem.rest, problem.lower, *self._at_rest)
+        kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self._correction = np.zeros(wires * free.size + nuisances)
         self._every = np.arange(wires)
         self._uniform = np.ascontiguousarray(prior.covariance[np.ix_(every, every)])

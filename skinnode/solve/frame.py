@@ -179,7 +179,9 @@ def clear(own: Index, its: Index) -> None:
         report[u, wires.STATUS] = DEADLINE
         for i in range(wires.MEASURES):
             measure[u, i] = math.inf
-    int_vector(own, wires.TALLY)[:] = 0
+    tally = int_vector(own, wires.TALLY)
+    for i in range(tally.size):
+        tally[i] = 0
 
 
 @njit_part

@@ -167,7 +167,7 @@ def _coordinate(electrodes: Index, j: int, each: int) -> int:
     return int(3 * electrodes[j] + 2)
 
 
-@njit_part
+@njit_body
 def _work(own: Index) -> Work:
     """The workspace in the bundle of a solver."""
     return Work(

@@ -32,9 +32,12 @@ LONG_S: Final = 6e-3
 """The same while it is known when the next thing that somebody waits for should come: two thirds of what
 gathering saves at 1.5 ms, again."""
 
+_BEFORE_S: Final = 0.8e-3
+"""What has gathered is fetched once more that long before something is expected, so that little is left to do
+when it is there."""
 _SHORT_S: Final = 0.2e-3
 """Least pause, when something is expected."""
-_LATE_NS: Final = 3_000_000
+_LATE_S: Final = 3e-3
 """For how long something overdue is still waited for with short pauses."""
 _ANSWER_NS: Final = 20_000_000
 """For how long after a question an answer may come at any time."""
@@ -104,9 +107,11 @@ class Intake:
         known = max(expected, default=0) > now_ns and now_ns > self._asked_ns + _ANSWER_NS
         pause_s = LONG_S if known else GATHER_S
         for t_ns in expected:
-            ahead_ns = t_ns + _LAG_NS - now_ns
-            if -_LATE_NS < ahead_ns < pause_s * 1e9:
-                pause_s = max(_SHORT_S, ahead_ns * 1e-9)
+            ahead_s = (t_ns + _LAG_NS - now_ns) * 1e-9
+            if ahead_s >= _BEFORE_S + GATHER_S:
+                ahead_s -= _BEFORE_S
+            if -_LATE_S < ahead_s < pause_s:
+                pause_s = max(_SHORT_S, ahead_s)
         return pause_s
 
     @property

@@ -14,6 +14,7 @@ from skinnode.host.link import BusLink
 from skinnode.host.mainline import Mainline
 from skinnode.model.config import BusConfig, HandConfig
 from skinnode.transport import CanPort, Frame
+from skinnode.transport.receiver import GATHER_S, LONG_S
 from skinnode.wire.timing import exact_bits
 
 from .conftest import eventually
@@ -165,6 +166,34 @@ def test_time_goes_on_for_a_silent_bus_while_another_is_busy(hand: HandConfig) -
                 while not told.empty():
                     newest_ns = told.get()
     assert begin_ns < newest_ns <= time.monotonic_ns()
+
+
+def test_whoever_asks_is_answered_as_soon_as_if_no_scan_were_expected(hand: HandConfig) -> None:
+    """A SYNC asks for no answer, for it is known when scans come."""
+    with BusLink(hand.buses[0], {}, fail) as link:
+        far_ns = time.monotonic_ns() + 1_000_000_000
+        link.expect("thumb", far_ns)
+        link.send(0x80, b"\x01")
+        assert link.intake.pause_s(time.monotonic_ns()) == LONG_S
+        link.send(0x605, bytes(8))
+        assert link.intake.pause_s(time.monotonic_ns()) == GATHER_S
+
+
+def test_the_load_of_each_bus_is_measured_though_in_turn(hand: HandConfig) -> None:
+    one, other = two_buses(hand)
+    with (
+        CanPort(one) as to_one,
+        CanPort(other) as to_other,
+        BusLink(one, {}, fail) as a,
+        BusLink(other, {}, fail) as b,
+        Mainline([a, b]),
+    ):
+        for _ in range(20):
+            to_one.send(0x185, bytes(8))
+            to_other.send(0x186, b"")
+            time.sleep(0.01)
+        assert eventually(lambda: a.stats().bits == 20 * exact_bits(0x185, bytes(8)))
+        assert eventually(lambda: b.stats().bits == 20 * exact_bits(0x186, b""))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Intake, Receiver
 from skinnode.transport.datagram import DatagramPort, datagram, free_channel
-from skinnode.transport.receiver import GATHER_S
+from skinnode.transport.receiver import GATHER_S, LONG_S
 
 
 @pytest.fixture(autouse=True)
@@ -266,5 +266,19 @@ def test_what_is_expected_does_not_wait_for_more_frames() -> None:
     assert intake.pause_s(now_ns + 1_200_000) < 0.3e-3  # overdue
     assert intake.pause_s(now_ns + 5_000_000) == GATHER_S  # it does not come any more
     intake.expect("thumb", now_ns + 50_000_000)
-    assert intake.pause_s(now_ns + 10_000_000) == GATHER_S
     assert intake.pause_s(now_ns + 49_000_000) < GATHER_S
+
+
+def test_the_pause_is_long_while_it_is_known_what_comes_and_nobody_has_asked_anything() -> None:
+    """An answer may come at any time, so it is looked for as often as if nothing were known."""
+    intake = Intake(Script(0))
+    now_ns = 5_000_000_000
+    intake.expect("thumb", now_ns + 50_000_000)
+    assert intake.pause_s(now_ns + 10_000_000) == LONG_S > GATHER_S
+    intake.asked(now_ns + 10_000_000)
+    assert intake.pause_s(now_ns + 11_000_000) == GATHER_S
+    assert intake.pause_s(now_ns + 35_000_000) == LONG_S  # it has come, or does not
+    # once a little before it is due, then when it is
+    assert intake.pause_s(now_ns + 45_000_000) == pytest.approx(4.2e-3, rel=0.05)
+    assert intake.pause_s(now_ns + 49_200_000) == pytest.approx(0.8e-3, rel=0.1)
+    assert intake.pause_s(now_ns + 80_000_000) == GATHER_S  # the stream has ended

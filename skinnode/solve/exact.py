@@ -41,11 +41,11 @@ from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import as_statuses
 from skinnode.solve import operators as op
-from skinnode.solve import patch_solver as call
+from skinnode.solve import patch_solver as stage
 from skinnode.solve import wires
 from skinnode.solve.follow import Z_HOLD, chi2_quantile
 from skinnode.solve.frame import DEADLINE, STALE, FrameArrays
-from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_mask, checked_noise
+from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask, checked_noise
 from skinnode.solve.patch_solver import PatchSolver
 from skinnode.solve.problem import PatchProblem
 from skinnode.solve.system import operator_code
@@ -211,35 +211,32 @@ class ExactTracker:
         its.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         its.noise[:] = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
         its.valid[:] = True if valid is None else checked_mask(valid, self.layout)
-        return self._advance(call.TAKE, start)
+        return self._advance(stage.TAKE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
         """The field of a scan of (U, K) codes, as :meth:`update` makes it of the resistances and the noise
         that they stand for. Afterwards :attr:`arrays` has those, and :attr:`invalid_codes` counts what was
-        none."""
+        none. Raises ValueError for another shape, or numbers that are no uint32."""
         start = perf_counter()
-        self.arrays.codes[:] = codes
-        return self._advance(call.DECODE | call.TAKE, start)
+        self.arrays.codes[:] = checked_codes(codes, self.layout)
+        return self._advance(stage.DECODE | stage.TAKE, start)
 
     def _advance(self, stages: int, start: float) -> FieldFrame:
+        """The field of the frame that :attr:`arrays` has, after the ``stages`` that come before its solve."""
         solver, its = self._solver, self.arrays
         solver.turn += 1
         sigma, until, units = self._sigma, start + self._seconds, math.inf
         if self._leaves_out:
-            sigma, self.invalid_codes, _ = self._call_stages(stages, sigma, units)
+            sigma, _ = self._call_stages(stages, sigma, units)
             self._leave_out(sigma)
             stages = 0
         if until < math.inf:
             units = max(WIRE_UNITS, (until - perf_counter()) / UNIT_S)
-        if self._active_only:  # wires may differ in the number of their unknowns
-            self._call_stages(stages | call.CHOOSE, sigma, units)
-            found = 0
-        else:
-            sigma, invalid, found = self._call_stages(
-                stages | call.CHOOSE | call.SOLVE | call.REACH | call.FINISH, sigma, units
-            )
-            self.invalid_codes = invalid if stages & call.DECODE else self.invalid_codes
-        easy = found & call.ALL_GOOD != 0
+        stages |= stage.CHOOSE
+        if not self._active_only:  # all wires have as many unknowns
+            stages |= stage.SOLVE | stage.REACH | stage.FINISH
+        sigma, found = self._call_stages(stages, sigma, units)
+        easy = found & stage.ALL_GOOD != 0
         if easy:
             self._order = self._in_order
             residual = solver.measure[:, wires.RESIDUAL].copy()
@@ -250,8 +247,8 @@ class ExactTracker:
             elif until < math.inf:
                 self._solve_rest_of(self._todo, frame)
             residual = self._rescue(frame)
-            _, _, found = self._call_stages(call.FINISH, sigma, math.inf)
-        if found & call.INCOMPLETE:
+            _, found = self._call_stages(stage.FINISH, sigma, math.inf)
+        if found & stage.INCOMPLETE:
             self._complete()
         displacement, std = its.outcome_m.copy()
         evaluations, jacobians, steps = solver.tally.tolist()
@@ -265,9 +262,9 @@ class ExactTracker:
             held=its.held.copy(),
         )
 
-    def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int, int]:
-        """As :meth:`PatchSolver.advance` does them for a frame."""
-        return self._solver.advance(
+    def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:
+        """As :meth:`PatchSolver.advance` does them for a frame: σ, and what came of it."""
+        sigma, invalid, found = self._solver.advance(
             stages,
             self.arrays,
             self._first,
@@ -279,6 +276,9 @@ class ExactTracker:
             self._order,
             units,
         )
+        if stages & stage.DECODE:
+            self.invalid_codes = invalid
+        return sigma, found
 
     def _rescue(self, frame: _Frame) -> Float:
         """Try what is left to try on wires that were not brought to a root: their status and whether they are

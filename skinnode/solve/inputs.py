@@ -58,3 +58,11 @@ def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
         got = f"{mask.dtype} of shape {mask.shape}"
         raise ValueError(f"valid: got {got}, must be bool of shape {layout.shape}")
     return mask
+
+
+def checked_codes(codes: Any, layout: PatchLayout) -> NDArray[np.uint32]:
+    """``codes`` as they are. ValueError unless they are uint32 and have the shape of a frame."""
+    if getattr(codes, "dtype", None) != np.uint32 or codes.shape != layout.shape:
+        got = f"{codes.dtype} of shape {codes.shape}" if isinstance(codes, np.ndarray) else f"{codes!r:.40}"
+        raise ValueError(f"codes: got {got}, must be uint32 of shape {layout.shape}")
+    return np.asarray(codes)

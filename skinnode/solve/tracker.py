@@ -114,6 +114,7 @@ class Tracker:
         nuisances = [name for name, asked in (("drift", drift != "none"), ("model_error", model_error > 0),
                                               ("estimate_noise", estimate_noise)) if asked]  # fmt: skip
         self.method, self.reason = _choose(layout, method, relative_noise, normal_only, nuisances)
+        self._knows_codes = codes is not None
         if self.method == "posterior":
             self._exact = None
             return
@@ -187,9 +188,11 @@ class Tracker:
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
         """The field of a scan of (U, K) codes, as :meth:`update` makes it of the resistances and the noise
         that they stand for, in a fraction of the time; and how many of them were no measurement. Raises
-        ValueError where :attr:`method` is ``posterior``."""
-        if self._exact is None:
-            raise ValueError("method: got 'posterior', must be exact to take codes")
+        ValueError for another shape, numbers that are no uint32, a tracker that was not told what codes mean
+        and one whose :attr:`method` is ``posterior``."""
+        if self._exact is None or not self._knows_codes:
+            lacks = "codes: got none" if self._exact is not None else "method: got 'posterior'"
+            raise ValueError(f"{lacks}, must be exact and told what codes mean, to take some")
         start = perf_counter()
         field = self._judged(self._exact.update_codes(codes), start)
         return field, self._exact.invalid_codes

@@ -361,7 +361,22 @@ def test_codes_are_solved_as_the_resistances_that_they_stand_for(
         np.testing.assert_allclose(field.residual, expected.residual, rtol=1e-3, atol=1e-9)
 
 
-def test_a_posterior_takes_no_codes(layout: sk.PatchLayout) -> None:
-    tracker = sk.Tracker(layout, method="posterior")
-    with pytest.raises(ValueError, match="got 'posterior', must be exact"):
-        tracker.update_codes(np.zeros(layout.shape, np.uint32))
+def code_map(layout: sk.PatchLayout) -> CodeMap:
+    scale, baseline = CodeScale(), frame_ohm(layout, np.zeros_like(layout.upper_m))
+    rounding = scale.relative_std * baseline
+    return CodeMap(baseline, scale.lo, scale.step, scale.steps, rounding, 1e-5)
+
+
+def test_codes_that_mean_nothing_are_refused(layout: sk.PatchLayout) -> None:
+    codes = np.zeros(layout.shape, np.uint32)
+    with pytest.raises(ValueError, match="method: got 'posterior', must be exact and told"):
+        sk.Tracker(layout, method="posterior", codes=code_map(layout)).update_codes(codes)
+    with pytest.raises(ValueError, match="codes: got none, must be exact and told what codes mean"):
+        sk.Tracker(layout, method="exact").update_codes(codes)
+    tracker = sk.Tracker(layout, method="exact", codes=code_map(layout))
+    for wrong in (codes[:1], codes.astype(np.int64), codes.tolist(), codes.T, None):
+        with pytest.raises(ValueError, match=r"codes: got .*, must be uint32 of shape"):
+            tracker.update_codes(wrong)
+    field, invalid = tracker.update_codes(codes)  # code 0 is R0 times the least ratio
+    assert invalid == 0
+    assert field.displacement_m.shape == layout.upper_m.shape

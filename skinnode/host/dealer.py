@@ -15,6 +15,7 @@ from skinnode.errors import CodecError
 from skinnode.model.config import BusConfig
 from skinnode.transport import Frame
 from skinnode.transport.bus_state import BusState, bus_state
+from skinnode.wire.stuffing import load_kernels
 from skinnode.wire.timing import BusLoad
 
 _log = logging.getLogger(__name__)
@@ -83,6 +84,8 @@ class Dealer:
         self._error_frames = self._bus_offs = 0
         self._foreign_ids: dict[int, int] = {}
         self._bus_state: BusState | None = None
+        if config.fd:
+            load_kernels()
         self._meter = BusLoad(config.bitrate_bps, config.data_bitrate_bps)
         self._outgoing: deque[tuple[int, bytes]] = deque()
         self._marks: deque[tuple[int, int]] = deque([(now_ns, 0)], maxlen=_MARKS)

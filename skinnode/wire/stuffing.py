@@ -62,8 +62,19 @@ def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
     return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
 
 
+_loaded = False
+
+
+def are_loaded() -> bool:
+    """Whether :func:`load_kernels` was called."""
+    return _loaded
+
+
 def load_kernels() -> None:
-    """Compile them, or read them from the cache, now: who counts frames in passing cannot stop for that."""
+    """Compile them, or read them from the cache, now: half a second in which a thread that receives would let
+    questions go unanswered."""
+    global _loaded
+    _loaded = True
     none, nothing, bits = np.zeros(0, np.uint32), np.zeros(0, np.uint8), np.zeros(0, np.int64)
     classic_bits(none, nothing, nothing, 0, bits)
     fd_bits(none, nothing, nothing, bits, bits)

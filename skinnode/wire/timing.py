@@ -42,9 +42,6 @@ FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Bytes that a CAN FD frame can have, by its length code."""
 _RUN: Final = 5
 _NO_RUN: Final = 0
-_FEW: Final = 32
-"""So many frames are not worth to load a kernel for, as a command that listens for a second would."""
-
 _Int = NDArray[np.int64]
 
 
@@ -246,9 +243,9 @@ class BusLoad:
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if len(ids) < _FEW:
+        if not stuffing.are_loaded():  # a command that listens for a second or two does well without
             self._bits += sum(map(exact_bits, ids, data))
-        else:
+        elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
         ids.clear()
         data.clear()

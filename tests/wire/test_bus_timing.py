@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.errors import ConfigError
+from skinnode.wire import stuffing
 from skinnode.wire.timing import (
     BusLoad,
     exact_bits,
@@ -98,6 +101,14 @@ def test_an_eight_byte_frame_is_111_to_135_bits() -> None:
     assert (nominal_bits(8, extended=True), worst_case_bits(8, extended=True)) == (131, 160)
 
 
+@pytest.fixture(scope="module", params=[False, True], ids=["by Python", "by kernels"])
+def either_way(request: pytest.FixtureRequest) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stuffing, "are_loaded", lambda: request.param)
+        yield
+
+
+@pytest.mark.usefixtures("either_way")
 @settings(deadline=None, max_examples=30)
 @given(frames=st.lists(st.tuples(STANDARD, DATA), max_size=20))
 def test_bus_load_is_the_sum_of_its_frames(frames: list[tuple[int, bytes]]) -> None:
@@ -111,6 +122,7 @@ def test_bus_load_is_the_sum_of_its_frames(frames: list[tuple[int, bytes]]) -> N
     assert load.load(0.25) == pytest.approx(expected / 125_000)
 
 
+@pytest.mark.usefixtures("either_way")
 def test_bus_load_counts_foreign_frames_and_many_of_them() -> None:
     load = BusLoad()
     for _ in range(10_000):  # more than a batch
@@ -121,6 +133,16 @@ def test_bus_load_counts_foreign_frames_and_many_of_them() -> None:
     extra = exact_bits(0x1234_5678, b"\x01", extended=True) + exact_bits(0x705, b"", remote=True, dlc=1)
     assert load.bits == 10_000 * 53 + extra
     assert load.load(0.0) == 0.0
+
+
+def test_kernels_are_not_loaded_in_passing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that receives would stand still for half a second, and answers to questions be late."""
+    monkeypatch.setattr(stuffing, "are_loaded", lambda: False)
+    monkeypatch.delattr(stuffing, "classic_bits")
+    load = BusLoad()
+    for _ in range(1000):
+        load.add(0, b"")
+    assert load.bits == 1000 * 53
 
 
 # --- CAN FD

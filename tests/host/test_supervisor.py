@@ -70,9 +70,12 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         stats = host.stats()
         assert (stats.nodes["p1"].rejoins, stats.nodes["p0"].rejoins) == (1, 0)
         assert host.health("p1").rejoins == 1
-        numbers = scans(take(undisturbed, stats.patches["p0"].solved - 10))
-        assert stats.patches["p0"].withheld == 0
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        other = stats.patches["p0"]
+        numbers = scans(take(undisturbed, other.solved - 10))
+        assert (other.withheld, other.assembler.scans_torn, other.assembler.scans_missed) == (0, 0, 0)
+        # the one processor of a guest may stand still for a period: then a scan is overtaken, and counted
+        assert other.skipped <= (1 if crossing_hand.buses[0].interface == "socketcan" else 0)
+        assert numbers[-1] - numbers[0] + 1 - len(numbers) <= other.skipped
 
 
 @pytest.mark.parametrize(("command", "booted"), [(0x81, 1), (0x82, 1), (0x80, 0), (0x02, 0)])

@@ -39,6 +39,8 @@ _SHORT_S: Final = 0.2e-3
 """Least pause, when something is expected."""
 _LATE_S: Final = 3e-3
 """For how long something overdue is still waited for with short pauses."""
+_GIVEN_UP_NS: Final = 200_000_000
+"""What is later than that does not come any more."""
 _ANSWER_NS: Final = 20_000_000
 """For how long after a question an answer may come at any time."""
 _LAG_NS: Final = 50_000
@@ -104,7 +106,9 @@ class Intake:
     def pause_s(self, now_ns: int) -> float:
         """How long to let frames gather."""
         expected = tuple(self._expected.values())
-        known = max(expected, default=0) > now_ns and now_ns > self._asked_ns + _ANSWER_NS
+        known = max(expected, default=0) > now_ns > self._asked_ns + _ANSWER_NS
+        if any(now_ns - _GIVEN_UP_NS < t_ns < now_ns for t_ns in expected):
+            known = False  # what is late may come at any time
         pause_s = LONG_S if known else GATHER_S
         for t_ns in expected:
             ahead_s = (t_ns + _LAG_NS - now_ns) * 1e-9

@@ -282,3 +282,15 @@ def test_the_pause_is_long_while_it_is_known_what_comes_and_nobody_has_asked_any
     assert intake.pause_s(now_ns + 45_000_000) == pytest.approx(4.2e-3, rel=0.05)
     assert intake.pause_s(now_ns + 49_200_000) == pytest.approx(0.8e-3, rel=0.1)
     assert intake.pause_s(now_ns + 80_000_000) == GATHER_S  # the stream has ended
+
+
+def test_while_something_is_late_the_pause_is_not_long() -> None:
+    """It may come at any time; a stream that has ended is given up after a while."""
+    intake = Intake(Script(0))
+    now_ns = 5_000_000_000
+    intake.expect("late", now_ns)
+    intake.expect("index", now_ns + 1_000_000_000)
+    assert intake.pause_s(now_ns + 2_000_000) < 0.3e-3
+    assert intake.pause_s(now_ns + 10_000_000) == GATHER_S
+    assert intake.pause_s(now_ns + 190_000_000) == GATHER_S
+    assert intake.pause_s(now_ns + 210_000_000) == LONG_S

@@ -30,7 +30,7 @@ it, and each has the time of its arrival."""
 
 LONG_S: Final = 3e-3
 """The same while it is known when the next thing that somebody waits for should come. At 6 ms a frame costs
-less again, but one scan in a hundred waits for it: on a classic bus the end of a scan is not known that well."""
+less again, but one scan in a hundred waits for it: the end of one on a classic bus is not known that well."""
 
 _BEFORE_S: Final = 0.8e-3
 """What has gathered is fetched once more that long before something is expected, so that little is left to do

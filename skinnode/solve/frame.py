@@ -34,8 +34,6 @@ STALE: Final = 2.0
 """The J⁺ of a tall system is used again while no equation's share of the weights has changed by more."""
 DEADLINE: Final = int(Status.DEADLINE)
 
-Flags = NDArray[np.bool_]
-
 # The arrays of a frame, by their number in its bundle
 (
     CODES,

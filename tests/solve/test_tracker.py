@@ -357,8 +357,8 @@ def test_codes_are_solved_as_the_resistances_that_they_stand_for(
         np.testing.assert_allclose(
             field.displacement_m, expected.displacement_m, atol=1e-9 * layout.pitch_m, rtol=0
         )
-        np.testing.assert_allclose(field.displacement_std_m, expected.displacement_std_m, rtol=1e-6)
-        np.testing.assert_allclose(field.residual, expected.residual, rtol=1e-3, atol=1e-9)
+        np.testing.assert_allclose(field.displacement_std_m, expected.displacement_std_m, rtol=1e-7)
+        np.testing.assert_allclose(field.residual, expected.residual, rtol=0, atol=1e-12)
 
 
 def code_map(layout: sk.PatchLayout) -> CodeMap:

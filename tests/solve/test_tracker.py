@@ -321,7 +321,9 @@ def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout,
 def test_codes_are_solved_as_the_resistances_that_they_stand_for(
     seed: int, bits: int, gained: bool, rough: bool
 ) -> None:
-    """The decoder of the wire format is the other way: a stream of codes, some of them none, by both."""
+    """The decoder of the wire format is the other way: a stream of codes, some of them none, by both, to the
+    last bit. Near a fold the last bit is worth asking for: there it moves a wire by up to 1 % of its deviation.
+    """
     rng = np.random.default_rng(seed)
     layout = sk.PatchLayout.preset("staggered", upper_wires=4, upper_electrodes=4, lower_electrodes=4)
     scale = CodeScale(bits)
@@ -348,17 +350,15 @@ def test_codes_are_solved_as_the_resistances_that_they_stand_for(
         resistance, valid = decode(codes, baseline, scale)
         if gain is not None:
             resistance = resistance * gain
-        noise = np.hypot(1e-5, scale.relative_std * baseline / resistance)
+        noise = np.sqrt(1e-5 * 1e-5 + (scale.relative_std * baseline / resistance) ** 2)
         field, invalid = one.update_codes(codes)
         expected = two.update(resistance, valid, noise)
         assert invalid == np.count_nonzero(~valid)
         assert field.status == expected.status
         np.testing.assert_array_equal(field.held, expected.held)
-        np.testing.assert_allclose(
-            field.displacement_m, expected.displacement_m, atol=1e-9 * layout.pitch_m, rtol=0
-        )
-        np.testing.assert_allclose(field.displacement_std_m, expected.displacement_std_m, rtol=1e-7)
-        np.testing.assert_allclose(field.residual, expected.residual, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(field.displacement_m, expected.displacement_m)
+        np.testing.assert_array_equal(field.displacement_std_m, expected.displacement_std_m)
+        np.testing.assert_array_equal(field.residual, expected.residual)
 
 
 def code_map(layout: sk.PatchLayout) -> CodeMap:

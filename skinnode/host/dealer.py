@@ -110,8 +110,8 @@ class Dealer:
         not more often than every 2 ms."""
         self._pollers = (*self._pollers, poller)
 
-    def expect(self, what: str, t_ns: int) -> None:
-        """Whoever is fed by a bus wants the frame that comes at ``t_ns`` without delay."""
+    def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
+        """Whoever is fed by a bus wants the frame that comes at one of these times without delay."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
         """Let a frame that was sent count towards the load. From any thread."""

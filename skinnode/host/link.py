@@ -126,9 +126,9 @@ class BusLink(Dealer):
 
     # --- the mainline's
 
-    def expect(self, what: str, t_ns: int) -> None:
+    def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
         """As :meth:`Intake.expect`."""
-        self.intake.expect(what, t_ns)
+        self.intake.expect(what, times_ns)
 
     def begin(self, resume: Callable[[], None]) -> None:
         """Before the first turn. ``resume``: receives again on an interface that was opened again."""

@@ -11,6 +11,7 @@ from skinnode.host.dealer import Dealer
 from skinnode.host.health import BOOT_UP, NodeMonitor
 from skinnode.host.pipeline import Lane
 from skinnode.host.publish import Publisher
+from skinnode.host.rhythm import Rhythm
 from skinnode.host.rivals import Rivals
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline, Workers
@@ -67,9 +68,11 @@ def receive_patch(
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
     monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject, watch)
 
+    rhythm = Rhythm(period_ns)
+
     def on_scan(scan: Scan) -> None:
         monitor.on_scan(scan.t_last_ns)
-        dealer.expect(patch.name, scan.t_last_ns + period_ns)
+        dealer.expect(patch.name, rhythm.next_ns(scan.t_last_ns))
 
     assembler = ScanAssembler(
         PatchProfile.from_config(patch, dealer.config),

@@ -23,22 +23,21 @@ _POLL_S: Final = 0.02
 """How long a thread waits for a frame before it says that there is none, and sees whether it should end."""
 
 
-GATHER_S: Final = 1.5e-3
+GATHER_NS: Final = 1_500_000
 """Pause after a batch, as a network card moderates its interrupts: a thread that woke for each of 8,000
 frames a second would spend more on waking than on frames. The first frame after a silence does not wait for
 it, and each has the time of its arrival."""
 
-LONG_S: Final = 3e-3
-"""The same while it is known when the next thing that somebody waits for should come. At 6 ms a frame costs
-less again, but one scan in a hundred waits for it: the end of one on a classic bus is not known that well."""
+LONG_NS: Final = 6_000_000
+"""The same while it is known when everything that somebody waits for should come."""
 
-_BEFORE_S: Final = 0.8e-3
+_BEFORE_NS: Final = 800_000
 """What has gathered is fetched once more that long before something is expected, so that little is left to do
 when it is there."""
-_SHORT_S: Final = 0.2e-3
-"""Least pause, when something is expected."""
-_LATE_S: Final = 3e-3
-"""For how long something overdue is still waited for with short pauses."""
+_SHORT_NS: Final = 300_000
+"""Least pause, when something is expected or overdue."""
+_LATE_NS: Final = 600_000
+"""For how long something overdue is waited for with such pauses."""
 _GIVEN_UP_NS: Final = 200_000_000
 """What is later than that does not come any more."""
 _ANSWER_NS: Final = 20_000_000
@@ -60,11 +59,14 @@ class Intake:
         self.port = port
         self.seen_ns = 0
         """Whatever came before is queued, or was dropped; monotonic."""
+        self.due_ns = 0
+        """When to :meth:`fetch` again. The receiver's."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
         self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the receiver's
         self._error: Exception | None = None
-        self._expected: dict[str, int] = {}
+        self._expected: dict[str, tuple[int, ...]] = {}
+        self._first_ns = 0  # the earliest of them all
         self._asked_ns = 0
 
     @property
@@ -92,10 +94,11 @@ class Intake:
         self._taken += len(frames)
         return frames
 
-    def expect(self, what: str, t_ns: int) -> None:
-        """The last frame of ``what`` should come at ``t_ns``, monotonic, and is not to wait for others then.
-        Holds until the same is expected at another time."""
-        self._expected[what] = t_ns
+    def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
+        """The last frame of ``what`` should come at one of ``times_ns``, monotonic and ascending, and is not
+        to wait for others then; empty: at any time. Holds until the same is expected anew."""
+        self._expected[what] = times_ns
+        self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
         """Something was sent at ``t_ns``, monotonic, that may be answered. From any thread."""
@@ -103,20 +106,28 @@ class Intake:
 
     # --- the receiver's
 
-    def pause_s(self, now_ns: int) -> float:
-        """How long to let frames gather."""
-        expected = tuple(self._expected.values())
-        known = max(expected, default=0) > now_ns > self._asked_ns + _ANSWER_NS
-        if any(now_ns - _GIVEN_UP_NS < t_ns < now_ns for t_ns in expected):
-            known = False  # what is late may come at any time
-        pause_s = LONG_S if known else GATHER_S
-        for t_ns in expected:
-            ahead_s = (t_ns + _LAG_NS - now_ns) * 1e-9
-            if ahead_s >= _BEFORE_S + GATHER_S:
-                ahead_s -= _BEFORE_S
-            if -_LATE_S < ahead_s < pause_s:
-                pause_s = max(_SHORT_S, ahead_s)
-        return pause_s
+    def gather(self, now_ns: int) -> None:
+        """After a batch: set :attr:`due_ns`, so that frames gather until then."""
+        known = now_ns > self._asked_ns + _ANSWER_NS
+        if now_ns < self._first_ns:  # mostly so, and asked after every batch of every bus
+            awaited_ns = _before(self._first_ns, now_ns)
+        else:
+            awaited_ns, all_known = self._next_awaited(now_ns)
+            known &= all_known
+        self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
+
+    def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
+        """When to fetch for the sake of what is expected, and whether that is all that may come. What is late
+        may come at any time."""
+        awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
+        for times in tuple(self._expected.values()):
+            for t_ns in times:
+                if now_ns < t_ns + _LATE_NS:
+                    awaited_ns = min(awaited_ns, _before(t_ns, now_ns))
+                    break
+            else:
+                all_known &= bool(times) and now_ns > times[-1] + _GIVEN_UP_NS
+        return awaited_ns, all_known
 
     @property
     def failed(self) -> bool:
@@ -211,15 +222,24 @@ class Receiver:
                 while self._joining:
                     intakes[self._joining.popleft()] = None
                 poll = _poll_of(intakes)
-            if not sum(intake.fetch(0.0) for intake in intakes):
-                poll.poll(_POLL_S * 1e3)
-                continue
-            if any(intake.failed for intake in intakes):
+            now_ns = time.monotonic_ns()
+            fetched = [intake for intake in intakes if intake.due_ns <= now_ns + _SHORT_NS]
+            if not _fetch(fetched):
+                fetched = list(intakes)
+                if not _fetch(fetched):
+                    poll.poll(_POLL_S * 1e3)
+                    for intake in intakes:
+                        intake.due_ns = 0
+                    continue
+            if any(intake.failed for intake in fetched):
                 intakes = {intake: None for intake in intakes if not intake.failed}
                 poll = _poll_of(intakes)
             self._tell()
             now_ns = time.monotonic_ns()
-            time.sleep(min([intake.pause_s(now_ns) for intake in intakes], default=GATHER_S))
+            for intake in fetched:
+                intake.gather(now_ns)
+            due_ns = min([intake.due_ns for intake in intakes], default=now_ns + GATHER_NS)
+            time.sleep(max(0, due_ns - now_ns) * 1e-9)
 
     def _receive_alone(self, intake: Intake) -> None:
         while not (self._stop.is_set() or intake.failed):
@@ -230,6 +250,25 @@ class Receiver:
     def _tell(self) -> None:
         if self._news.empty():  # once is enough
             self._news.put(None)
+
+
+def _fetch(intakes: Iterable[Intake]) -> bool:
+    """Whether there is anything new to take from any of them."""
+    return sum(intake.fetch(0.0) for intake in intakes) > 0  # of each, whatever another has
+
+
+def _together(now_ns: int, pause_ns: int) -> int:
+    """The end of a pause of about ``pause_ns``, from half of it to one and a half: the same instant for all
+    buses, so that one waking does for all."""
+    return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
+
+
+def _before(t_ns: int, now_ns: int) -> int:
+    """When to fetch for the sake of what is expected at ``t_ns``."""
+    due_ns = t_ns + _LAG_NS
+    if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
+        due_ns -= _BEFORE_NS
+    return max(now_ns + _SHORT_NS, due_ns)
 
 
 def _poll_of(intakes: Iterable[Intake]) -> select.poll:

@@ -431,10 +431,12 @@ class ScanAssembler:
         self._held = frames
 
     def _decode(self) -> tuple[Codes, NDArray[np.bool_]]:
+        known = [frame for frame in self._held if frame is not None]
         blank = bytes(self._chunk_bytes)
-        payload = b"".join([frame or blank for frame in self._held])
+        whole = len(known) == self._n
+        payload = b"".join(known if whole else [frame or blank for frame in self._held])
         codes = unpack_scan(payload, self._profile)
-        if None in self._held:
+        if not whole:
             unknown = np.array([frame is None for frame in self._held])
             codes[unknown[chunk_of_code(self._profile)]] = MISSING
         valid = codes <= self._steps

@@ -322,7 +322,7 @@ def test_codes_are_solved_as_the_resistances_that_they_stand_for(
     seed: int, bits: int, gained: bool, rough: bool
 ) -> None:
     """The decoder of the wire format is the other way: a stream of codes, some of them none, by both, to the
-    last bit. Near a fold the last bit is worth asking for: there it moves a wire by up to 1 % of its deviation.
+    last bit. Near a fold that is worth asking for: there one bit moves a wire by up to 1 % of its deviation.
     """
     rng = np.random.default_rng(seed)
     layout = sk.PatchLayout.preset("staggered", upper_wires=4, upper_electrodes=4, lower_electrodes=4)

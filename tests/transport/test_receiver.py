@@ -14,7 +14,7 @@ from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Intake, Receiver
 from skinnode.transport.datagram import DatagramPort, datagram, free_channel
-from skinnode.transport.receiver import GATHER_S, LONG_S
+from skinnode.transport.receiver import GATHER_NS, LONG_NS
 
 
 @pytest.fixture(autouse=True)
@@ -256,41 +256,76 @@ def test_frames_that_wait_are_not_yet_seen(any_bus: BusConfig) -> None:
             assert ids(intake.take()) == [1] or seen_ns < sent_ns
 
 
+def pause_ns(intake: Intake, now_ns: int) -> int:
+    intake.gather(now_ns)
+    return intake.due_ns - now_ns
+
+
+def is_about(pause: int, usual: int) -> bool:
+    """Buses wake together, so a pause may be half as long again, or half as long."""
+    return 0.5 * usual <= pause <= 1.5 * usual
+
+
+NOW_NS = 5_000_000_000
+
+
 def test_what_is_expected_does_not_wait_for_more_frames() -> None:
     intake = Intake(Script(0))
-    now_ns = 5_000_000_000
-    assert intake.pause_s(now_ns) == GATHER_S
-    intake.expect("thumb", now_ns + 1_000_000)
-    intake.expect("index", now_ns + 900_000)
-    assert 0.9e-3 < intake.pause_s(now_ns) < 1e-3  # until the first of them
-    assert intake.pause_s(now_ns + 1_200_000) < 0.3e-3  # overdue
-    assert intake.pause_s(now_ns + 5_000_000) == GATHER_S  # it does not come any more
-    intake.expect("thumb", now_ns + 50_000_000)
-    assert intake.pause_s(now_ns + 49_000_000) < GATHER_S
+    assert is_about(pause_ns(intake, NOW_NS), GATHER_NS)  # nothing is known
+    intake.expect("thumb", (NOW_NS + 600_000,))
+    intake.expect("index", (NOW_NS + 500_000,))
+    assert 500_000 < pause_ns(intake, NOW_NS) < 600_000  # until the first of them
+    assert pause_ns(intake, NOW_NS + 700_000) < 400_000  # overdue
+    intake.expect("thumb", (NOW_NS + 50_000_000,))
+    intake.expect("index", (NOW_NS + 50_000_000,))
+    assert 600_000 < pause_ns(intake, NOW_NS + 49_400_000) < 700_000
+
+
+def test_one_that_may_come_at_two_times_is_looked_for_at_both() -> None:
+    intake = Intake(Script(0))
+    intake.expect("thumb", (NOW_NS, NOW_NS + 12_000_000))
+    assert 300_000 < pause_ns(intake, NOW_NS - 300_000) < 400_000
+    assert pause_ns(intake, NOW_NS + 100_000) < 400_000  # perhaps it is a little late
+    assert is_about(pause_ns(intake, NOW_NS + 1_000_000), LONG_NS)  # it is the other time
+    assert 300_000 < pause_ns(intake, NOW_NS + 11_700_000) < 400_000
+    assert is_about(pause_ns(intake, NOW_NS + 14_000_000), GATHER_NS)  # neither
+    intake.expect("thumb", ())
+    assert is_about(pause_ns(intake, NOW_NS + 14_000_000), GATHER_NS)
 
 
 def test_the_pause_is_long_while_it_is_known_what_comes_and_nobody_has_asked_anything() -> None:
     """An answer may come at any time, so it is looked for as often as if nothing were known."""
     intake = Intake(Script(0))
-    now_ns = 5_000_000_000
-    intake.expect("thumb", now_ns + 50_000_000)
-    assert intake.pause_s(now_ns + 10_000_000) == LONG_S > GATHER_S
-    intake.asked(now_ns + 10_000_000)
-    assert intake.pause_s(now_ns + 11_000_000) == GATHER_S
-    assert intake.pause_s(now_ns + 35_000_000) == LONG_S  # it has come, or does not
+    intake.expect("thumb", (NOW_NS + 50_000_000,))
+    assert is_about(pause_ns(intake, NOW_NS + 10_000_000), LONG_NS)
+    assert LONG_NS > 3 * GATHER_NS
+    intake.asked(NOW_NS + 10_000_000)
+    assert is_about(pause_ns(intake, NOW_NS + 11_000_000), GATHER_NS)
+    assert is_about(pause_ns(intake, NOW_NS + 35_000_000), LONG_NS)  # it has come, or does not
     # once a little before it is due, then when it is
-    assert intake.pause_s(now_ns + 47_000_000) == pytest.approx(2.25e-3, rel=0.05)
-    assert intake.pause_s(now_ns + 49_200_000) == pytest.approx(0.8e-3, rel=0.1)
-    assert intake.pause_s(now_ns + 80_000_000) == GATHER_S  # the stream has ended
+    assert 2_000_000 < pause_ns(intake, NOW_NS + 47_000_000) < 2_500_000
+    assert 700_000 < pause_ns(intake, NOW_NS + 49_300_000) < 800_000
 
 
 def test_while_something_is_late_the_pause_is_not_long() -> None:
     """It may come at any time; a stream that has ended is given up after a while."""
     intake = Intake(Script(0))
-    now_ns = 5_000_000_000
-    intake.expect("late", now_ns)
-    intake.expect("index", now_ns + 1_000_000_000)
-    assert intake.pause_s(now_ns + 2_000_000) < 0.3e-3
-    assert intake.pause_s(now_ns + 10_000_000) == GATHER_S
-    assert intake.pause_s(now_ns + 190_000_000) == GATHER_S
-    assert intake.pause_s(now_ns + 210_000_000) == LONG_S
+    intake.expect("late", (NOW_NS,))
+    intake.expect("index", (NOW_NS + 1_000_000_000,))
+    assert pause_ns(intake, NOW_NS + 300_000) < 400_000
+    assert is_about(pause_ns(intake, NOW_NS + 10_000_000), GATHER_NS)
+    assert is_about(pause_ns(intake, NOW_NS + 190_000_000), GATHER_NS)
+    assert is_about(pause_ns(intake, NOW_NS + 210_000_000), LONG_NS)
+
+
+def test_buses_are_fetched_from_together() -> None:
+    """However far apart the frames came that the pauses began with: one waking does for all."""
+    one, other = Intake(Script(0)), Intake(Script(0))
+    for intake in (one, other):
+        intake.expect("thumb", (NOW_NS + 500_000_000,))
+    ends = set()
+    for after_ns in range(0, LONG_NS, LONG_NS // 10):
+        one.gather(NOW_NS + after_ns)
+        other.gather(NOW_NS + after_ns + LONG_NS // 20)
+        ends |= {one.due_ns, other.due_ns}
+    assert len(ends) <= 3

@@ -26,7 +26,7 @@ def replay(
     """Decode and solve a recording of `skinnode record`, with the same results as live, bit by bit.
 
     Exit status 1 if the recording is damaged, was not ended or lacks frames, or if what it holds lacks some:
-    a scan torn or missed, a chunk or a summary lost. 2 if it cannot be read at all.
+    a scan torn or missed, a chunk or a summary lost; or has error frames. 2 if it cannot be read at all.
     """
     from skinnode.record import replay as play
     from skinnode.signals import until_told
@@ -90,9 +90,11 @@ def _patches(run: Replay, deepest_m: dict[str, float]) -> dict[str, dict[str, An
 
 
 def _faults(run: Replay) -> list[str]:
-    from skinnode.host.accounting import losses_of_lane
+    from skinnode.host.accounting import losses_of_bus, losses_of_lane
 
     found = run.flaws
+    for name, bus in run.bus_stats().items():
+        found += [f"{name}: {text}" for text in losses_of_bus(bus).values()]
     for name, lane in run.patch_stats().items():
         found += [f"{name}: {text}" for text in losses_of_lane(lane).values()]
         if not lane.offered and not run.stopped:

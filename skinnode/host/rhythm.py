@@ -32,7 +32,10 @@ class Rhythm:
         ends.appendleft(t_ns)
         due: list[int] = []
         for end_ns in ends:  # the newest first: it knows best
-            due_ns = end_ns + (round((t_ns - end_ns) / period_ns) + 1) * period_ns
-            if all(abs(due_ns - other_ns) >= APART_NS for other_ns in due):
+            due_ns = end_ns + ((t_ns - end_ns + period_ns // 2) // period_ns + 1) * period_ns
+            for other_ns in due:
+                if -APART_NS < due_ns - other_ns < APART_NS:
+                    break
+            else:
                 due.append(due_ns)
         return tuple(sorted(due)) if len(due) <= MOST else ()

@@ -94,6 +94,17 @@ def test_a_whole_recording_has_no_fault(recorded: Recorded, play: Play) -> None:
         assert facts["deepest_m"] == max(0.0, *(-np.array(field)[..., 2].min() for field in fields))
 
 
+def test_an_error_frame_is_a_fault_as_it_is_live(recorded: Recorded, play: Play) -> None:
+    whole = play(recorded.log, recorded.journal)
+    middle = len(recorded.log) // 2
+    before, channel = recorded.log[middle].split()[:2]
+    journal = [*recorded.journal[:-1], recorded.journal[-1] | {"frames": len(recorded.log) + 1}]
+    error = b" ".join((before, channel, b"20000004#0010000000000000", b"R")) + b"\n"
+    played = play([*recorded.log[:middle], error, *recorded.log[middle:]], journal)
+    assert (played.status, played.faults) == (1, ["can0: 1 error frame"])
+    assert played.fields == whole.fields
+
+
 def test_a_log_cut_between_two_lines_lacks_frames(recorded: Recorded, play: Play) -> None:
     kept, frames = len(recorded.log) // 2, len(recorded.log)
     played = play(recorded.log[:kept], recorded.journal)

@@ -69,6 +69,7 @@ def receive_patch(
     monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject, watch)
 
     rhythm = Rhythm(period_ns)
+    dealer.expect(patch.name, ())  # until its first scan
 
     def on_scan(scan: Scan) -> None:
         monitor.on_scan(scan.t_last_ns)

@@ -28,7 +28,7 @@ GATHER_NS: Final = 1_500_000
 frames a second would spend more on waking than on frames. The first frame after a silence does not wait for
 it, and each has the time of its arrival."""
 
-LONG_NS: Final = 6_000_000
+LONG_NS: Final = 5_000_000
 """The same while it is known when everything that somebody waits for should come."""
 
 _BEFORE_NS: Final = 800_000

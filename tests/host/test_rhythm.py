@@ -9,7 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skinnode.host.dealer import Dealer
+from skinnode.host.publish import Publisher
+from skinnode.host.reception import receive_patch
 from skinnode.host.rhythm import APART_NS, MOST, REMEMBERED, Rhythm
+from skinnode.host.sync import Ticks
+from skinnode.host.workers import Inline
+from skinnode.model.config import HandConfig
 
 PERIOD_NS = 50_000_000
 
@@ -64,3 +70,19 @@ def test_what_is_expected_lies_ahead_and_apart(steps_ns: list[int], period_ns: i
 def test_after_a_hiccup_the_next_is_looked_for_in_time(hiccup_ns: int) -> None:
     due = after([n * PERIOD_NS for n in range(10)] + [10 * PERIOD_NS + hiccup_ns])
     assert due == (11 * PERIOD_NS, 11 * PERIOD_NS + hiccup_ns)
+
+
+class Told(Dealer):
+    """Remembers what was expected."""
+
+    def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
+        self.expected = {**getattr(self, "expected", {}), what: times_ns}
+
+
+def test_the_first_scan_of_a_patch_may_come_at_any_time(hand: HandConfig) -> None:
+    """However well those of the others are known."""
+    dealer = Told(hand.buses[0], {}, 0)
+    names = [patch.name for patch in hand.patches]
+    for patch in hand.patches:
+        receive_patch(patch, hand, dealer, Ticks(240), Inline(), Publisher(tuple(names)))
+    assert dealer.expected == dict.fromkeys(names, ())

@@ -119,8 +119,6 @@ class Dealer:
 
     def deal(self, batch: Sequence[Frame]) -> None:
         """Frames to their handlers, in order."""
-        if not batch:
-            return
         for listener in self._listeners:
             listener(batch)
         handlers, takes_fd = self._handlers, self.config.fd

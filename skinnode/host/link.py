@@ -169,10 +169,15 @@ class BusLink(Dealer):
         batch = self.intake.take()
         while self._jobs:
             self._jobs.popleft()()
-        self.deal(batch)
         # While frames wait, here or in the interface, time is that of the newest one dealt out: nothing is
         # late because we are.
-        self.t_dealt_ns = batch[-1].t_ns if batch else max(seen_ns, self.t_dealt_ns)
+        if batch:
+            self.deal(batch)
+            self.t_dealt_ns = batch[-1].t_ns
+        elif seen_ns > self.t_dealt_ns:
+            self.t_dealt_ns = seen_ns
+        else:
+            return False
         self.poll(self.t_dealt_ns)
         return bool(batch)
 

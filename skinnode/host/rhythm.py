@@ -1,8 +1,9 @@
 """When the next scan of a patch should have come, so that the receiver may let other frames gather before.
 
-On a full bus that is not always a period after the last: where the frames of several nodes meet, and now and
-then a heartbeat, a scan may end at one of two instants of its period, by turns. So each instant at which one
-of the last scans ended is looked at."""
+On a full bus that is not always a period after the last: where heartbeats go before the frames of several
+nodes, a scan may end at one of two instants of its period, by turns (12 ms apart at every fifth scan in
+``bench pipeline``, and not without heartbeats). So each instant at which one of the last ended is looked at.
+"""
 
 from __future__ import annotations
 

@@ -29,7 +29,8 @@ frames a second would spend more on waking than on frames. The first frame after
 it, and each has the time of its arrival."""
 
 LONG_NS: Final = 5_000_000
-"""The same while it is known when everything that somebody waits for should come."""
+"""The same while it is known when everything that somebody waits for should come. What comes unforeseen all
+the same may wait for it, and half as long again."""
 
 _BEFORE_NS: Final = 800_000
 """What has gathered is fetched once more that long before something is expected, so that little is left to do
@@ -66,7 +67,7 @@ class Intake:
         self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the receiver's
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
-        self._first_ns = 0  # the earliest of them all
+        self._first_ns = 0  # the earliest of them all; 0 while one of them may come at any time
         self._asked_ns = 0
 
     @property
@@ -164,8 +165,8 @@ class Intake:
 class Receiver:
     """Receives on the ports of ``intakes`` from construction until :meth:`close`.
 
-    Ports that read batches share one thread: for as many buses it wakes as often as for one. Any other may
-    block in python-can, and has a thread of its own. What goes wrong on a port ends its receiving alone.
+    Ports that read batches share one thread, which wakes for several buses at once where it can. Any other
+    may block in python-can, and has a thread of its own. What goes wrong on a port ends its receiving alone.
     """
 
     def __init__(self, intakes: Sequence[Intake]) -> None:

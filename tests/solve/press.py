@@ -1,10 +1,13 @@
-"""An independent truth: the surface of a half-space under a rigid sphere, Hertz's closed form, with shear."""
+"""Independent truths: displacements, among them Hertz's closed form with shear, and what a patch measures."""
 
 from __future__ import annotations
 
 import numpy as np
 
 import skinnode as sk
+
+LO, HI, STEPS = 0.25, 1.25, 2**16 - 4
+"""Range of R/R0 and number of steps of the 16-bit code on the wire."""
 
 
 def hertz_press(
@@ -39,3 +42,26 @@ def frame_ohm(layout: sk.PatchLayout, displacement_m: np.ndarray) -> np.ndarray:
             paths = 1 / np.linalg.norm(upper[:, None] - lower[None], axis=-1)
             frame[u, k] = layout.resistivity_ohm_per_m / paths.sum()
     return frame
+
+
+def quantised(frame: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    code = np.rint((frame / rest - LO) / (HI - LO) * STEPS)
+    return (LO + code * (HI - LO) / STEPS) * rest
+
+
+def dent(layout: sk.PatchLayout, depth: float, *, shear: float = 0.3, centre=(4.0, 5.0)) -> np.ndarray:
+    """A press felt by the electrodes within 1.2 pitches of (upper wire, electrode) ``centre`` alone."""
+    wire, electrode = np.indices(layout.upper_m.shape[:2])
+    ratio = ((wire - centre[0]) ** 2 + (electrode - centre[1]) ** 2) / 1.2**2
+    sunk = depth * layout.height_m * np.clip(1 - ratio, 0, None) ** 2
+    return np.stack([shear * sunk, -0.5 * shear * sunk, -sunk], axis=-1)
+
+
+def noisy(layout: sk.PatchLayout, moved: np.ndarray, rng: np.random.Generator, sigma: float = 1e-5):
+    return frame_ohm(layout, moved) * (1 + sigma * rng.normal(size=layout.shape))
+
+
+def relative_slopes(layout: sk.PatchLayout, moved: np.ndarray) -> np.ndarray:
+    """∂(R F)/∂x at R = 1/F, (U, K, 3N), 1/m."""
+    potential = layout.resistivity_ohm_per_m / frame_ohm(layout, moved)
+    return sk.jacobian(layout, layout.upper_m + moved).reshape(*layout.shape, -1) / potential[:, :, None]

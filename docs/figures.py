@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from skinnode.cli._bench_accuracy import best_of_each
+from skinnode.bench.accuracy import best_of_each
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "solver.md"
@@ -244,7 +244,7 @@ def stability(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['seeds']} seeds a row, {len(figures['rows'])} rows, "
         f"**{figures['wrong']} wires CONVERGED and wrong**. Wrong is an error above 5 deviations and beyond "
-        "chance, with exact data above 1e-6 (`cli/_verdict.py`). Below: the rows with noise, by `auto` (by "
+        "chance, with exact data above 1e-6 (`bench/verdict.py`). Below: the rows with noise, by `auto` (by "
         "the method it chose); errors and deviations in the deepest frame, median over the seeds."
     ]
     rows = [

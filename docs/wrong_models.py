@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.special import j0, j1
 
 import skinnode as sk
-from skinnode.cli import _bench_stability as stability
-from skinnode.cli._cases import MODEL_ERROR, all_cases
+from skinnode.bench import stability
+from skinnode.bench.cases import MODEL_ERROR, all_cases
 from skinnode.model.elastic import Rubber
 
 Float = NDArray[np.float64]

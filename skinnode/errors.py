@@ -21,6 +21,8 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from skinnode.words import counted
+
 
 class SkinError(Exception):
     """Root of all errors of this project. ``str(error)`` is one line fit for a technician."""
@@ -38,18 +40,23 @@ class Shown(str):
 NOTHING: Final = Shown("nothing")
 """What was got where a key is missing."""
 
+_MOST_SHOWN: Final = 240
+
 
 class ConfigError(SkinError, ValueError):
     """A configuration value that cannot be used.
 
-    ``key`` is the dotted path of the value (``patches[1].node_id``), ``got`` what was found there and
-    ``allowed`` a phrase that says what would have been accepted.
+    ``key`` is the dotted path of the value (``patches[1].node_id``), ``got`` the value found there
+    (None: nothing) and ``allowed`` a phrase that says what is accepted.
     """
 
     def __init__(self, key: str, got: object, allowed: str, *, where: str = "") -> None:
         self.key, self.got, self.allowed, self.where = key, got, allowed, where
         prefix = f"{where}: " if where else ""
-        super().__init__(f"{prefix}{key}: got {got!r}, allowed: {allowed}")
+        shown = repr(NOTHING if got is None else got)
+        if len(shown) > _MOST_SHOWN:  # an overlong path, or an array
+            shown = f"{shown[: _MOST_SHOWN - 40]}…{shown[-40:]}"
+        super().__init__(f"{prefix}{key}: got {shown}, allowed: {allowed}")
 
 
 class ProfileError(ConfigError):
@@ -96,7 +103,9 @@ class CodecError(SkinError, ValueError):
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed
         shown = self.data.hex(" ") or "nothing"
-        super().__init__(f"COB-ID 0x{cob_id:03X}: got {len(self.data)} bytes ({shown}), allowed: {allowed}")
+        super().__init__(
+            f"COB-ID 0x{cob_id:03X}: got {counted(len(self.data), 'byte')} ({shown}), allowed: {allowed}"
+        )
 
 
 class SolveError(SkinError):

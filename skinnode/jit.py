@@ -1,9 +1,9 @@
 """The one way kernels are compiled here: ``@njit`` with a cache that cannot go stale.
 
-Numba's file cache notices an edit to the file of a function, not to the functions it calls in other
-files. So the cache lives in a folder named after a digest of every file that holds kernels: an edit to any
-of them compiles all of them anew. The folder is below ``$SKINNODE_CACHE_DIR``, else the user's cache
-folder, else the system's temporary folder, whichever can be written first; with none, nothing is cached.
+A file cache notices an edit to the file of a function, not to the functions it calls in other files. So the
+cache (:mod:`skinnode.kernel_cache`) is in a folder named after a digest of every file that holds kernels: an
+edit to any of them recompiles all of them. The folder is below ``$SKINNODE_CACHE_DIR``, the user's cache
+folder or the system's temporary folder, the first that is writable; if none is, nothing is cached.
 
 ``error_model="numpy"`` because a division by zero must become inf (a status), not an exception; ``nogil``
 because patches are solved side by side on a thread pool. ``fastmath`` stays off: results must not depend on
@@ -21,11 +21,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite
 import numba as typed_numba
+
+from skinnode.kernel_cache import SUFFIX, KernelCache
 
 numba: Any = typed_numba  # its type hints leave out configuration and options that are used here
 _F = TypeVar("_F", bound=Callable[..., Any])
-_KERNEL_FILES = ("jit.py", "simd.py", "bundle.py", "model/kernels.py", "solve/*.py", "wire/stuffing.py")
+_KERNEL_FILES = (
+    "jit.py",
+    "kernel_cache.py",
+    "simd.py",
+    "bundle.py",
+    "model/kernels.py",
+    "solve/*.py",
+    "wire/stuffing.py",
+)
 
 
 def _writable(folder: Path) -> bool:
@@ -43,7 +54,7 @@ def _writable(folder: Path) -> bool:
 def cache_dir() -> Path | None:
     """Folder of the compiled kernels, or None where no folder can be written."""
     package = Path(__file__).parent
-    digest = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for pattern in _KERNEL_FILES:
         for file in sorted(package.glob(pattern)):
             digest.update(file.read_bytes())
@@ -52,14 +63,15 @@ def cache_dir() -> Path | None:
     candidates = [Path(root) / "skinnode" / leaf for root in roots if root]
     with contextlib.suppress(RuntimeError):  # there may be no home directory
         candidates.append(Path.home() / ".cache" / "skinnode" / leaf)
-    candidates.append(Path(tempfile.gettempdir()) / f"skinnode-{os.getuid()}" / leaf)
+    with contextlib.suppress(OSError):  # no temporary folder either
+        candidates.append(Path(tempfile.gettempdir()) / f"skinnode-{os.getuid()}" / leaf)
     return next((folder for folder in candidates if _writable(folder)), None)
 
 
 def is_cold(kernel: str = "solve_patch") -> bool:
     """True when ``kernel`` still has to be compiled, so that a command can say why it takes its time."""
     folder = cache_dir()
-    return folder is None or not any(folder.rglob(f"*.{kernel}-*.nbc"))
+    return folder is None or not any(folder.glob(f"*.{kernel}-*{SUFFIX}"))
 
 
 _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
@@ -93,12 +105,8 @@ def njit_brief(function: _F) -> _F:
 
 
 def _kept(function: _F, *, nogil: bool) -> _F:
+    compiled: _F = numba.njit(no_cfunc_wrapper=True, **_OPTIONS | {"nogil": nogil})(function)
     folder = cache_dir()
-    kept = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder or "")
-    try:  # the cache folder is read here, at decoration; other users of numba keep theirs
-        options = _OPTIONS | {"nogil": nogil, "cache": folder is not None}
-        compiled: _F = numba.njit(no_cfunc_wrapper=True, **options)(function)
-    finally:
-        numba.config.CACHE_DIR = kept
+    if folder is not None and compiled is not function:  # with NUMBA_DISABLE_JIT it is not compiled
+        compiled._cache = KernelCache(function, folder)  # type: ignore[attr-defined]
     return compiled

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import os
 import random
+import signal
 import socket
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
@@ -29,6 +30,10 @@ AGAIN = pytest.StashKey[list[str]]()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--frames", type=int, default=FUZZ_FRAMES, help="frames that a node is fuzzed with")
+    parser.addoption(
+        "--all-injections", action="store_true", help="an exception at every call of a thread of the host"
+    )
+    parser.addoption("--injection-seed", type=int, default=0, help="which calls, where not every one")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -66,6 +71,15 @@ def fuzz_frames(request: pytest.FixtureRequest) -> int:
     """How many frames a node is fuzzed with."""
     frames: int = request.config.getoption("--frames")
     return frames
+
+
+@pytest.fixture(autouse=True)
+def _signal_handlers() -> Iterator[None]:
+    """A command that is run in this process leaves its own in place: its process ends with it."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
 
 
 def has_vcan() -> bool:

@@ -1,120 +1,23 @@
-"""``vcan-sim hand.toml``: the patches of a hand as CANopen nodes, pressed by a simulated indenter.
-
-Exit status: 0 ended as asked (Ctrl-C, SIGTERM or ``--seconds``), 2 could not run or could not go on.
-"""
+"""Entry point of ``vcan-sim``. The command is in :mod:`vcan_sim.command`, exit statuses in
+:mod:`skinnode.cli._ending`."""
 
 from __future__ import annotations
 
-import dataclasses
-import sys
-import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
-import typer
-
-from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._usage import Seconds, run
-from skinnode.words import counted
-
-if TYPE_CHECKING:
-    from skinnode.node import NmtState
-    from vcan_sim.fleet import Fleet, NodeReport
-
-app = typer.Typer(
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+from skinnode.cli._ending import main_of
 
 
-@app.command()
-def simulate(
-    hand: Annotated[Path, typer.Argument(help="The hand to simulate.", metavar="HAND.toml")],
-    interface: OtherInterface = None,
-    channel: OtherChannel = None,
-    seconds: Seconds = None,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="What goes wrong with every node, such as lost=0.01,restart_every_s=5,frozen, or with one, "
-            "such as palm:open_upper=3. May be given again.",
-            metavar="[PATCH:]FAULTS",
-        ),
-    ] = None,
-) -> None:
-    """Simulate the patches of a hand: CANopen nodes on a bus, a sphere pressing and sliding over each.
-
-    Bring them up with `skinnode host` and the same file in another terminal.
-    """
-    from skinnode.model.config import load_hand
-    from skinnode.pauses import short_pauses
-    from skinnode.signals import until_told
-    from vcan_sim.faults import faults_of
-    from vcan_sim.fleet import Fleet
-
-    plan = load_hand(hand).on(interface, channel)
-    simulated = Fleet(plan)
-    for patch, faults in faults_of(fault or [], [each.name for each in plan.patches]).items():
-        simulated.inject(faults, patch)
-    with until_told() as ended, simulated as fleet, short_pauses():
-        where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
-        _say(f"{counted(len(plan.patches), 'patch', 'patches')} of {plan.name!r} on {where}; Ctrl-C ends")
-        _watch(fleet, ended.wait, seconds)
-        injected = _injected(fleet) if fault else []
-    _say(_summary(fleet.report()))
-    for line in injected:
-        _say(line)
+def main(argv: Sequence[str] | None = None) -> NoReturn:
+    """Run ``vcan-sim`` with these arguments, or those of the process."""
+    main_of("vcan_sim.command", argv)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run(app, argv)
+def __getattr__(name: str) -> Any:
+    """Provide ``app``, the typer application."""
+    if name == "app":
+        from vcan_sim.command import app
 
-
-def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:
-    """A line a second until ``wait`` says that it is over, time is up, or a node thread has failed."""
-    start = time.monotonic()
-    before = fleet.report()
-    for second in range(1, sys.maxsize):
-        due = float(second) if seconds is None else min(second, seconds)
-        if wait(max(0.0, start + due - time.monotonic())) or fleet.failed:
-            return
-        now = fleet.report()
-        _say(_progress(due, before, now))
-        before = now
-        if seconds is not None and due >= seconds:
-            return
-
-
-def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
-    steps = list(zip(before, now, strict=True))
-    frames = sum(new.frames_sent - old.frames_sent for old, new in steps)
-    each = "  ".join(
-        f"{new.patch} {_words(new.nmt_state)} {new.scans_sent - old.scans_sent} scans" for old, new in steps
-    )
-    return f"{elapsed_s:6.1f} s  {each}  {frames} frames"
-
-
-def _words(state: NmtState) -> str:
-    return state.name.lower().replace("_", "-")
-
-
-def _summary(reports: Sequence[NodeReport]) -> str:
-    scans, frames = sum(r.scans_sent for r in reports), sum(r.frames_sent for r in reports)
-    sent, frames_in = counted(scans, "scan"), counted(frames, "frame")
-    return f"sent {sent} in {frames_in} from {counted(len(reports), 'node')}"
-
-
-def _injected(fleet: Fleet) -> list[str]:
-    """What went wrong, a line a patch."""
-    lines = []
-    for patch in fleet.patches:
-        counts = dataclasses.asdict(fleet.injected(patch))
-        told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        lines.append(f"{patch}: {told or 'nothing injected'}")
-    return lines
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)
+        return app
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,10 +12,33 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import ConfigError
+from vcan_sim.tally import Kind
 
-OF_CHUNKS: Final = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted")
-OF_SCANS: Final = ("torn", "summary_lost", "reset")
-_SHARES: Final = (*OF_CHUNKS, *OF_SCANS, "sync_lost", "long")
+OF_CHUNKS: Final = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted", "corrupted")
+OF_SCANS: Final = ("torn", "summary_lost", "reset", "displaced", "understated", "unchecked")
+LOST_OUT: Final = {
+    Kind.SDO_RESPONSE: "sdo_response_lost",
+    Kind.LSS_RESPONSE: "lss_response_lost",
+    Kind.HEARTBEAT: "heartbeat_lost",
+    Kind.BOOT_UP: "boot_up_lost",
+    Kind.EMCY: "emcy_lost",
+}
+"""Faults that drop frames sent by the node, by kind."""
+LOST_IN: Final = {
+    Kind.NMT: "nmt_lost",
+    Kind.SDO_REQUEST: "sdo_request_lost",
+    Kind.LSS_REQUEST: "lss_request_lost",
+    Kind.COMMAND: "command_lost",
+    Kind.HEARTBEAT: "heartbeat_lost",
+}
+"""Faults that drop frames meant for the node, by kind. For SYNC there is ``sync_lost``."""
+_SHARES: Final = (
+    *OF_CHUNKS,
+    *OF_SCANS,
+    "sync_lost",
+    "long",
+    *dict.fromkeys((*LOST_OUT.values(), *LOST_IN.values())),
+)
 OF_WIRES: Final = (
     "open_upper",
     "open_lower",
@@ -54,6 +77,8 @@ class Faults:
     """Has the counter of another scan."""
     miscounted_by: int | None = None
     """How far that counter is off, modulo 256; None: any other value."""
+    corrupted: float = 0.0
+    """A code differs from what the node packed, without a trace in length or counters."""
 
     # --- shares of the scans
     torn: float = 0.0
@@ -61,12 +86,39 @@ class Faults:
     summary_lost: float = 0.0
     reset: float = 0.0
     """The node resets itself after half of the chunks, as a watchdog does."""
+    displaced: float = 0.0
+    """A chunk has the counter of the next scan, whose own chunk of that index is lost."""
+    understated: float = 0.0
+    """A chunk is lost, and the summary says that only changed chunks were sent, one fewer; its check, if
+    any, is correct for that summary. Scans of changed chunks only lose the chunk."""
+    unchecked: float = 0.0
+    """The summary carries no check: it has the form of revision 1.0."""
+    struck: int | None = None
+    """Index of the chunk that ``displaced`` and ``understated`` strike; None: any."""
 
     # --- shares of other frames
     sync_lost: float = 0.0
     """The node does not hear it."""
     long: float = 0.0
     """A heartbeat has a byte too many; chunks and summaries fill their frame already."""
+    nmt_lost: float = 0.0
+    """The node does not hear an NMT command."""
+    sdo_request_lost: float = 0.0
+    """The node does not hear an SDO request."""
+    sdo_response_lost: float = 0.0
+    """An SDO response does not arrive."""
+    lss_request_lost: float = 0.0
+    """The node does not hear an LSS request."""
+    lss_response_lost: float = 0.0
+    """An LSS response does not arrive."""
+    heartbeat_lost: float = 0.0
+    """A heartbeat does not arrive, whether sent by the node or meant for it."""
+    boot_up_lost: float = 0.0
+    """A boot-up message does not arrive."""
+    emcy_lost: float = 0.0
+    """An emergency message does not arrive; this includes *error reset*."""
+    command_lost: float = 0.0
+    """The node does not hear a command PDO, such as a tare."""
 
     # --- as long as they are set
     silent: bool = False
@@ -133,8 +185,22 @@ class Injected:
     summary_lost: int = 0
     reset: int = 0
     """Resets in the middle of a scan."""
+    corrupted: int = 0
+    displaced: int = 0
+    """Scans of which a chunk moved into the next scan."""
+    understated: int = 0
+    unchecked: int = 0
     sync_lost: int = 0
     long: int = 0
+    nmt_lost: int = 0
+    sdo_request_lost: int = 0
+    sdo_response_lost: int = 0
+    lss_request_lost: int = 0
+    lss_response_lost: int = 0
+    heartbeat_lost: int = 0
+    boot_up_lost: int = 0
+    emcy_lost: int = 0
+    command_lost: int = 0
     silenced: int = 0
     """Frames that were not let out while silent, unplugged or cut off by a reset."""
     unheard: int = 0
@@ -151,7 +217,7 @@ class Injected:
     emergencies: int = 0
     babbled: int = 0
     scans_spoilt: int = 0
-    """Scans of which chunks are missing: lost, late, short, remote or miscounted ones."""
+    """Scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
     """Data frames on the COB-IDs of chunks and summaries that were put on the bus."""
 
@@ -198,5 +264,5 @@ def _value(kind: type, text: str) -> int | float | bool:
 
 def _allowed(kind: type) -> str:
     if kind is bool:
-        return "nothing, true or false"
+        return "no value, or true or false"
     return "a number" if kind is float else "an integer"

@@ -6,20 +6,36 @@ clock, except for what happens so often a second.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 import numpy as np
 
+from skinnode.errors import BusError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, PatchNode
+from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.nmt import NmtCommand
 from skinnode.node.source import ResistanceSource
 from skinnode.wire import indices as od
+from skinnode.wire.codec import (
+    SummaryFlag,
+    chunk_indexer,
+    pack_checked_summary,
+    pack_summary,
+    unpack_scan_with_check,
+    unpack_summary,
+)
 from skinnode.wire.profile import PatchProfile
-from vcan_sim.faults import NO_FAULTS, OF_CHUNKS, OF_SCANS, OF_WIRES, Faults, Injected
+from vcan_sim.faults import LOST_IN, LOST_OUT, NO_FAULTS, OF_CHUNKS, OF_SCANS, OF_WIRES, Faults, Injected
+from vcan_sim.tally import Kind, Tally, kind_of
 
 BABBLE_COB_ID: Final = 0x3F0
+SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
+"""Pacing of a simulated node. It may be away for half a SYNC period of the reference hand and still finish
+its scan in time, because a busy machine is not part of the simulation. Four nodes then send bursts of up to
+270 frames, which fit the default receive buffer of a socket."""
+
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F, error register: generic and manufacturer's."""
 _MOST_AT_ONCE: Final = 32
@@ -56,7 +72,7 @@ class FaultyNode(PatchNode):
         faults: Faults = NO_FAULTS,
     ) -> None:
         self.faults = faults
-        self.injected = Injected()
+        self.injected, self.tally = Injected(), Tally()
         self._emit, self._on_sent = emit, on_sent
         self._source = source
         self._reading: Float | None = None
@@ -68,11 +84,17 @@ class FaultyNode(PatchNode):
         self._fate = ""  # of this scan: one of OF_SCANS
         self._spoilt = False
         self._counter_instead: int | None = None  # of a scan that follows a torn one
+        self._index_of = chunk_indexer(profile)
+        self._packed: list[bytes] = []  # chunks of this scan, as the node packed them
+        self._struck = -1  # index of the chunk of this scan that a fault of scans strikes
+        self._lost_next = -1  # index of the chunk that the next scan loses
         self._swapped: tuple[int, bytes] | None = None
         self._late: list[tuple[int, bytes]] = []  # with the counter they had
         self._to_reset = self._unplugged = self._stormed = False
         self._due_ns = dict.fromkeys(("restart", "emcy", "babble"), 0)
-        super().__init__(node_id, layout, self, send=self._out, serial=serial, profile=profile)
+        super().__init__(
+            node_id, layout, self, send=self._out, serial=serial, profile=profile, pacing=SIMULATED
+        )
 
     # --- the analogue port
 
@@ -107,15 +129,29 @@ class FaultyNode(PatchNode):
     # --- what drives it
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
+        kind = kind_of(can_id, data, remote)
+        self.tally.heard[kind] += 1
         if self.faults.deaf or self._unplugged:
             self.injected.unheard += 1
+            self.tally.unheard[kind] += 1
             return
-        second_half_to_come = self._fate == "torn"  # soon, or nobody takes it for the same scan
-        if can_id == od.SYNC_COB_ID and not second_half_to_come and self._draw(self.faults.sync_lost):
+        next_is_needed = self._fate in ("torn", "displaced")  # soon enough to be taken for that scan
+        if can_id == od.SYNC_COB_ID and not next_is_needed and self._draw(self.faults.sync_lost):
             self.injected.sync_lost += self.nmt_state is NmtState.OPERATIONAL
+            self.tally.lost_in[kind] += 1
             return
+        if self._concerns(kind, can_id) and self._loses(LOST_IN.get(kind)):
+            self.tally.lost_in[kind] += 1
+            return
+        self.tally.taken[kind] += 1
         super().on_frame(can_id, data, t_ns, remote)
         self._reset_if_due(t_ns)
+
+    def _concerns(self, kind: Kind, can_id: int) -> bool:
+        """Return whether the frame is meant for the node: requests to its neighbours are not its loss."""
+        if kind is Kind.SDO_REQUEST:
+            return can_id == od.sdo_request_cob_id(self.node_id)
+        return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
         if self.faults.unplugged != self._unplugged:
@@ -144,6 +180,7 @@ class FaultyNode(PatchNode):
         self._unplugged = self.faults.unplugged
         if self._unplugged:
             self.power_off()
+            self.tally.silenced[Kind.CHUNK] += self.tally.waiting.pop(Kind.CHUNK, 0)
             self._swapped, self._late = None, []
             self.injected.unplugged += 1
         else:
@@ -173,7 +210,7 @@ class FaultyNode(PatchNode):
                 self._due_ns[name] = t_ns + period_ns
         if self._stormed and not self.faults.emcy_per_s:
             self._stormed = False
-            self._pass(od.emcy_cob_id(self.node_id), bytes(8))
+            self._pass_or_lose(od.emcy_cob_id(self.node_id), bytes(8))
 
     def _do(self, name: str, t_ns: int) -> None:
         match name:
@@ -182,22 +219,35 @@ class FaultyNode(PatchNode):
                 self._reset_node(t_ns)
             case "emcy":
                 self._stormed = True
-                self.injected.emergencies += self._pass(od.emcy_cob_id(self.node_id), _STORM)
+                self.injected.emergencies += self._pass_or_lose(od.emcy_cob_id(self.node_id), _STORM)
             case _:
-                self.injected.babbled += self._pass(BABBLE_COB_ID, bytes(8))
+                self.injected.babbled += self._pass_or_lose(BABBLE_COB_ID, bytes(8))
 
     # --- what the node sends
 
     def _out(self, can_id: int, data: bytes) -> None:
         if can_id == self._chunk_id:
+            self.tally.handed[Kind.CHUNK] += 1
             self._out_chunk(data)
         elif can_id == self._summary_id:
+            self.tally.handed[Kind.SUMMARY] += 1
             self._out_summary(data)
-        elif can_id == od.heartbeat_cob_id(self.node_id) and self._draw(self.faults.long):
-            self.injected.long += self._pass(can_id, data + b"\0")
         else:
-            self._pass(can_id, self._imposture(can_id, data))
+            self._pass_or_lose(can_id, self._imposture(can_id, data))
         self._on_sent(can_id)
+
+    def _pass_or_lose(self, can_id: int, data: bytes) -> bool:
+        """Send or drop a frame other than a PDO. Returns whether it was sent."""
+        kind = kind_of(can_id, data)
+        self.tally.handed[kind] += 1
+        if not self._is_cut_off and self._loses(LOST_OUT.get(kind)):
+            self.tally.lost[kind] += 1
+            return False
+        if can_id == od.heartbeat_cob_id(self.node_id) and self._draw(self.faults.long):
+            too_long = self._pass(can_id, data + b"\0")
+            self.injected.long += too_long
+            return too_long
+        return self._pass(can_id, data)
 
     def _out_chunk(self, data: bytes) -> None:
         counter = data[_CHUNK_COUNTER_BYTE]
@@ -210,23 +260,39 @@ class FaultyNode(PatchNode):
             injected.reset += 1
         if self._fate == "torn":
             if self._chunks > self._half:
+                self.tally.lost[Kind.CHUNK] += 1
                 return
             injected.torn_chunks += 1
+        index = self._index_of(data) if max(self._struck, self._lost_next) >= 0 else -2
+        if self._fate == "understated":
+            self._packed.append(data)
+        if index == self._lost_next or (index == self._struck and self._fate == "understated"):
+            self.tally.lost[Kind.CHUNK] += 1
+            return
+        if index == self._struck and self._fate == "displaced":
+            data = _with_byte(data, _CHUNK_COUNTER_BYTE, self._following(self._counter))
+            injected.displaced += 1
         if self._counter_instead is not None:
             data = _with_byte(data, _CHUNK_COUNTER_BYTE, self._counter_instead)
         fault = self._draw_one(OF_CHUNKS) if self._fate == "" and self._counter_instead is None else ""
         swapped, self._swapped = self._swapped, None
-        self._send_chunk(fault, data)
-        if swapped is not None:
-            self._pass(*swapped)
+        try:
+            self._send_chunk(fault, data)
+        finally:  # a bus may refuse one frame and accept the other
+            self._release([] if swapped is None else [swapped])
 
     def _begin_scan(self, counter: int) -> None:
         was_torn, before = self._fate == "torn", self._counter
+        self._lost_next = self._struck if self._fate == "displaced" else -1
         self._counter, self._chunks, self._spoilt = counter, 0, False
         self._counter_instead = before if was_torn else None
-        self._fate = "" if was_torn else self._draw_one(OF_SCANS)
+        self._fate = "" if was_torn or self._lost_next >= 0 else self._draw_one(OF_SCANS)
         if self._fate == "torn":
             self.injected.torn += 1
+        self._packed, self._struck = [], -1
+        if self._fate in ("displaced", "understated"):
+            struck = self.faults.struck
+            self._struck = int(self._random.integers(self.profile.n_chunks)) if struck is None else struck
 
     def _send_chunk(self, fault: str, data: bytes) -> None:
         injected, chunk_id = self.injected, self._chunk_id
@@ -234,22 +300,34 @@ class FaultyNode(PatchNode):
             case "":
                 self._pass(chunk_id, data)
                 return
+            case "lost":
+                self.tally.lost[Kind.CHUNK] += 1
             case "duplicated":
                 self._pass(chunk_id, data)
+                self.tally.handed[Kind.CHUNK] += 1
                 self._pass(chunk_id, data)
             case "reordered":
                 self._swapped = chunk_id, data
+                self.tally.waiting[Kind.CHUNK] += 1
             case "late":
                 self._late.append((data[_CHUNK_COUNTER_BYTE], data))
+                self.tally.waiting[Kind.CHUNK] += 1
             case "short":
                 if not self._pass(chunk_id, data[:-1], spoilt=True):
                     return  # silenced, whatever it would have been
             case "remote":
+                self.tally.lost[Kind.CHUNK] += 1
+                self.tally.handed[Kind.REMOTE] += 1
                 if not self._pass(chunk_id, b"", remote=True):
                     return
             case "miscounted":
                 wrong = _with_byte(data, _CHUNK_COUNTER_BYTE, self._another(self._counter))
                 if not self._pass(chunk_id, wrong, spoilt=True):
+                    return
+            case "corrupted":
+                at = self.profile.chunk_head_bytes
+                wrong = _with_byte(data, at, data[at] ^ int(self._random.integers(1, 256)))
+                if not self._pass(chunk_id, wrong):
                     return
         setattr(injected, fault, getattr(injected, fault) + 1)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
@@ -260,18 +338,45 @@ class FaultyNode(PatchNode):
         off = self.faults.miscounted_by
         return (counter + (int(self._random.integers(1, 256)) if off is None else off)) & 0xFF
 
+    def _following(self, counter: int) -> int:
+        """Return the counter of the scan after the one with ``counter``."""
+        overflow = self._store.integer(od.SYNC_COUNTER_OVERFLOW)
+        return counter % overflow + 1 if overflow else counter + 1 & 0xFF
+
     def _out_summary(self, data: bytes) -> None:
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
         swapped, self._swapped = self._swapped, None
-        if self._fate == "summary_lost":
-            self.injected.summary_lost += 1
-        elif self._fate != "torn":
-            if self._counter_instead is not None:
-                data = _with_byte(data, _SUMMARY_COUNTER_BYTE, self._counter_instead)
-            self._pass(self._summary_id, data)
-        if swapped is not None:
-            self._pass(*swapped)
+        try:
+            if self._fate == "summary_lost":
+                self.injected.summary_lost += 1
+                self.tally.lost[Kind.SUMMARY] += 1
+            elif self._fate == "torn":
+                self.tally.lost[Kind.SUMMARY] += 1
+            else:
+                if self._counter_instead is not None:
+                    data = _with_byte(data, _SUMMARY_COUNTER_BYTE, self._counter_instead)
+                if self._fate in ("understated", "unchecked"):
+                    data = self._untrue(data)
+                self._pass(self._summary_id, data)
+        finally:
+            self._release([] if swapped is None else [swapped])
+
+    def _untrue(self, data: bytes) -> bytes:
+        """Return the summary of a scan that is understated or unchecked."""
+        said = unpack_summary(data)
+        if self._fate == "unchecked":
+            self.injected.unchecked += 1
+            return pack_summary(
+                said.scan, said.flags & ~SummaryFlag.CHECKED, said.chunks, said.device_time_us
+            )
+        if len(self._packed) != self.profile.n_chunks:  # the codes of the other chunks are unknown here
+            return data
+        self.injected.understated += 1
+        head = said.scan, said.flags | SummaryFlag.CHANGED_ONLY, said.chunks - 1, said.device_time_us
+        if said.check is None:
+            return pack_summary(*head)
+        return pack_checked_summary(*head, unpack_scan_with_check(b"".join(self._packed), self.profile)[1])
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
         """The answer to an upload, changed where it is about who the node is."""
@@ -294,23 +399,53 @@ class FaultyNode(PatchNode):
     def _pass(self, can_id: int, data: bytes, *, remote: bool = False, spoilt: bool = False) -> bool:
         """On the bus with it; unless it is ``spoilt``, so that nobody takes it for one of its scan, also with
         whatever waited for the next scan. Whether it was let out."""
-        if self.faults.silent or self._unplugged or self._to_reset:
+        kind = kind_of(can_id, data, remote)
+        if self._is_cut_off:
             self.injected.silenced += 1
+            self.tally.silenced[kind] += 1
             return False
-        self._emit(can_id, data, remote=remote)
+        try:
+            self._emit(can_id, data, remote=remote)
+        except BusError:
+            self.tally.refused[kind] += 1
+            raise
+        self.tally.emitted[kind] += 1
         is_pdo = can_id in (self._chunk_id, self._summary_id) and not remote
         self.injected.pdos += is_pdo
         if self._late and is_pdo and not spoilt:
             due = [chunk for counter, chunk in self._late if counter != self._counter]
             self._late = [(counter, chunk) for counter, chunk in self._late if counter == self._counter]
-            for chunk in due:
-                self._pass(self._chunk_id, chunk)
+            self._release([(self._chunk_id, chunk) for chunk in due])
         return True
+
+    def _release(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Send chunks that waited, even after the bus has refused one. Raises BusError if it refused any."""
+        failure: BusError | None = None
+        for can_id, data in frames:
+            self.tally.waiting[Kind.CHUNK] -= 1
+            try:
+                self._pass(can_id, data)
+            except BusError as error:
+                failure = error
+        if failure is not None:
+            raise failure
+
+    @property
+    def _is_cut_off(self) -> bool:
+        """Return whether no frame of the node reaches the bus."""
+        return self.faults.silent or self._unplugged or self._to_reset
 
     # --- chance
 
     def _draw(self, share: float) -> bool:
         return share > 0.0 and bool(self._random.random() < share)
+
+    def _loses(self, fault: str | None) -> bool:
+        """Return whether the fault of its kind drops a frame, and count the drop."""
+        if fault is None or not self._draw(getattr(self.faults, fault)):
+            return False
+        setattr(self.injected, fault, getattr(self.injected, fault) + 1)
+        return True
 
     def _draw_one(self, names: tuple[str, ...]) -> str:
         """One of the faults by its share, or none."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
 from skinnode.errors import BusError, ConfigError
-from skinnode.model.config import HandConfig, PatchConfig
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner
 from skinnode.node.source import ResistanceSource
@@ -20,6 +21,7 @@ from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
+from vcan_sim.tally import Kind, Tally, kind_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +37,9 @@ class NodeReport:
     scans_sent: int
     """Scans sent to their end."""
     overruns: int
-    """Scans skipped because two others were still to be sent, as on a machine too busy for its nodes."""
+    """Scans skipped because two earlier scans were still to be sent."""
+    slow_overruns: int
+    """Scans skipped because this machine was too busy."""
 
 
 class Fleet:
@@ -51,6 +55,7 @@ class Fleet:
             several buses.
         faults: what goes wrong with every node from the start; see also :meth:`inject`.
         wire_up: what the converter of each patch is connected to, in place of the simulated patch itself.
+        unchecked: names of patches of revision 1.0, whose summaries carry no check.
     """
 
     def __init__(
@@ -61,12 +66,15 @@ class Fleet:
         channel: str | None = None,
         faults: Faults = NO_FAULTS,
         wire_up: Callable[[SimulatedPatch], ResistanceSource] = lambda patch: patch,
+        unchecked: Collection[str] = (),
     ) -> None:
         self.hand = hand.on(interface, channel)
         self._stations = {
             patch.name: _Station(
                 patch,
-                PatchProfile.from_config(patch, hand.bus(patch.bus)),
+                replace(
+                    PatchProfile.from_config(patch, hand.bus(patch.bus)), checked=patch.name not in unchecked
+                ),
                 SimulatedPatch(Scene(patch.layout.build(), hand.simulation, number)),
                 wire_up,
                 faults,
@@ -122,6 +130,14 @@ class Fleet:
         """A count of what went wrong so far with the node of a patch."""
         return self._stations[patch].injected()
 
+    def tally(self, patch: str) -> Tally:
+        """Return the live counts of the frames of a patch's node, by kind."""
+        return self._stations[patch].tally()
+
+    def passed(self, bus: str) -> Passed:
+        """Return the counts of the frames that passed through the nodes' interface to a bus, by kind."""
+        return self._ports[bus].passed
+
     def bus_off(self, bus: str, *, off: bool) -> None:
         """Take the controller of the nodes on a bus off it, or back. The nodes end if it lasts longer than
         :data:`skinnode.node.runner.PATIENCE_S`."""
@@ -148,22 +164,46 @@ class Fleet:
         self.stop()
 
 
+class Passed:
+    """Frames that passed through an interface, by kind; data and remote frames only."""
+
+    def __init__(self) -> None:
+        self.sent: Counter[Kind] = Counter()
+        self.heard: Counter[Kind] = Counter()
+        """Frames given to the nodes."""
+        self.missed: Counter[Kind] = Counter()
+        """Frames on the bus while the controller was off it."""
+
+
 class FaultyPort(CanPort):
     """A port whose controller may go off the bus: then it sends nothing, and what passes is lost to it."""
 
     off = False
 
+    def __init__(self, config: BusConfig) -> None:
+        super().__init__(config)
+        self.passed = Passed()
+
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         if self.off:
             raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
         super().send(can_id, data, remote=remote)
+        self.passed.sent[kind_of(can_id, data, remote)] += 1
 
     def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
         if self.off:
-            while super().recv_batch(0.0):
-                pass
+            while frames := super().recv_batch(0.0):
+                _count(frames, self.passed.missed)
             raise BusError(f"{self.config.name}: bus-off, nothing received")
-        return super().recv_batch(timeout_s, most)
+        frames = super().recv_batch(timeout_s, most)
+        _count(frames, self.passed.heard)
+        return frames
+
+
+def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
+    for frame in frames:
+        if not (frame.error or frame.extended):
+            counter[kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
 
 class _Station:
@@ -211,6 +251,9 @@ class _Station:
     def injected(self) -> Injected:
         return Injected() if self._node is None else replace(self._node.injected)
 
+    def tally(self) -> Tally:
+        return Tally() if self._node is None else self._node.tally
+
     def _on_sent(self, can_id: int) -> None:
         self._frames += 1
         self._pdos += can_id in self._pdo_ids
@@ -221,5 +264,5 @@ class _Station:
     def report(self) -> NodeReport:
         node, config = self._node, self._config
         state = NmtState.INITIALISING if node is None else node.nmt_state
-        scans, overruns = (0, 0) if node is None else (node.scans_sent, node.overruns)
-        return NodeReport(config.name, config.node_id, state, self._frames, self._pdos, scans, overruns)
+        counts = (0, 0, 0) if node is None else (node.scans_sent, node.overruns, node.slow_overruns)
+        return NodeReport(config.name, config.node_id, state, self._frames, self._pdos, *counts)

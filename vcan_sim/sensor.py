@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.wire.codec import TIME_STEP_US
 from vcan_sim.scene import Scene
 
 REMEMBERED_READINGS: Final = 4096
@@ -70,12 +71,13 @@ class SimulatedPatch:
         return read if self.fault is None else self.fault(read, t_ns)
 
     def read_ns(self, device_time_us: int) -> int:
-        """When the reading was taken that a node calls ``device_time_us``, the u32 of its scan summary.
+        """When the reading was taken that a node calls ``device_time_us``: its lower 32 bits, of which a
+        checked summary carries all but the lowest 6.
 
         Raises LookupError if there was none, or if it is too long ago.
         """
         try:
-            return self._read_ns[device_time_us]
+            return self._read_ns[(device_time_us & 0xFFFF_FFFF) // TIME_STEP_US]
         except KeyError:
             raise LookupError(
                 f"no reading at device time {device_time_us} µs among the last {len(self._read_ns)}"
@@ -88,7 +90,7 @@ class SimulatedPatch:
         return self.scene.upper_m((t_ns - self._origin_ns) * 1e-9)
 
     def _remember(self, t_ns: int) -> None:
-        self._read_ns[t_ns // 1000 & 0xFFFF_FFFF] = t_ns
+        self._read_ns[(t_ns // 1000 & 0xFFFF_FFFF) // TIME_STEP_US] = t_ns
         if len(self._read_ns) > REMEMBERED_READINGS:
             self._read_ns.popitem(last=False)
 

@@ -57,7 +57,10 @@ Fd = Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")]
 Hand = Annotated[
     Path | None, typer.Option(help="Take the bus from this hand; patches by name.", metavar="HAND.toml")
 ]
-Bus = Annotated[str | None, typer.Option(help="Which bus of the hand.", metavar="NAME")]
+Bus = Annotated[
+    str | None,
+    typer.Option(help="Bus of the hand; default: the bus of the patch, or all buses.", metavar="NAME"),
+]
 Node = Annotated[
     str,
     typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE", autocompletion=nodes),
@@ -71,22 +74,26 @@ class Place(NamedTuple):
     bus: BusConfig
     hand: HandConfig | None
 
+    @property
+    def patches(self) -> tuple[PatchConfig, ...]:
+        """Patches of the hand on this bus."""
+        return () if self.hand is None else self.hand.patches_on(self.bus.name)
+
     def patch_name(self, node_id: int) -> str:
         """What the hand calls the patch at that node-ID; empty for none."""
-        if self.hand is None:
-            return ""
-        return next((p.name for p in self.hand.patches_on(self.bus.name) if p.node_id == node_id), "")
+        return next((patch.name for patch in self.patches if patch.node_id == node_id), "")
 
 
-def find_bus(
+def find_buses(
     interface: str | None,
     channel: str | None,
     bitrate: int | None,
     fd: bool,
     hand: Path | None,
     bus: str | None,
-) -> Place:
-    """The bus that the options name. Raises ConfigError."""
+) -> list[Place]:
+    """Return the bus that the options name, or every bus of the hand without ``--bus``. Raises ConfigError if
+    the options are not valid."""
     from pydantic import ValidationError
 
     from skinnode.errors import ConfigError
@@ -94,7 +101,7 @@ def find_bus(
 
     if hand is None:
         if bus is not None:
-            raise ConfigError("--bus", bus, "nothing without a hand file")
+            raise ConfigError("--bus", bus, "only with a hand file")
         try:
             config = BusConfig(
                 name="can0" if channel is None else channel[:64],
@@ -109,42 +116,94 @@ def find_bus(
                 raise ConfigError("--bitrate", wrong["input"], "a bit rate from 10000 to 1000000") from None
             option = "--interface" if wrong["loc"][0] == "interface" else "--channel"
             raise ConfigError(option, wrong["input"], "a name of printable characters") from None
-        return Place(config, None)
-    plan = find_hand(hand, interface, channel, bitrate, fd)
-    names = [item.name for item in plan.buses]
-    if bus is None and len(names) > 1:
-        raise ConfigError("--bus", bus, f"one of {', '.join(names)}")
-    if bus is not None and bus not in names:
-        raise ConfigError("--bus", bus, f"one of {', '.join(names)}")
-    return Place(plan.bus(bus or names[0]), plan)
+        return [Place(config, None)]
+    plan = _of_one_bus(_load(hand, bitrate, fd), bus).on(interface, channel)
+    return [Place(item, plan) for item in plan.buses]
 
 
-def find_hand(
-    hand: Path, interface: str | None, channel: str | None, bitrate: int | None, fd: bool
-) -> HandConfig:
-    """The hand of that file, on another interface or channel if they are given. Raises ConfigError."""
+def find_bus(
+    interface: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    fd: bool,
+    hand: Path | None,
+    bus: str | None,
+) -> Place:
+    """Return the one bus that the options name. Raises ConfigError if the options are not valid or leave
+    several buses."""
+    from skinnode.errors import NOTHING, ConfigError
+
+    places = find_buses(interface, channel, bitrate, fd, hand, bus)
+    if len(places) > 1:
+        raise ConfigError("--bus", NOTHING, f"one of {', '.join(place.bus.name for place in places)}")
+    return places[0]
+
+
+def _of_one_bus(plan: HandConfig, bus: str | None) -> HandConfig:
+    """Return the hand reduced to ``bus``, or the whole hand if ``bus`` is None. Raises ConfigError if the
+    hand has no such bus."""
     from skinnode.errors import ConfigError
+
+    if bus is None:
+        return plan
+    names = [item.name for item in plan.buses]
+    if bus not in names:
+        raise ConfigError("--bus", bus, f"one of {', '.join(names)}")
+    return plan.model_copy(update={"buses": (plan.bus(bus),), "patches": plan.patches_on(bus)})
+
+
+def _load(hand: Path, bitrate: int | None, fd: bool) -> HandConfig:
+    """Load a hand file. Raises ConfigError if the file is not valid, or if an option is given that cannot be
+    combined with a hand file."""
+    from skinnode.errors import ConfigError, Shown
     from skinnode.model.config import load_hand
 
-    for option, value in (("--bitrate", bitrate), ("--fd", fd or None)):
+    for option, value in (("--bitrate", bitrate), ("--fd", Shown("yes") if fd else None)):
         if value is not None:
-            raise ConfigError(option, value, "nothing beside a hand file, which says it")
-    return load_hand(hand).on(interface, channel)
+            raise ConfigError(option, value, "only without a hand file, which sets it")
+    return load_hand(hand)
 
 
-def find_node(node: str, place: Place) -> int:
-    """The node-ID that an argument means. Raises ConfigError."""
+def find_node(
+    node: str,
+    interface: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    fd: bool,
+    hand: Path | None,
+    bus: str | None,
+) -> tuple[Place, int]:
+    """Return the bus and the node-ID of NODE; a patch of the hand is looked up on all its buses.
+
+    Raises ConfigError if no patch has the name, or if the node-ID could be on several buses.
+    """
+    places = find_buses(interface, channel, bitrate, fd, hand, bus)
+    return node_among(node, places, "NODE")
+
+
+def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
+    """Return the one of ``places`` that has the node that ``node``, the value of ``key``, names, and its
+    node-ID. Raises ConfigError as :func:`find_node` does."""
     from skinnode.errors import ConfigError
 
+    named = [(place, patch) for place in places for patch in place.patches]
     try:
         node_id = int(node, 0)
     except ValueError:
-        patches = () if place.hand is None else place.hand.patches_on(place.bus.name)
-        for patch in patches:
+        for place, patch in named:
             if patch.name == node:
-                return patch.node_id
-        named = f", or {', '.join(patch.name for patch in patches)}" if patches else ""
-        raise ConfigError("NODE", node, f"a node-ID from 1 to 127{named}") from None
+                return place, patch.node_id
+        known = f", or {', '.join(patch.name for _, patch in named)}" if named else ""
+        raise ConfigError(key, node, f"a node-ID from 1 to 127{known}") from None
     if not 1 <= node_id <= 127:
-        raise ConfigError("NODE", node_id, "a node-ID from 1 to 127")
-    return node_id
+        raise ConfigError(key, node_id, "a node-ID from 1 to 127")
+    if len(places) == 1:
+        return places[0], node_id
+    found = [(place, patch) for place, patch in named if patch.node_id == node_id]
+    if len(found) == 1:
+        return found[0][0], node_id
+    buses = " or ".join(f"--bus {place.bus.name}" for place in places)
+    if not found:
+        raise ConfigError(key, node_id, f"a node-ID of the hand, or any with {buses}")
+    which = " and ".join(f"{patch.name} on {place.bus.name}" for place, patch in found)
+    raise ConfigError(key, node_id, f"a node-ID of one bus: it is {which}; name the patch, or add {buses}")

@@ -2,31 +2,75 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import typer
 
+from skinnode.printable import printable_lines
+
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.padding import Padding
     from rich.table import Table
+
+UNBOUNDED: Final = 10_000
+"""Columns of a pipe, more than any line of skinnode has."""
 
 
 def print_json(value: Any) -> None:
     """One JSON document."""
-    from skinnode.cli._files import plain
+    from skinnode.json_values import plain
 
     typer.echo(json.dumps(plain(value), indent=2))
 
 
-def console() -> Console:
-    """For tables. Not in a terminal: as wide as a terminal of 80 columns would have them."""
-    from rich.console import Console
+def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
+    """Return the console of all commands. It prints square brackets and colons literally, because names
+    contain them; styles are arguments of ``print``. The console is as wide as the terminal. Output to a pipe
+    or file is not wrapped, so that programs read whole lines, unless ``COLUMNS`` sets a width."""
+    return _console_type()(
+        stderr=stderr,
+        soft_wrap=soft_wrap,
+        highlight=False,
+        markup=False,
+        emoji=False,
+        width=_width(sys.stderr if stderr else sys.stdout),
+    )
 
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=80)
+
+def _width(stream: TextIO) -> int | None:
+    if stream.isatty() or os.environ.get("COLUMNS", "").isdigit():
+        return None  # rich asks the terminal
+    return UNBOUNDED
+
+
+@functools.cache
+def _console_type() -> type[Console]:
+    """Define the console class. Imports rich only when something is drawn, so that ``--help`` responds at
+    once."""
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+    from rich.text import Text
+
+    class PrintableConsole(Console):
+        """Console that escapes control characters; see :mod:`skinnode.printable`."""
+
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(printable_lines(text), **options)
+
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterator[Segment]:
+            for text, style, control in super().render(renderable, options):
+                yield Segment(text if control else printable_lines(text), style, control)
+
+    return PrintableConsole
 
 
 def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
@@ -40,13 +84,18 @@ def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
     return made
 
 
+def indented(text: str, columns: int = 10) -> Padding:
+    """Indent each line of ``text`` by ``columns``."""
+    from rich.padding import Padding
+
+    return Padding(text, (0, 0, 0, columns), expand=False)
+
+
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
     """Tell what is being done, on one line of stderr that is gone in the end; nothing where nobody looks."""
     if quiet or not sys.stderr.isatty():
         yield lambda text: None
         return
-    from rich.console import Console
-
-    with Console(stderr=True).status("") as status:
+    with console(stderr=True).status("") as status:
         yield lambda text: status.update(text)

@@ -1,4 +1,4 @@
-"""What a user got wrong on the command line, as one line and status 2; and how every command ends."""
+"""Reports a mistake on the command line as one line and status 2."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
-from skinnode.errors import SkinError
+from skinnode.cli._ending import COULD_NOT_RUN, FINE, closed_pipe
+from skinnode.errors import ConfigError, SkinError
+from skinnode.printable import PrintableStream
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # of click, or of typer's own copy of it
 
@@ -30,25 +32,44 @@ Seconds = Annotated[
 ]
 
 
-def run(app: typer.Typer, argv: Sequence[str] | None = None) -> None:
-    """Run ``app`` and exit with its status: an error of ours or of an argument is one line on stderr and
+def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
+    """Run ``app`` and return its exit status. A SkinError or an invalid argument gives one line on stderr and
     status 2."""
+    sys.stdout, sys.stderr = _printable(sys.stdout), _printable(sys.stderr)
     try:
         status = app(args=argv, standalone_mode=False)
     except _UsageError as error:
-        if not _wants_help(error):
-            _end(usage_line(error))
-        sys.exit(2)
+        return COULD_NOT_RUN if _wants_help(error) else _refused(usage_line(error))
     except typer.Abort:
-        _end("stopped at the question; nothing was changed")
+        return _refused("not confirmed; nothing was changed")
+    except BrokenPipeError:
+        return closed_pipe()
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):  # typer has turned it into status 1
+            return closed_pipe()
+        raise
     except (SkinError, ValueError, OSError) as error:
-        _end(" ".join(str(error).split()))
-    sys.exit(status if isinstance(status, int) else 0)
+        return _refused(_line_of(error))
+    return status if isinstance(status, int) else FINE
 
 
-def _end(line: str) -> None:
+def _printable(stream: Any) -> Any:
+    """Return ``stream`` limited to printable text, with an escape for each character that its encoding
+    lacks."""
+    if hasattr(stream, "reconfigure"):
+        stream.reconfigure(errors="backslashreplace")
+    return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
+
+
+def _line_of(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return str(ConfigError(error.strerror, str(error.filename), "a file or folder that can be used"))
+    return " ".join(str(error).split())
+
+
+def _refused(line: str) -> int:
     print(f"error: {line}", file=sys.stderr)
-    sys.exit(2)
+    return COULD_NOT_RUN
 
 
 def _wants_help(error: Any) -> bool:
@@ -67,7 +88,7 @@ def usage_line(error: Any) -> str:
     param, kind = getattr(error, "param", None), type(error).__name__
     if kind == "NoSuchOption":
         perhaps = f" ({', '.join(error.possibilities)}?)" if error.possibilities else ""
-        message = f"got {error.option_name!r}, allowed: the options of --help{perhaps}"
+        message = f"got {error.option_name!r}, allowed: the options that --help lists{perhaps}"
     elif param is not None and kind == "MissingParameter":
         message = f"{_name(param)}: got nothing, allowed: {_values(param) or _meant(param)}"
     elif param is not None and kind == "BadParameter":

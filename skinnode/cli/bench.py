@@ -23,10 +23,10 @@ Rounds = Annotated[int, typer.Option(min=1, help="How often each candidate has i
 @app.command()
 def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
     """F + J and one step of each operator against NumPy; the dense kernels against LAPACK."""
-    from skinnode.cli import _bench_kernel
+    from skinnode.bench import kernel as bench
 
     _prepare(json, plot)
-    figures = _bench_kernel.run(rounds)
+    figures = bench.run(rounds)
     _print_machine(figures)
     typer.echo(f"{'':28}{'':22}{'µs':>10}{'ratio':>8}")
     for row in figures["rows"]:
@@ -37,7 +37,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
     )
     _write(json, figures)
     if plot is not None:
-        from skinnode.cli._plot_ratios import draw_kernel
+        from skinnode.bench.plots.ratios import draw_kernel
 
         draw_kernel(plot, figures)
 
@@ -45,10 +45,10 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
     """One wire to 1e-9 from a near start: ours, SciPy's and Ceres' solvers on the same compiled F and J."""
-    from skinnode.cli import _bench_solve
+    from skinnode.bench import solve as bench
 
     _prepare(json, plot)
-    figures = _bench_solve.run(rounds)
+    figures = bench.run(rounds)
     _print_machine(figures)
     typer.echo(f"{'':42}{'µs a wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
     for row in figures["rows"]:
@@ -59,7 +59,7 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
         typer.echo("Ceres is not installed: after sh install.sh bench it is measured too.")
     _write(json, figures)
     if plot is not None:
-        from skinnode.cli._plot_ratios import draw_solve
+        from skinnode.bench.plots.ratios import draw_solve
 
         draw_solve(plot, figures)
 
@@ -73,8 +73,8 @@ def stability(
 ) -> None:
     """Every hard case over many seeds: error, deviation, status, verdict. Exit 1 if any ends CONVERGED and
     wrong."""
-    from skinnode.cli import _bench_stability as bench
-    from skinnode.cli._verdict import named
+    from skinnode.bench import stability as bench
+    from skinnode.bench.verdict import named
 
     _prepare(json, plot)
     typer.echo(bench.HEAD)
@@ -88,7 +88,7 @@ def stability(
         typer.echo(f"  {named(row)}")
     _write(json, figures)
     if plot is not None:
-        from skinnode.cli._plot_stability import draw
+        from skinnode.bench.plots.stability import draw
 
         draw(plot, figures)
     if wrong:
@@ -104,7 +104,7 @@ def accuracy(
 ) -> None:
     """Error against time, noise and code width; coverage of the intervals; time a frame. Exit 1 if a line
     that must be reached is not; times, which are the machine's as well, fail nothing."""
-    from skinnode.cli import _bench_accuracy as bench
+    from skinnode.bench import accuracy as bench
 
     _prepare(json, plot)
     figures = bench.run(scenes, rounds)
@@ -112,7 +112,7 @@ def accuracy(
     bench.print_all(figures, typer.echo)
     _write(json, figures)
     if plot is not None:
-        from skinnode.cli._plot_accuracy import draw
+        from skinnode.bench.plots.accuracy import draw
 
         draw(plot, figures)
     if not all(row["reached"] or row["absolute"] for row in figures["must"]):
@@ -126,8 +126,8 @@ def path(
     experiments: Annotated[int, typer.Option(min=1, help="Random presses for each setting.")] = 10,
 ) -> None:
     """The paper's tables 2, 3 and 4 and figures 8 to 13, beside its printed values."""
-    from skinnode.cli import _bench_path as bench
-    from skinnode.cli._files import plain
+    from skinnode.bench import path as bench
+    from skinnode.json_values import plain
 
     _prepare(json, plot)
     figures = bench.run(experiments)
@@ -135,7 +135,7 @@ def path(
     bench.print_all(figures, typer.echo)
     _write(json, plain(figures))
     if plot is not None:
-        from skinnode.cli._plot_path import draw
+        from skinnode.bench.plots.path import draw
 
         draw(plot, figures)
 
@@ -152,7 +152,7 @@ def node(
 ) -> None:
     """A node's punctuality and cost: pacing of chunks, SYNC to first chunk, heartbeat on a full bus, µs a
     frame."""
-    from skinnode.cli import _bench_node as bench
+    from skinnode.bench import node as bench
 
     _prepare(json)
     figures = bench.run(seconds, rounds, interface, channel)
@@ -188,7 +188,7 @@ def pipeline(
 ) -> None:
     """Four full buses and sixteen patches through a host: losses, latency, CPU. Exit 1 if anything was lost
     or does not add up; times are said to be reached or not."""
-    from skinnode.cli import _bench_pipeline as bench
+    from skinnode.bench import pipeline as bench
 
     if interface not in ("udp", "socketcan"):
         raise ConfigError("--interface", interface, "udp or socketcan")
@@ -207,7 +207,7 @@ def pipeline(
     _print_must(figures["must"])
     _write(json, figures)
     if plot is not None:
-        from skinnode.cli._plot_pipeline import draw
+        from skinnode.bench.plots.pipeline import draw
 
         draw(plot, figures)
     lost = not all(row["reached"] for row in figures["must"] if not row["time"])
@@ -219,27 +219,47 @@ def pipeline(
 def soak(
     json: JsonFile = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="How long.")] = 10.0,
-    seed: Annotated[int, typer.Option(help="Of the faults: the same seed, the same rounds.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the faults: the same seed draws the same rounds.")] = 1,
+    own_cache: Annotated[
+        bool, typer.Option(hidden=True, help="Soak in this process, with the kernel cache as it is.")
+    ] = False,
 ) -> None:
-    """A simulated hand under random faults: no growth in memory, threads or file descriptors, all sums exact.
-    Exit 1 if not."""
-    from skinnode.cli import _bench_soak as bench
+    """Soak a simulated hand under random faults: frames of every kind dropped, a starved processor, a damaged
+    kernel cache at the start. The host must survive, every patch must recover, every sum must be exact, and
+    memory, threads and file descriptors must not grow. Exit 1 if not."""
+    from skinnode.bench import soak as bench
 
-    _prepare(json)
+    if not own_cache:
+        _prepare(json)
+        raise typer.Exit(_soak_on_damaged_cache(json, minutes, seed))
     figures = bench.run(minutes, seed, typer.echo)
-    typer.echo(
-        f"{figures['rounds']} rounds, {figures['frames']} frames, {figures['scans']} scans, "
-        f"{figures['fields']} fields, {figures['rejoins']} rejoins, "
-        f"slowest stream back after {figures['slowest_back_s']:.2f} s"
-    )
-    counts = ", ".join(f"{name} {count}" for name, count in figures["injected"].items() if count)
-    typer.echo(f"injected: {counts}")
-    for text in figures["discrepancies"]:
-        typer.echo(f"  {text}")
+    for line in bench.told(figures):
+        typer.echo(line)
     _print_must(figures["must"])
     _write(json, figures)
-    if not all(row["reached"] for row in figures["must"]):
+    if missed := [row["what"] for row in figures["must"] if not row["reached"]]:
+        typer.echo(f"The soak failed: {'; '.join(missed)}.")
         raise typer.Exit(1)
+
+
+def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
+    """Soak in a child process whose kernel cache is a damaged copy. Returns its exit status."""
+    import subprocess
+    import sys
+    import tempfile
+
+    from skinnode.bench import soak_cache as cache
+
+    with tempfile.TemporaryDirectory(prefix="skinnode-soak-") as folder:
+        cache.fill(Path(folder))
+        typer.echo("The soak starts with a damaged copy of the kernel cache:")
+        for line in cache.damage(Path(folder), seed):
+            typer.echo(f"  {line}")
+        command = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "bench", "soak"]
+        command += ["--minutes", str(minutes), "--seed", str(seed), "--own-cache"]
+        command += [] if json is None else ["--json", str(json)]
+        sys.stdout.flush()
+        return subprocess.run(command, env=cache.environment(Path(folder)), check=False).returncode
 
 
 def _print_must(must: list[dict[str, Any]]) -> None:
@@ -251,9 +271,9 @@ def _print_must(must: list[dict[str, Any]]) -> None:
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
     """Refuse what could not be written, before the work; say why the first run takes longer."""
-    from skinnode.cli._files import require_writable
-    from skinnode.cli._plot import require_matplotlib
     from skinnode.jit import is_cold
+    from skinnode.output_file import require_writable
+    from skinnode.plot_file import require_matplotlib
 
     if json is not None:
         require_writable("--json", json)
@@ -271,6 +291,6 @@ def _print_machine(figures: dict[str, Any]) -> None:
 
 def _write(path: Path | None, figures: dict[str, Any]) -> None:
     if path is not None:
-        from skinnode.cli._bench_timing import write_json
+        from skinnode.bench.timing import write_json
 
         write_json(path, figures)

@@ -10,7 +10,7 @@ import typer
 from skinnode.cli._bus import node_ids
 
 if TYPE_CHECKING:
-    from skinnode.conformance import Report
+    from skinnode.conformance import Eds, Report
 
 
 def conformance(
@@ -49,10 +49,10 @@ def conformance(
     Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
     """
     from skinnode.cli._bus import find_bus
-    from skinnode.cli._files import read_text, require_writable
-    from skinnode.conformance import connect, parse_eds, run_cases, select
+    from skinnode.conformance import connect, run_cases, select
     from skinnode.conformance.report import list_lines, result_line, summary_line
     from skinnode.errors import ConfigError
+    from skinnode.output_file import require_writable
     from skinnode.transport import CanPort
 
     cases = select(only.split(",") if only else ())
@@ -64,7 +64,7 @@ def conformance(
     for option, file in (("--junit", junit), ("--html", html), ("--json", json_file)):
         if file is not None:
             require_writable(option, file)
-    sheet = None if eds is None else parse_eds(read_text("--eds", eds), str(eds))
+    sheet = None if eds is None else _sheet(eds)
     bus = find_bus(interface, channel, bitrate, fd, None, None).bus
     with CanPort(bus) as port:
         dut = connect(port, node_id, sheet)
@@ -77,13 +77,19 @@ def conformance(
         raise typer.Exit(1)
 
 
+def _sheet(file: Path) -> Eds:
+    from skinnode.conformance import parse_eds_file
+
+    return parse_eds_file(file, "--eds")[0]
+
+
 def _write(report: Report, title: str, junit: Path | None, html: Path | None, json_file: Path | None) -> None:
     import datetime
     import json
 
-    from skinnode.cli._files import write_text
     from skinnode.conformance.html import as_html
     from skinnode.conformance.report import as_json, as_junit
+    from skinnode.output_file import write_text
 
     if junit is not None:
         write_text("--junit", junit, as_junit(report))

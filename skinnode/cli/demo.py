@@ -43,27 +43,28 @@ def demo(
     """
     import json
 
-    from rich.console import Console
-
-    from skinnode.cli import _demo, _plot
-    from skinnode.cli._files import require_writable, write_text
+    from skinnode.cli._console import console
+    from skinnode.demo import plot as demo_plot
+    from skinnode.demo import run as demo_run
+    from skinnode.output_file import require_writable, write_text
+    from skinnode.plot_file import require_matplotlib
 
     for option, file in (("--json", json_file), ("--plot", plot)):
         if file is not None:
             require_writable(option, file)
     if plot is not None:
-        _plot.require_matplotlib(plot)
-    console = Console(highlight=False)
-    run = _demo.play(demo_hand(patches, seed), seconds, console)
-    _demo.print_report(console, run.report)
+        require_matplotlib(plot)
+    out = console()
+    run = demo_run.play(demo_hand(patches, seed), seconds, out)
+    demo_run.print_report(out, run.report)
     if json_file is not None:
         write_text(
-            "--json", json_file, json.dumps(_demo.as_json(run.report), indent=2, allow_nan=False) + "\n"
+            "--json", json_file, json.dumps(demo_run.as_json(run.report), indent=2, allow_nan=False) + "\n"
         )
-        console.print(f"figures written to {json_file}")
+        out.print(f"figures written to {json_file}")
     if plot is not None:
-        _plot.draw_demo(plot, run.traces)
-        console.print(f"plot written to {plot}")
+        demo_plot.draw_demo(plot, run.traces)
+        out.print(f"plot written to {plot}")
     if run.report.faults:
         raise typer.Exit(1)
 

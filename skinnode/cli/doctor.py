@@ -10,11 +10,14 @@ import typer
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Interface, Json
 
 if TYPE_CHECKING:
-    from skinnode.doctor.facts import BusFacts, Finding
+    from skinnode.doctor.causes import Group
+    from skinnode.doctor.facts import BusFacts
 
 
 def doctor(
-    hand: Annotated[Path | None, typer.Argument(help="What should be there.", metavar="[HAND.toml]")] = None,
+    hand: Annotated[
+        Path | None, typer.Argument(help="Hand file to check the buses against.", metavar="[HAND.toml]")
+    ] = None,
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
@@ -22,7 +25,9 @@ def doctor(
     bus: Bus = None,
     active: Annotated[
         bool,
-        typer.Option("--active", help="Start nodes that do not run, and send SYNC where nobody does."),
+        typer.Option(
+            "--active", help="Start nodes that are not running, and send SYNC if no other node does."
+        ),
     ] = False,
     html: Annotated[
         Path | None, typer.Option(help="Write a report with plots, one file.", metavar="FILE")
@@ -36,45 +41,47 @@ def doctor(
     the skin alone meanwhile. Exit status 0 if nothing was found, 1 if something
     was, 2 if it could not run.
     """
-    from skinnode.cli._bus import find_bus, find_hand
+    from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
-    from skinnode.cli._files import require_writable, write_text
-    from skinnode.doctor.checks import diagnose
+    from skinnode.doctor.causes import grouped
     from skinnode.doctor.gather import gather
+    from skinnode.output_file import require_writable, write_text
 
     if html is not None:
-        from skinnode.cli._plot import require_matplotlib
+        from skinnode.plot_file import require_matplotlib
 
         require_writable("--html", html)
         require_matplotlib(Path("report.svg"))
-    if hand is None or bus is not None:
-        place = find_bus(interface, channel, bitrate, fd, hand, bus)
-        plan, buses = place.hand, [place.bus]
-    else:
-        plan = find_hand(hand, interface, channel, bitrate, fd)
-        buses = [item for item in plan.buses if plan.patches_on(item.name)]
+    places = find_buses(interface, channel, bitrate, fd, hand, bus)
+    plan, buses = places[0].hand, [place.bus for place in places if place.patches or len(places) == 1]
     with progress(as_json) as tell:
         facts = [gather(item, plan, active=active, progress=tell) for item in buses]
-    findings = [finding for known in facts for finding in diagnose(known)]
+    groups = grouped(facts)
     if html is not None:
         from skinnode.doctor.page import as_html
 
-        write_text("--html", html, as_html(facts, findings, plan.name if plan else facts[0].name))
+        write_text("--html", html, as_html(facts, groups, plan.name if plan else facts[0].name))
     if as_json:
-        print_json(_as_json(facts, findings))
+        print_json(_as_json(facts, groups))
     else:
-        _print(facts, findings)
-    if findings:
+        _print(facts, groups)
+    if groups:
         raise typer.Exit(1)
 
 
-def _as_json(facts: list[BusFacts], findings: list[Finding]) -> dict[str, object]:
+def _as_json(facts: list[BusFacts], groups: list[Group]) -> dict[str, object]:
     from dataclasses import asdict
 
-    from skinnode.doctor.checks import not_judged
+    from skinnode.doctor.checks import not_judged, others
 
     return {
-        "findings": [asdict(finding) for finding in findings],
+        "findings": [
+            {**asdict(finding), "cause": None if finding is group.cause else f"{cause.where}: {cause.what}"}
+            for group in groups
+            for cause in (group.cause,)
+            for finding in (cause, *group.consequences)
+        ],
+        "others": [line for known in facts for line in others(known)],
         "not_judged": [line for known in facts for line in not_judged(known)],
         "buses": [
             {
@@ -97,35 +104,53 @@ def _as_json(facts: list[BusFacts], findings: list[Finding]) -> dict[str, object
     }
 
 
-def _print(facts: list[BusFacts], findings: list[Finding]) -> None:
-    from rich.markup import escape
-    from rich.padding import Padding
+def _print(facts: list[BusFacts], groups: list[Group]) -> None:
+    from rich.text import Text
 
-    from skinnode.cli._console import console
-    from skinnode.doctor.checks import not_judged
+    from skinnode.cli._console import console, indented
+    from skinnode.doctor.causes import merged
+    from skinnode.doctor.checks import not_judged, others
     from skinnode.words import counted
 
     out = console()
     for known in facts:
         there = sum(patch.found is not None for patch in known.patches)
         scans = sum(patch.scans.scans for patch in known.patches if patch.scans is not None)
-        out.print(
-            f"[bold]{escape(known.name)}[/bold] ({escape(f'{known.interface} {known.channel}')}): {there} of "
-            f"{len(known.patches)} patches there, {counted(known.frames, 'frame')}, "
+        rest = (
+            f" ({known.interface} {known.channel}): "
+            + (f"{there} of {len(known.patches)} patches there, " if known.patches else "no patches, ")
+            + f"{counted(known.frames, 'frame')}, "
             f"{counted(scans, 'scan')} in {known.seconds:.1f} s, load {known.load:.0%}"
         )
+        out.print(Text.assemble((known.name, "bold"), rest))
+        for line in others(known):
+            out.print(line)
     colours = {"certain": "red", "likely": "yellow", "possible": "cyan"}
-    for finding in findings:
-        colour = colours[finding.sure]
-        what = escape(f"{finding.where}: {finding.what}")
-        out.print(f"\n[{colour}]{finding.sure:>8}[/{colour}]  [bold]{what}[/bold]")
-        out.print(Padding(escape(finding.evidence), (0, 0, 0, 10)))
-        out.print(Padding(f"→ {escape(finding.advice)}", (0, 0, 0, 10)))
+    for group in groups:
+        finding, colour = group.cause, colours[group.cause.sure]
+        said = f"{finding.where}: {finding.what}"
+        out.print(Text.assemble("\n", (f"{finding.sure:>8}", colour), "  ", (said, "bold")))
+        out.print(indented(finding.evidence))
+        out.print(indented(f"→ {finding.advice}"))
+        if group.consequences:
+            out.print(indented("probable consequences:"))
+        for below, places in merged(group.consequences):
+            out.print(indented(f"{', '.join(places)}: {below.what}", 12))
+            if len(places) == 1:
+                out.print(indented(below.evidence, 14))
     lines = [line for known in facts for line in not_judged(known)]
     if lines:
         out.print("\nnot judged:")
         for line in lines:
-            out.print(Padding(escape(line), (0, 0, 0, 10)))
-    out.print(
-        f"\n{counted(len(findings), 'finding')}" if findings else "\nnothing is wrong with what was looked at"
-    )
+            out.print(indented(line))
+    out.print(f"\n{_summary(groups)}")
+
+
+def _summary(groups: list[Group]) -> str:
+    from skinnode.words import counted
+
+    if not groups:
+        return "no fault found in what was checked"
+    below = sum(len(group.consequences) for group in groups)
+    causes = counted(len(groups), "finding")
+    return f"{causes}, and {counted(below, 'consequence')} of them" if below else causes

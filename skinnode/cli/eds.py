@@ -56,8 +56,8 @@ def eds(
     An EDS depends on nothing but the sizes, the code width and the bus. The files
     of the reference patches are in eds/.
     """
-    from skinnode.cli._files import require_writable, write_text
     from skinnode.errors import ConfigError
+    from skinnode.output_file import require_writable, write_text
     from skinnode.wire.profile import dcf_text, eds_text
 
     sizes = {
@@ -73,7 +73,7 @@ def eds(
         raise ConfigError("--node-id", None, "1 to 127, for --dcf")
     for option, value in (("--node-id", node_id), ("--bitrate", bitrate)):
         if value is not None and not dcf:
-            raise ConfigError(option, value, "nothing without --dcf: an EDS is of no node in particular")
+            raise ConfigError(option, value, "only with --dcf: an EDS does not describe a particular node")
     if output is not None:
         require_writable("--output", output)
     bitrate_bps = 1_000_000 if bitrate is None else bitrate
@@ -93,6 +93,6 @@ def _profile(sizes: dict[str, int], layout: str | None, code_bits: int, fd: bool
         rows, columns, upper, lower = (_DEFAULT_SIZES | sizes).values()
         return PatchProfile(rows, columns, upper, lower, code_bits, bus="fd" if fd else "classic")
     if sizes:
-        raise ConfigError(next(iter(sizes)), next(iter(sizes.values())), "nothing beside --layout")
+        raise ConfigError(next(iter(sizes)), next(iter(sizes.values())), "only without --layout")
     import_from_here()
     return PatchProfile.from_layout(find_layout(layout), code_bits, "fd" if fd else "classic")

@@ -33,12 +33,17 @@ def check(
     frame of `others` waits at worst. Nothing is opened.
     Exit status 1 if a bus needs more than its max_load, 2 if the file cannot be used.
     """
-    from skinnode.errors import BusLoadError
+    from skinnode.errors import BusLoadError, ConfigError
     from skinnode.host.hand_files import check_files
     from skinnode.model.config import load_hand
+    from skinnode.transport.port import allowed_interfaces, is_interface
     from skinnode.wire.plan import plan_of, require_room
 
     config = load_hand(hand)
+    for number, bus in enumerate(config.buses):
+        if not is_interface(bus):
+            key = f"buses[{number}].interface"
+            raise ConfigError(key, bus.interface, allowed_interfaces(bus), where=config.where(key))
     plans, refused = plan_of(config), []
     check_files(config)
     for plan in plans:
@@ -93,23 +98,21 @@ def _facts(plan: BusPlan) -> dict[str, Any]:
 
 
 def _print(config: HandConfig, plans: tuple[BusPlan, ...]) -> None:
-    from rich.console import Console
+    from skinnode.cli._console import console
 
-    console = Console(highlight=False, soft_wrap=True)
+    out = console(soft_wrap=True)
     where = counted(len(plans), "bus", "buses")
     patches = counted(len(config.patches), "patch", "patches")
-    console.print(
-        f"{config.name}: {patches} on {where}, a scan every {config.sync.period_ms} ms", markup=False
-    )
+    out.print(f"{config.name}: {patches} on {where}, a scan every {config.sync.period_ms} ms")
     for plan in plans:
-        console.print()
-        console.print(_headline(plan), markup=False)
-        console.print(_scan_table(plan))
-        console.print(_frame_table(plan))
+        out.print()
+        out.print(_headline(plan))
+        out.print(_scan_table(plan))
+        out.print(_frame_table(plan))
         if plan.others:
-            console.print(_other_table(plan))
+            out.print(_other_table(plan))
         for line in _remarks(plan):
-            console.print(line, markup=False)
+            out.print(line)
 
 
 def _headline(plan: BusPlan) -> str:
@@ -187,22 +190,39 @@ def schema() -> None:
 @app.command()
 def new(
     patches: Annotated[int, typer.Option(min=1, max=127, help="How many patches.", metavar="N")] = 4,
+    buses: Annotated[
+        int, typer.Option(min=1, max=16, help="Number of buses that share the patches.", metavar="N")
+    ] = 1,
 ) -> None:
-    """Print a commented hand file to begin with: one bus, and a SYNC period that it has room for."""
+    """Print a commented hand file to start from, with a SYNC period that fits the bus load.
+
+    The patches are divided evenly among the buses, in order.
+    """
+    from skinnode.errors import ConfigError
     from skinnode.model.config import parse_hand
     from skinnode.wire.plan import plan_of
 
-    (plan,) = plan_of(parse_hand(_table_of(patches, period_ms=60_000)))
-    period_ms = max(10, -(-(plan.shortest_period_ms or 60_000) // 10) * 10)
-    head = _NEW.format(period_ms=period_ms, rate=f"{1e3 / period_ms:.3g}")
-    typer.echo(head + "".join(_NEW_PATCH.format(i=i) for i in range(1, patches + 1)), nl=False)
+    if buses > patches:
+        raise ConfigError("--buses", buses, f"at most {patches}, a bus for each patch of --patches")
+    bus_of = {i: f"can{(i - 1) * buses // patches}" for i in range(1, patches + 1)}
+    plans = plan_of(parse_hand(_table_of(bus_of, period_ms=60_000)))
+    shortest_ms = max(plan.shortest_period_ms or 60_000 for plan in plans)
+    period_ms = max(10, -(-shortest_ms // 10) * 10)
+    text = _NEW.format(
+        buses="".join(_NEW_BUS.format(n=n, group=n + 2) for n in range(buses)),
+        period_ms=period_ms,
+        rate=f"{1e3 / period_ms:.3g}",
+    )
+    for i, name in bus_of.items():
+        text += _NEW_PATCH.format(i=i, bus=f'bus = "{name}"\n' if buses > 1 else "")
+    typer.echo(text, nl=False)
 
 
-def _table_of(patches: int, period_ms: int) -> dict[str, Any]:
+def _table_of(bus_of: dict[int, str], period_ms: int) -> dict[str, Any]:
     return {
-        "buses": [{"name": "can0"}],
+        "buses": [{"name": name, "channel": name} for name in dict.fromkeys(bus_of.values())],
         "sync": {"period_ms": period_ms},
-        "patches": [{"name": f"patch{i}", "node_id": i} for i in range(1, patches + 1)],
+        "patches": [{"name": f"patch{i}", "node_id": i, "bus": name} for i, name in bus_of.items()],
     }
 
 
@@ -213,27 +233,28 @@ _NEW = """\
 # Editors complete and check it after:  skinnode hand schema > hand.schema.json
 
 name = "hand"
-
-[[buses]]
-name = "can0"
-interface = "udp_multicast"       # socketcan, pcan, kvaser, ...: any that python-can knows
-channel = "239.74.163.2"          # of socketcan: "can0"
-bitrate_bps = 1_000_000
-role = "master"                   # "guest" where the robot has a CANopen master of its own
-max_load = 0.7                    # share of the bus that this plan may need
-
+{buses}
 [sync]
 period_ms = {period_ms}                    # one SYNC is one scan of every patch: {rate} a second
 
 [stream]
-partial = "pass"                  # a scan with chunks missing: on with a mask, or "withhold"
+partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"
+"""
+_NEW_BUS = """
+[[buses]]
+name = "can{n}"
+interface = "udp_multicast"       # socketcan, pcan, kvaser, ...: any that python-can knows
+channel = "239.74.163.{group}"          # for socketcan: "can{n}"
+bitrate_bps = 1_000_000
+role = "master"                   # "guest" if the robot has its own CANopen master
+max_load = 0.7                    # maximum share of the bus load for this plan
 """
 _NEW_PATCH = """
 [[patches]]
 name = "patch{i}"
-node_id = {i}
-# serial = 12345                  # must be this one; found by LSS if it has no node-ID yet
-# link = "palm_link"              # of the robot
+{bus}node_id = {i}
+# serial = 12345                  # expected number; LSS uses it to find a node that has no node-ID
+# link = "palm_link"              # name of the link in the robot model
 # pose = {{ position_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}
 layout = {{ preset = "staggered", pitch_m = 4e-3, height_m = 2e-3, upper_wires = 10, upper_electrodes = 10 }}
 """

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
 import typer
 
@@ -18,11 +18,17 @@ from skinnode.words import counted
 
 if TYPE_CHECKING:
     from skinnode.host import Host, HostStats
+    from skinnode.host.health import PatchHealth
     from skinnode.model.config import HandConfig
     from skinnode.model.frames import FieldFrame
 
 _LONGEST_WAIT_S = 0.1
 """How long Ctrl-C may go unnoticed."""
+
+_OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
+"""Maximum wait at the end for an overrun to clear: seconds, or SYNC periods if that is longer."""
+
+_POLL_S = 0.01
 
 _FIRST_SCANS = 3
 """SYNCs after which a patch must have sent a scan."""
@@ -37,9 +43,12 @@ def host(
 ) -> None:
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
+    With --json each patch has `contacts` (null unless solver.method is "posterior"):
+    centroid, area, normal and shear force with standard deviations, in m, m² and N.
     Ctrl-C ends it; the nodes are left pre-operational. Exit status 1 if a patch was not operational at the
-    end, a scan was torn or a frame lost, an interface failed or told of errors meanwhile, or a guest heard no
-    SYNC; 2 if the hand could not be run, or if a node sent frames that are not what their identifier says.
+    end, a scan was torn or a frame lost (unless its node reported that its computer was too slow), an
+    interface failed or reported errors, or a guest heard no SYNC; 2 if the hand could not be run, or if a
+    node sent frames whose content does not match their identifier.
     """
     from skinnode.host.pipeline import check_solvable
     from skinnode.jit import is_cold
@@ -69,10 +78,12 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
             where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
             report.note(f"{operational(running)} on {where}; Ctrl-C ends")
             _watch(running, told, seconds, report)
-            faults = faults_of(running)
+            faults, notes = verdict(running)
     except BringUpCancelled:
         return 0
     report.note(left(plan))
+    for note in notes:
+        report.note(f"note: {note}")
     for fault in faults:
         report.note(f"fault: {fault}")
     if running.stats().malformed:
@@ -104,27 +115,87 @@ def left(plan: HandConfig) -> str:
     return "; ".join(f"nodes on {bus.name} are {ends[bus.role]}" for bus in used)
 
 
-def faults_of(running: Host) -> list[str]:
-    """What was not as it should be, one line each."""
-    from skinnode.host.accounting import losses_of_bus, losses_of_lane
+_OF_SLOWNESS: Final = ("scans_torn", "scans_missed", "scans_mixed", "chunks_lost", "summaries_lost")
+"""Counters of what is missing or came too late, which a slow computer explains; it does not explain frames
+that were wrong."""
 
-    stats = running.stats()
-    found = [f"{name}: {text}" for name, bus in stats.buses.items() for text in losses_of_bus(bus).values()]
+
+def verdict(running: Host) -> tuple[list[str], list[str]]:
+    """Return the faults, and the notes that are not faults, one line each.
+
+    A node that skips scans because its own computer is too slow sends EMCY 0x8110. What is missing of it, or
+    came too late, is then a note, and so is that emergency at the end. Frames that were wrong stay a fault.
+    """
+    from skinnode.host.accounting import losses_of_bus, losses_of_lane
+    from skinnode.wire.emergency import OVERRUN
+
+    _let_overruns_end(running)
+    stats, notes = running.stats(), list[str]()
+    found = [
+        f"{name}: {text}" for name, counts in stats.buses.items() for text in losses_of_bus(counts).values()
+    ]
     for name in stats.buses:
-        health = running.bus_health(name)
-        if health.no_sync:
+        bus = running.bus_health(name)
+        if bus.no_sync:
             found.append(f"{name}: no SYNC of its master is heard")
-        if health.controller in ("error warning", "error passive", "bus-off"):
-            found.append(f"{name}: its controller is {health.controller} at the end")
+        if bus.controller in ("error warning", "error passive", "bus-off"):
+            found.append(f"{name}: its controller is {bus.controller} at the end")
     for name, lane in stats.patches.items():
-        condition = running.health(name).condition
+        health = running.health(name)
+        condition = health.condition
         due = stats.sync.sent + stats.sync.received > _FIRST_SCANS
-        if condition != "operational" and (due or lane.offered > 0):
-            found.append(f"{name}: {condition} at the end")
+        overrun = health.last_emergency == OVERRUN and health.defect is None
+        slow_still = condition == "faulty" and overrun and health.slow_overruns > 0
+        if slow_still:
+            notes.append(f"{name}: {condition} at the end{reason(health, ': ')}")
+        elif condition != "operational" and (due or lane.offered > 0):
+            found.append(f"{name}: {condition} at the end{reason(health, ': ')}")
         elif due and not lane.solved:
             found.append(f"{name}: no scan was solved")
-        found += [f"{name}: {text}" for text in losses_of_lane(lane).values()]
-    return found
+        losses = losses_of_lane(lane)
+        slow = slow_still or (condition == "operational" and health.slow_overruns > 0)
+        explained = [losses.pop(counter) for counter in _OF_SLOWNESS if slow and counter in losses]
+        if explained:
+            notes.append(
+                f"{name}: {', '.join(explained)}, while the computer that runs the node was too slow "
+                f"(EMCY 0x8110{'' if slow_still else ', since cleared'})"
+            )
+        found += [f"{name}: {text}" for text in losses.values()]
+    for name, defects in stats.defects.items():
+        if defects.count:
+            found.append(f"{name}: {counted(defects.count, 'defect')} of the host, last {defects.newest}")
+    return found, notes
+
+
+def faults_of(running: Host) -> list[str]:
+    """Return the faults, one line each."""
+    return verdict(running)[0]
+
+
+def reason(health: PatchHealth, before: str = "") -> str:
+    """Return why a patch is faulty or refused, prefixed with ``before``; empty for other conditions."""
+    if health.condition == "refused" and health.refusal:
+        return f"{before}{health.refusal}"
+    if health.condition == "faulty" and health.defect is not None:
+        return f"{before}{health.defect}"
+    if health.condition == "faulty":
+        from skinnode.wire.emergency import register_text
+
+        if health.last_emergency is None:  # the fault is older than the host
+            text = register_text(health.error_register)
+            return f"{before}error register 0x{health.error_register:02X} ({text})"
+        return f"{before}EMCY 0x{health.last_emergency:04X} {health.emergency_text}"
+    return ""
+
+
+def _let_overruns_end(running: Host) -> None:
+    """Wait briefly for nodes on slow computers to clear the emergency, which lasts one scan."""
+    end_s = time.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
+    while time.monotonic() < end_s:
+        healths = [running.health(patch.name) for patch in running.hand.patches]
+        if not any(h.condition in ("faulty", "stale") and h.slow_overruns for h in healths):
+            return
+        time.sleep(_POLL_S)
 
 
 def _watch(running: Host, told: threading.Event, seconds: float | None, report: _Report) -> None:
@@ -181,17 +252,23 @@ class _Second:
 
 
 def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[str, object]:
+    from skinnode.cli._contacts import contact_tables
+
     new, old, field = now.patches[name], before.patches[name], running.latest(name)
+    health = running.health(name)
     return {
-        "condition": str(running.health(name).condition),
+        "condition": str(health.condition),
+        "reason": reason(health) or health.reason or None,
         "solved": new.solved - old.solved,
         "skipped": new.skipped,
         "torn": new.assembler.scans_torn,
+        "corrupt": new.assembler.scans_corrupt,
         "missed": new.assembler.scans_missed,
         "chunks_lost": new.assembler.chunks_lost,
         "trusted": field.trusted if field is not None else None,
         "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
         **_deepest(field),
+        "contacts": contact_tables(field),
     }
 
 
@@ -242,10 +319,12 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
     if facts["solved"] and isinstance(deepest_m, float):
         std = f" ± {std_m * 1e6:.1f}" if isinstance(std_m, float) else ""
         deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
-    worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "missed", "skipped") if facts[key])
+    worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
     doubt = "  untrusted" if facts["trusted"] is False else ""
+    why = f" ({facts['reason']})" if facts["reason"] else ""
     return (
-        f"{name} {facts['condition']}  {facts['solved']} fields{deepest}{doubt}{worst and '  in all' + worst}"
+        f"{name} {facts['condition']}{why}  {facts['solved']} fields{deepest}{doubt}"
+        f"{worst and '  in all' + worst}"
     )
 
 

@@ -22,7 +22,7 @@ def info(
     hand: Hand = None,
     bus: Bus = None,
     eds: Annotated[
-        Path | None, typer.Option(help="Names the objects of a device of others.", metavar="FILE")
+        Path | None, typer.Option(help="EDS of a device other than a patch.", metavar="FILE")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -31,15 +31,18 @@ def info(
     Only reads. Exit status 0 if the node says that all is well, 1 if it has an
     error, wires at fault or no baseline; 2 if it does not answer.
     """
-    from skinnode.cli._bus import find_bus, find_node
+    from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
     from skinnode.technician.info import read_info
     from skinnode.technician.line import Line
     from skinnode.technician.sheet import load_sheet
 
-    place = find_bus(interface, channel, bitrate, fd, hand, bus)
-    node_id = find_node(node, place)
-    sheet = None if eds is None else load_sheet(eds).eds
+    place, node_id = find_node(node, interface, channel, bitrate, fd, hand, bus)
+    sheet = None
+    if eds is not None:
+        sheet, *_, note = load_sheet(eds)
+        if note:
+            typer.echo(f"note: {note}", err=True)
     with progress(as_json) as tell, Line(place.bus) as line:
         tell(f"reading node {node_id}")
         found = read_info(line, node_id, sheet)
@@ -54,14 +57,13 @@ def info(
 
 
 def _print(found: NodeInfo, patch_name: str) -> None:
-    from rich.markup import escape
-
     from skinnode.cli._console import console, table
     from skinnode.wire.emergency import register_text
 
     out = console()
     title = f"node {found.node_id}" + (f" ({patch_name})" if patch_name else "")
-    out.print(f"[bold]{escape(title)}[/bold]  {found.state} (by {found.state_known_by})")
+    out.print(title, style="bold", end="")
+    out.print(f"  {found.state} (by {found.state_known_by})")
     grid = table("", "")
     grid.show_header = False
     register = found.error_register or 0
@@ -81,19 +83,21 @@ def _print(found: NodeInfo, patch_name: str) -> None:
         ("storing", found.storing),
     ]
     for name, value in rows:
-        grid.add_row(name, escape(value))
+        grid.add_row(name, value)
     out.print(grid)
     for fault in found.faults:
-        out.print(f"fault: {escape(fault)}")
+        out.print(f"fault: {fault}")
 
 
 def _identity(found: NodeInfo) -> str:
+    from skinnode.words import known
+
     vendor, product, revision = (
         value or 0 for value in (found.vendor_id, found.product_code, found.revision)
     )
     return (
         f"vendor {vendor:08X}, product {product:08X}, revision {revision >> 16}.{revision & 0xFFFF}, "
-        f"serial {found.serial}"
+        f"serial {known(found.serial)}"
     )
 
 
@@ -106,7 +110,11 @@ def _pdos(found: NodeInfo) -> str:
 def _patch_rows(patch: PatchInfo) -> list[tuple[str, str]]:
     mode = "all chunks"
     if patch.send_changed_only:
-        refresh = f"all every {patch.send_refresh_scans} scans" if patch.send_refresh_scans else "never all"
+        refresh = (
+            f"all of them every {patch.send_refresh_scans} scans"
+            if patch.send_refresh_scans
+            else "never all of them"
+        )
         mode = f"chunks that moved by more than {patch.send_threshold_codes} codes, {refresh}"
     when = f"every {patch.period_ms} ms by its own timer" if patch.period_ms else "at SYNC"
     averaged = f", mean of {patch.averaging}" if patch.averaging > 1 else ""
@@ -145,7 +153,7 @@ def _patch_rows(patch: PatchInfo) -> list[tuple[str, str]]:
 
 def _baseline(patch: PatchInfo) -> str:
     if patch.baseline_ohm is None:
-        return "none: tare"
+        return "none: skinnode tare"
     least, median, greatest = patch.baseline_ohm
     missing = f"; {patch.baseline_missing} crossings without" if patch.baseline_missing else ""
     return f"{least:.4g} to {greatest:.4g} ohm, median {median:.4g}{missing}"

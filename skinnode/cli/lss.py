@@ -9,7 +9,9 @@ import typer
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, node_ids
 
 if TYPE_CHECKING:
+    from skinnode.cli._bus import Place
     from skinnode.technician.commission import Commissioned
+    from skinnode.wire.lss import LssAddress
 
 app = typer.Typer(help="Layer setting services: give nodes their node-ID and bit rate.", no_args_is_help=True)
 
@@ -24,27 +26,34 @@ def list_nodes(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Find all nodes without a node-ID, by fastscan. Changes nothing."""
-    from skinnode.cli._bus import find_bus
+    """Find all nodes without a node-ID, by fastscan, on one bus or on all of --hand. Changes nothing."""
+    from skinnode.cli._bus import find_buses
     from skinnode.cli._console import console, print_json, progress, table
     from skinnode.technician.line import Line
     from skinnode.technician.survey import find_unconfigured
     from skinnode.words import counted
 
-    place = find_bus(interface, channel, bitrate, fd, hand, bus)
-    with progress(as_json) as tell, Line(place.bus) as line:
-        tell("fastscan")
-        found, more = find_unconfigured(line)
+    found: list[tuple[str, LssAddress]] = []
+    more = False
+    places = find_buses(interface, channel, bitrate, fd, hand, bus)
+    with progress(as_json) as tell:
+        for place in places:
+            tell(f"{place.bus.name}: fastscan")
+            with Line(place.bus) as line:
+                there, and_more = find_unconfigured(line)
+            found += [(place.bus.name, address) for address in there]
+            more |= and_more
     if as_json:
-        print_json({"unconfigured": [address._asdict() for address in found], "more": more})
+        addresses = [{**address._asdict(), "bus": name} for name, address in found]
+        print_json({"unconfigured": addresses, "more": more})
         return
     if found:
-        listed = table("serial", "vendor", "product", "revision", right=("serial",))
-        for item in found:
+        head = ["bus"] if len(places) > 1 else []
+        listed = table(*head, "serial", "vendor", "product", "revision", right=("serial",))
+        for name, item in found:
             revision = f"{item.revision_number >> 16}.{item.revision_number & 0xFFFF}"
-            listed.add_row(
-                str(item.serial_number), f"{item.vendor_id:08X}", f"{item.product_code:08X}", revision
-            )
+            row = [str(item.serial_number), f"{item.vendor_id:08X}", f"{item.product_code:08X}", revision]
+            listed.add_row(*([name] if head else []), *row)
         console().print(listed)
     typer.echo(f"{counted(len(found), 'node')} without a node-ID" + (", and more" if more else ""))
 
@@ -53,7 +62,9 @@ def list_nodes(
 def set_node(
     serial: Annotated[
         int | None,
-        typer.Option(min=0, max=0xFFFF_FFFF, help="Which; default: the only one without a node-ID."),
+        typer.Option(
+            min=0, max=0xFFFF_FFFF, help="Serial number of the node; default: the only one without a node-ID."
+        ),
     ] = None,
     node_id: Annotated[
         int | None,
@@ -62,11 +73,19 @@ def set_node(
     bit_rate: Annotated[
         int | None, typer.Option(help="Its bit rate from its next power-on on.", metavar="BPS")
     ] = None,
-    store: Annotated[bool, typer.Option(help="Have it keep both over a power cycle.")] = True,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
-    vendor: Annotated[int | None, typer.Option(help="Of a device of others.", metavar="N")] = None,
-    product: Annotated[int | None, typer.Option(help="Of a device of others.", metavar="N")] = None,
-    revision: Annotated[int | None, typer.Option(help="Of a device of others.", metavar="N")] = None,
+    store: Annotated[
+        bool, typer.Option(help="Store both, so that the node keeps them across a power cycle.")
+    ] = True,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
+    vendor: Annotated[
+        int | None, typer.Option(help="Vendor-ID of a device other than a patch.", metavar="N")
+    ] = None,
+    product: Annotated[
+        int | None, typer.Option(help="Product code of a device other than a patch.", metavar="N")
+    ] = None,
+    revision: Annotated[
+        int | None, typer.Option(help="Revision number of a device other than a patch.", metavar="N")
+    ] = None,
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
@@ -80,39 +99,41 @@ def set_node(
     A node that has a node-ID is reset to take the new one. Exit status 0 if all
     was done, 1 if the node did not store or boot, 2 if it could not be done.
     """
-    from skinnode.cli._bus import find_bus
+    from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
-    from skinnode.errors import ConfigError
+    from skinnode.errors import ConfigError, Shown
     from skinnode.technician.commission import commission, only_unconfigured
     from skinnode.technician.line import Line
     from skinnode.wire import indices as od
     from skinnode.wire.lss import BIT_RATES_BPS, LssAddress
 
     if node_id is None and bit_rate is None:
-        raise ConfigError("--node-id, --bit-rate", None, "one of them at least")
+        raise ConfigError("--node-id, --bit-rate", None, "at least one of them")
     if bit_rate is not None and bit_rate not in BIT_RATES_BPS.values():
         allowed = ", ".join(str(rate) for rate in BIT_RATES_BPS.values())
         raise ConfigError("--bit-rate", bit_rate, allowed)
-    place = find_bus(interface, channel, bitrate, fd, hand, bus)
+    place = _meant(find_buses(interface, channel, bitrate, fd, hand, bus), serial, node_id)
     with Line(place.bus) as line:
         if serial is None:
             with progress(as_json) as tell:
                 tell("fastscan")
                 address = only_unconfigured(line)
         else:
-            address = LssAddress(
+            named = LssAddress(
                 od.VENDOR_ID if vendor is None else vendor,
                 od.PRODUCT_CODE if product is None else product,
                 od.REVISION_NUMBER if revision is None else revision,
                 serial,
             )
+            ours = vendor is None and product is None and revision is None
+            address = line.lss.select_patch(serial) or named if ours else named
 
         def agreed(before: int | None) -> bool:
             return yes or _confirmed(address.serial_number, before, node_id, bit_rate, store)
 
         done = commission(line, address, node_id=node_id, bitrate_bps=bit_rate, store=store, agreed=agreed)
     if done is None:
-        raise ConfigError("--yes", False, "a yes to the question; nothing was changed")
+        raise ConfigError("--yes", Shown("no"), "yes to the question; nothing was changed")
     if as_json:
         from dataclasses import asdict
 
@@ -121,6 +142,22 @@ def set_node(
         _print(done)
     if done.faults:
         raise typer.Exit(1)
+
+
+def _meant(places: list[Place], serial: int | None, node_id: int | None) -> Place:
+    """Return the bus of the patch with this serial number, or else with this node-ID. Raises ConfigError if
+    several buses match."""
+    from skinnode.errors import NOTHING, ConfigError
+
+    for number, key in ((serial, "serial"), (node_id, "node_id")):
+        if number is not None and len(places) > 1:
+            fitting = [
+                place for place in places if any(getattr(patch, key) == number for patch in place.patches)
+            ]
+            places = fitting or places
+    if len(places) > 1:
+        raise ConfigError("--bus", NOTHING, f"one of {', '.join(place.bus.name for place in places)}")
+    return places[0]
 
 
 def _confirmed(

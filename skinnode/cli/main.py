@@ -1,78 +1,23 @@
-"""The ``skinnode`` command: names the subcommands.
-
-Exit status: 0 fine, 1 a fault was found, 2 could not run (bad input, no bus, no node). One file a subcommand;
-each imports what it needs when it runs, so that ``--help`` answers at once.
-"""
+"""Entry point of ``skinnode``, kept small so that signal handlers are installed before anything slow is
+imported. The subcommands are in :mod:`skinnode.cli._app`, exit statuses in :mod:`skinnode.cli._ending`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Any, NoReturn
 
-import typer
-
-from skinnode.cli import (
-    bench,
-    conformance,
-    demo,
-    doctor,
-    eds,
-    hand,
-    host,
-    info,
-    lss,
-    monitor,
-    nmt,
-    node,
-    od,
-    record,
-    replay,
-    scan,
-)
-from skinnode.cli._usage import run
-
-app = typer.Typer(
-    name="skinnode",
-    help="Robot skin on a CAN bus: pressed patches in, displacement fields out.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command(name="demo")(demo.demo)
-app.command(name="host")(host.host)
-app.add_typer(hand.app, name="hand")
-app.command(name="node")(node.node)
-app.command(name="eds")(eds.eds)
-app.command(name="scan")(scan.scan)
-app.command(name="info")(info.info)
-app.command(name="od")(od.od)
-app.command(name="nmt")(nmt.nmt)
-app.add_typer(lss.app, name="lss")
-app.command(name="monitor")(monitor.monitor)
-app.command(name="doctor")(doctor.doctor)
-app.command(name="record")(record.record)
-app.command(name="replay")(replay.replay)
-app.command(name="conformance")(conformance.conformance)
-app.add_typer(bench.app, name="bench")
+from skinnode.cli._ending import main_of
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from skinnode import __version__
-
-        typer.echo(f"skinnode {__version__}")
-        raise typer.Exit
+def main(argv: Sequence[str] | None = None) -> NoReturn:
+    """Run ``skinnode`` with these arguments, or those of the process."""
+    main_of("skinnode.cli._app", argv)
 
 
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    pass
+def __getattr__(name: str) -> Any:
+    """Provide ``app``, the typer application."""
+    if name == "app":
+        from skinnode.cli._app import app
 
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of the console script."""
-    run(app, argv)
+        return app
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -36,7 +36,7 @@ def monitor(
         typer.Option(help="Look at a recording of `skinnode record`.", metavar="RECORDING"),
     ] = None,
     speed: Annotated[
-        float | None, typer.Option(help="Of --replay: 2 is twice as fast; default 1.", metavar="X")
+        float | None, typer.Option(help="Speed of --replay: 2 is twice as fast; default 1.", metavar="X")
     ] = None,
     simulate: Annotated[
         bool,
@@ -68,11 +68,11 @@ def monitor(
     if not as_json:
         _require_screen()
     if (hand is not None or simulate) == (replay is not None):
-        got = NOTHING if replay is None else Shown("it and --replay")
+        got = NOTHING if replay is None else Shown("both it and --replay")
         raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
     _require_use(interface, channel, speed, played=replay is not None, simulated=simulate)
-    if not output or not Path(output).is_dir():
-        raise ConfigError("--output", output, "an existing folder")
+    if not output or (Path(output).exists() and not Path(output).is_dir()):
+        raise ConfigError("--output", output, "a folder; the first recording creates it")
     from skinnode.host import BringUpCancelled
     from skinnode.signals import until_told
 
@@ -99,10 +99,10 @@ def _require_use(
     from skinnode.errors import ConfigError
 
     if speed is not None and not played:
-        raise ConfigError("--speed", speed, "nothing without --replay")
+        raise ConfigError("--speed", speed, "only with --replay")
     for option, value in (("--interface", interface), ("--channel", channel)):
         if value is not None and (played or simulated):
-            allowed = f"nothing beside {'--replay' if played else '--simulate'}, which opens no bus of a hand"
+            allowed = f"only without {'--replay' if played else '--simulate'}, which opens no bus of a hand"
             raise ConfigError(option, value, allowed)
 
 
@@ -114,9 +114,9 @@ def _require_screen() -> None:
 
     if find_spec("textual") is None:
         allowed = "the screen after sh install.sh tui, or --json"
-        raise ConfigError("skinnode monitor", Shown("no textual to draw with"), allowed)
+        raise ConfigError("skinnode monitor", Shown("no package textual"), allowed)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise ConfigError("standard input and output", Shown("no terminal"), "one, or --json")
+        raise ConfigError("standard input and output", Shown("no terminal"), "a terminal, or --json")
 
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
@@ -132,7 +132,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
     if simulate:
-        from skinnode.cli._simulated import on_simulated_buses
+        from skinnode.demo.simulated import on_simulated_buses
 
         plan = on_simulated_buses(plan)
     waiting = plan.bring_up.model_copy(update={"missing": "wait"})
@@ -159,7 +159,7 @@ def _running(
         for patch in plan.patches:
             check_solvable(patch, plan.solver)
         if simulate:
-            from skinnode.cli._simulated import simulated
+            from skinnode.demo.simulated import simulated
 
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
@@ -196,7 +196,7 @@ def _show(source: Source, told: threading.Event, seconds: float | None, output: 
 
 def _print(source: Source, told: threading.Event, seconds: float | None) -> list[str]:
     """A line of JSON a second; what was wrong meanwhile. Raises the SkinError that ended the source."""
-    from skinnode.cli._files import plain
+    from skinnode.json_values import plain
     from skinnode.monitor.report import FaultBook, watch
 
     faults = FaultBook()

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
+
+if TYPE_CHECKING:
+    from skinnode.cli._bus import Place
+    from skinnode.technician.nmt import Change
 
 _COMMANDS = "start stop pre-operational reset-node reset-communication"
 
@@ -37,9 +41,11 @@ def nmt(
 ) -> None:
     """Start, stop or reset nodes; tell their state before and after, from heartbeat or guarding.
 
+    `all` means every node of the bus, or of every bus of --hand.
+
     Exit status 0 if every node followed, 1 if one did not, 2 if it could not run.
     """
-    from skinnode.cli._bus import find_bus, find_node
+    from skinnode.cli._bus import find_buses, find_node
     from skinnode.cli._console import console, print_json, progress, table
     from skinnode.errors import BusError, ConfigError
     from skinnode.technician.line import Line
@@ -48,22 +54,34 @@ def nmt(
 
     if command not in _COMMANDS.split():
         raise ConfigError("COMMAND", command, _COMMANDS.replace(" ", ", "))
-    place = find_bus(interface, channel, bitrate, fd, hand, bus)
-    node_ids = [] if node == "all" else [find_node(node, place)]
-    with progress(as_json) as tell, Line(place.bus) as line:
-        if node == "all":
-            node_ids = [found.node_id for found in survey(line, tell).nodes]
-            if not node_ids:
-                raise BusError(f"{place.bus.name}: got no answer from any node, allowed: one at least")
-        tell(command)
-        changes = command_nodes(line, node_ids, Command(command), at_once=node == "all")
-    if as_json:
-        print_json([asdict(change) for change in changes])
+    if node == "all":
+        wanted = [(place, list[int]()) for place in find_buses(interface, channel, bitrate, fd, hand, bus)]
     else:
-        listed = table("node", "before", "after", "known by", right=("node",))
-        for change in changes:
+        place, node_id = find_node(node, interface, channel, bitrate, fd, hand, bus)
+        wanted = [(place, [node_id])]
+    changes: list[tuple[Place, Change]] = []
+    with progress(as_json) as tell:
+        for place, node_ids in wanted:
+            with Line(place.bus) as line:
+                if node == "all":
+                    node_ids = [found.node_id for found in survey(line, tell).nodes]
+                tell(f"{place.bus.name}: {command}")
+                done = (
+                    command_nodes(line, node_ids, Command(command), at_once=node == "all") if node_ids else []
+                )
+            changes += [(place, change) for change in done]
+    if not changes:
+        where = " and ".join(place.bus.name for place, _ in wanted)
+        raise BusError(f"{where}: no node answered, so the command {command} was not sent")
+    if as_json:
+        print_json([{**asdict(change), "bus": place.bus.name} for place, change in changes])
+    else:
+        several = len(wanted) > 1
+        listed = table(*(["bus"] if several else []), "node", "before", "after", "known by", right=("node",))
+        for place, change in changes:
             known = change.known_by if change.followed else f"DID NOT FOLLOW: {change.known_by}"
-            listed.add_row(str(change.node_id), change.before, change.after, known)
+            row = [str(change.node_id), change.before, change.after, known]
+            listed.add_row(*([place.bus.name] if several else []), *row)
         console().print(listed)
-    if not all(change.followed for change in changes):
+    if not all(change.followed for _, change in changes):
         raise typer.Exit(1)

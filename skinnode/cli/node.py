@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,9 +16,10 @@ import typer
 
 from skinnode.cli._layouts import HELP as LAYOUT_HELP
 from skinnode.cli._usage import Seconds
+from skinnode.words import counted
 
 if TYPE_CHECKING:
-    from skinnode.node import NodeRunner
+    from skinnode.node import FileMemory, NodeRunner
     from skinnode.transport import CanPort
 
 
@@ -37,7 +40,7 @@ def node(
     ] = 1_000_000,
     fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD, with bit-rate switch.")] = False,
     data_bitrate: Annotated[
-        int, typer.Option(min=10_000, max=8_000_000, help="Of CAN FD frames.", metavar="BPS")
+        int, typer.Option(min=10_000, max=8_000_000, help="Data bit rate of CAN FD frames.", metavar="BPS")
     ] = 5_000_000,
     code_bits: Annotated[int, typer.Option(help="Width of a code: 16 or 24.", metavar="16|24")] = 16,
     serial: Annotated[
@@ -61,14 +64,13 @@ def node(
     failed, scans were skipped, frames not sent, another node had its node-ID or
     what --store names was of no use; 2 if it could not run.
     """
-    from skinnode.cli._files import require_writable, sole_user
     from skinnode.cli._layouts import find_layout, import_from_here
     from skinnode.errors import ConfigError
     from skinnode.model.config import BusConfig
     from skinnode.node import NodeRunner, PatchNode
     from skinnode.node.clock import EXACT, THRIFTY
     from skinnode.node.find_source import make_source
-    from skinnode.node.memory import FileMemory
+    from skinnode.output_file import require_writable
     from skinnode.pauses import short_pauses
     from skinnode.signals import until_told
     from skinnode.transport import CanPort
@@ -76,7 +78,7 @@ def node(
     from skinnode.wire.profile import PatchProfile
 
     if node_id is None and store is None:
-        raise ConfigError("--node-id", None, "1 to 127, or --store FILE and a node-ID by LSS")
+        raise ConfigError("--node-id", None, "1 to 127, or --store FILE and a node-ID that LSS stores there")
     if store is not None:
         require_writable("--store", store)
     import_from_here()
@@ -91,8 +93,7 @@ def node(
         data_bitrate_bps=data_bitrate,
     )
     measuring = make_source(source, patch, "--source")
-    alone = nullcontext() if store is None else sole_user("--store", store)
-    with alone, until_told() as told, CanPort(bus) as port:
+    with _memory(store) as memory, until_told() as told, CanPort(bus) as port:
         board = PatchNode(
             NOT_CONFIGURED if node_id is None else node_id,
             patch,
@@ -100,7 +101,7 @@ def node(
             send=port.send,
             profile=profile,
             serial=serial,
-            memory=None if store is None else FileMemory(store),
+            memory=memory,
             pacing=EXACT if strict_timing else THRIFTY,
             set_bit_rate=port.set_bitrate,
         )
@@ -115,6 +116,34 @@ def node(
         _note(f"fault: {fault}", as_json)
     if faults:
         raise typer.Exit(1)
+
+
+@contextmanager
+def _memory(store: Path | None) -> Iterator[FileMemory | None]:
+    """Yield the memory in ``store``, claimed for this process. Raises ConfigError if it cannot be claimed."""
+    from skinnode.errors import ConfigError
+    from skinnode.file_lock import FileInUse, NotARegularFile
+    from skinnode.node.memory import FileMemory
+
+    if store is None:
+        yield None
+        return
+    if os.path.islink(store):
+        raise ConfigError("--store", str(store), "a file, not a symbolic link")
+    if os.path.exists(store) and not os.path.isfile(store):
+        raise ConfigError("--store", str(store), "a regular file, or a name that does not exist")
+    memory = FileMemory(store)
+    try:
+        memory.claim()
+    except FileInUse as error:
+        allowed = f"a file that no other process is using ({error.strerror})"
+        raise ConfigError("--store", str(store), allowed) from None
+    except NotARegularFile as error:
+        raise ConfigError("--store", str(store), f"a file that can be locked ({error.strerror})") from None
+    except OSError as error:
+        raise ConfigError("--store", str(store), f"a file in a writable folder ({error.strerror})") from error
+    with memory:
+        yield memory
 
 
 def _who(node_id: int, given: int | None) -> str:
@@ -166,13 +195,18 @@ def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
 
 def _faults(end: _Progress) -> list[str]:
     """What was not as it should be, one line each."""
-    counted = (
-        (end.source_failures, f"failures of the source, the last: {end.source_error}"),
-        (end.overruns, "scans skipped, for the ones before were still to be sent"),
-        (end.rival_frames, "boot-ups or heartbeats of another node with this node-ID"),
-        (end.bus_errors, f"errors of the bus, the last began with: {end.bus_error}"),
+    counts = (
+        (end.source_failures, "failure", "failures", f" of the source, the last: {end.source_error}"),
+        (end.overruns, "scan", "scans", " skipped because earlier ones were still being sent"),
+        (
+            end.rival_frames,
+            "boot-up or heartbeat",
+            "boot-ups or heartbeats",
+            " of another node with this node-ID",
+        ),
+        (end.bus_errors, "bus error", "bus errors", f", the last began with: {end.bus_error}"),
     )
-    faults = [f"{count} {what}" for count, what in counted if count]
+    faults = [f"{counted(count, one, several)}{what}" for count, one, several, what in counts if count]
     return [*faults, f"memory: {end.memory_problem}"] if end.memory_problem else faults
 
 

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
+from skinnode.words import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from skinnode.conformance.eds import Eds, EdsEntry
+    from skinnode.conformance.eds import EdsEntry
     from skinnode.host.network import RemoteOd
     from skinnode.technician.dictionary import Difference, Reading
     from skinnode.technician.sheet import Sheet
@@ -21,7 +20,8 @@ if TYPE_CHECKING:
 def od(
     node: Node,
     address: Annotated[
-        str | None, typer.Argument(help="0x1018 or 0x1018:4; all without.", metavar="INDEX[:SUB]")
+        str | None,
+        typer.Argument(help="0x1018 or 0x1018:4; default: the whole dictionary.", metavar="INDEX[:SUB]"),
     ] = None,
     interface: Interface = None,
     channel: Channel = None,
@@ -32,7 +32,9 @@ def od(
     write: Annotated[
         str | None, typer.Option(help="Write this, typed as the EDS says, and read it back.", metavar="VALUE")
     ] = None,
-    as_hex: Annotated[bool, typer.Option("--hex", help="Bytes as they travel, both ways.")] = False,
+    as_hex: Annotated[
+        bool, typer.Option("--hex", help="Show and take values as raw bytes in hexadecimal.")
+    ] = False,
     eds: Annotated[
         Path | None, typer.Option(help="Names and types; not needed for a patch of ours.", metavar="FILE")
     ] = None,
@@ -49,38 +51,50 @@ def od(
     Without INDEX it dumps the whole dictionary. Exit status 0 if done, 1 if
     --diff found differences, 2 if the node did not answer or refused.
     """
-    from skinnode.cli._bus import find_bus, find_node
+    from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
-    from skinnode.cli._files import require_writable
     from skinnode.errors import ConfigError
-    from skinnode.technician.dictionary import compare, entries_at, expected, parse_address, require_answer
+    from skinnode.output_file import require_writable
+    from skinnode.technician.dcf import expected
+    from skinnode.technician.dictionary import (
+        compare,
+        dump,
+        dump_standard,
+        entries_at,
+        parse_address,
+    )
     from skinnode.technician.line import Line
     from skinnode.technician.sheet import load_sheet, sheet_of
 
-    place = find_bus(interface, channel, bitrate, fd, hand, bus)
-    node_id = find_node(node, place)
+    place, node_id = find_node(node, interface, channel, bitrate, fd, hand, bus)
     where = None if address is None else parse_address(address)
     if write is not None and where is None:
-        raise ConfigError("--write", write, "a value beside INDEX[:SUB]")
+        raise ConfigError("--write", write, "only with INDEX[:SUB]")
     if diff is not None and (where is not None or write is not None or dcf is not None):
-        raise ConfigError("--diff", str(diff), "alone: it compares the whole dictionary")
+        raise ConfigError("--diff", str(diff), "only by itself, because it compares the whole dictionary")
     if dcf is not None and where is not None:
-        raise ConfigError("--dcf", str(dcf), "no INDEX beside it: it takes the whole dictionary")
+        raise ConfigError("--dcf", str(dcf), "only without INDEX, because it takes the whole dictionary")
     if dcf is not None:
         require_writable("--dcf", dcf)
-    wanted = None if diff is None else expected(load_sheet(diff))
+    wanted = None
+    if diff is not None:
+        compared = load_sheet(diff)
+        _note(compared)
+        wanted = expected(compared)
     with progress(as_json) as tell, Line(place.bus) as line:
         remote = line.od(node_id)
-        require_answer(remote)
+        line.require_answer(node_id)
         if wanted is not None:
             found = compare(remote, wanted, node_id, tell)
         else:
-            typed = where is None or (write is not None and not as_hex)
-            sheet = sheet_of(remote, eds) if typed else _sheet_if_any(remote, eds)
+            sheet = sheet_of(remote, eds) if dcf is not None else _sheet_if_any(remote, eds)
+            _note(sheet)
             if where is None:
-                readings = _dump(remote, sheet.eds, tell)
+                bare = not sheet.eds.entries
+                readings = list(dump_standard(remote, tell) if bare else dump(remote, sheet.eds, tell))
             else:
-                entries = entries_at(sheet.eds, *where)
+                index = where[0]
+                entries = entries_at(sheet.eds, *where, lambda: int(remote.read(index, 0, "u8")))
                 if write is not None:
                     _write(remote, entries, write, as_hex, node_id)
                 readings = _read(remote, entries)
@@ -95,12 +109,20 @@ def od(
         print_json([_as_json(reading) for reading in readings])
     else:
         _print(readings, as_hex, single=where is not None)
+        if where is None and not sheet.eds.entries and not sheet.note:
+            typer.echo(f"note: node {node_id} is not a skinnode patch; --eds FILE names all its objects")
+
+
+def _note(sheet: Sheet) -> None:
+    if sheet.note:
+        typer.echo(f"note: {sheet.note}", err=True)
 
 
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> Sheet:
-    """Bytes need no types."""
+    """Return the sheet of the node. It has no entries for a third-party device without an EDS, or a node that
+    refuses to say which it is: CiA 301 then names the objects."""
     from skinnode.conformance.eds import Eds
-    from skinnode.errors import ProfileError
+    from skinnode.errors import NodeError, ProfileError
     from skinnode.technician.sheet import Sheet, sheet_of
 
     try:
@@ -108,13 +130,10 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> Sheet:
     except ProfileError:
         if eds is not None:
             raise
-        return Sheet(Eds("", {}, frozenset(), {}, ()), "")
-
-
-def _dump(remote: RemoteOd, sheet: Eds, tell: Callable[[str], None]) -> list[Reading]:
-    from skinnode.technician.dictionary import dump
-
-    return list(dump(remote, sheet, tell))
+        why = ""
+    except NodeError as error:
+        why = f"{error}: objects are named by CiA 301 alone"
+    return Sheet(Eds("", {}, frozenset(), {}, ()), "", note=why)
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
@@ -131,7 +150,9 @@ def _write(remote: RemoteOd, entries: list[EdsEntry], text: str, as_hex: bool, n
     from skinnode.technician.dictionary import encode
 
     if len(entries) != 1:
-        raise ConfigError("INDEX", f"0x{entries[0].index:04X}", "one with :SUB, for an array or a record")
+        raise ConfigError(
+            "INDEX", f"0x{entries[0].index:04X}", "INDEX:SUB, because this object is an array or a record"
+        )
     (entry,) = entries
     if as_hex:
         try:
@@ -146,20 +167,24 @@ def _write(remote: RemoteOd, entries: list[EdsEntry], text: str, as_hex: bool, n
 def _write_dcf(
     file: Path, readings: list[Reading], sheet: Sheet, node_id: int, bitrate: int, name: str
 ) -> None:
-    from skinnode.cli._files import write_text
-    from skinnode.technician.dictionary import as_dcf
+    from skinnode.output_file import write_text
+    from skinnode.technician.dcf import as_dcf
+    from skinnode.words import counted
 
-    text = as_dcf(sheet, readings, node_id, bitrate, name or f"node {node_id}")
-    write_text("--dcf", file, text)
+    made = as_dcf(sheet, readings, node_id, bitrate, name or f"node {node_id}")
+    write_text("--dcf", file, made.text)
     refused = [reading for reading in readings if reading.refused and reading.refused != "no data"]
-    typer.echo(f"{len(readings) - len(refused)} values of node {node_id} in {file}")
+    typer.echo(f"{counted(made.values, 'value')} of node {node_id} in {file}")
+    for reading in made.as_bytes:
+        where = f"0x{reading.index:04X}:{reading.subindex}"
+        typer.echo(
+            f"note: CiA 306 cannot express {where}: its bytes are in a comment, which other tools skip"
+        )
     for reading in refused:
         typer.echo(f"note: 0x{reading.index:04X}:{reading.subindex} {reading.refused}")
 
 
 def _print(readings: list[Reading], as_hex: bool, *, single: bool) -> None:
-    from rich.markup import escape
-
     from skinnode.cli._console import console, table
     from skinnode.technician.dictionary import hex_text
 
@@ -171,18 +196,16 @@ def _print(readings: list[Reading], as_hex: bool, *, single: bool) -> None:
         value = (reading.data or b"").hex(" ") if raw and whole else hex_text(reading.data or b"")
         listed.add_row(
             f"{reading.index:04X}:{reading.subindex}",
-            escape(reading.name),
+            reading.name,
             reading.data_type,
             reading.access,
-            escape(value if raw else reading.text),
+            value if raw else reading.text,
         )
     out.print(listed)
 
 
 def _tell_differences(found: list[Difference], as_json: bool) -> None:
     from dataclasses import asdict
-
-    from rich.markup import escape
 
     from skinnode.cli._console import console, print_json, table
 
@@ -194,9 +217,9 @@ def _tell_differences(found: list[Difference], as_json: bool) -> None:
         return
     listed = table("object", "name", "node", "file")
     for item in found:
-        listed.add_row(f"{item.index:04X}:{item.subindex}", *map(escape, (item.name, item.node, item.file)))
+        listed.add_row(f"{item.index:04X}:{item.subindex}", item.name, item.node, item.file)
     console().print(listed)
-    typer.echo(f"{len(found)} differences")
+    typer.echo(counted(len(found), "difference"))
 
 
 def _as_json(reading: Reading) -> dict[str, object]:

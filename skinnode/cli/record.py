@@ -28,8 +28,8 @@ def record(
         typer.Option(
             "--output",
             "-o",
-            help="An existing folder, in which the file is named after hand, date and time; or a new file "
-            "ending in .log or .blf. Nothing is written over.",
+            help="A folder, created if needed, in which the file is named after hand, date and time; "
+            "or a new file ending in .log or .blf. Existing files are never overwritten.",
             metavar="FOLDER|FILE",
         ),
     ],
@@ -72,7 +72,7 @@ def _run(
     plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
     """What was wrong meanwhile, a line each."""
-    from skinnode.cli.host import faults_of
+    from skinnode.cli.host import verdict
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.pipeline import check_solvable
 
@@ -83,7 +83,10 @@ def _run(
             _say(as_json, note=f"{counted(len(plan.patches), 'patch', 'patches')} operational; Ctrl-C ends")
             with running.fields(capacity=1) as fields:
                 _follow(recorder, told, seconds, as_json, lambda: fields.get(0.0))
-            return faults_of(running)
+            faults, notes = verdict(running)
+            for note in notes:
+                _say(as_json, note=f"note: {note}")
+            return faults
     except BringUpCancelled:
         return []
 

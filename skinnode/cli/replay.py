@@ -25,6 +25,9 @@ def replay(
 ) -> None:
     """Decode and solve a recording of `skinnode record`, with the same results as live, bit by bit.
 
+    With --json each field has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
+    and shear force with standard deviations, in m, m² and N.
+
     Exit status 1 if the recording is damaged, was not ended or lacks frames, or if what it holds lacks some:
     a scan torn or missed, a chunk or a summary lost; or has error frames. 2 if it cannot be read at all.
     """
@@ -56,6 +59,8 @@ def replay(
 
 def field_table(field: FieldFrame) -> dict[str, Any]:
     """A field as JSON; numbers survive bit by bit."""
+    from skinnode.cli._contacts import contact_tables
+
     stamp = field.stamp
     assert stamp is not None
     return {
@@ -66,6 +71,7 @@ def field_table(field: FieldFrame) -> dict[str, Any]:
         "trusted": field.trusted,
         "method": field.method,
         "displacement_m": field.displacement_m.tolist(),
+        "contacts": contact_tables(field),
         # JSON has no infinity: where nothing is known there is no deviation
         "displacement_std_m": [
             [[v if v < float("inf") else None for v in electrode] for electrode in wire]

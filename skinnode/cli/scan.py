@@ -24,29 +24,40 @@ def scan(
 ) -> None:
     """Find every node on a bus: by SDO, by its heartbeat, and by LSS those without a node-ID.
 
-    Nothing is changed in any node. Takes two seconds. Exit status 0 if nodes were
+    With --hand it scans every bus of the hand. Nothing is changed in any node.
+    Takes two seconds a bus. Exit status 0 if nodes were
     found and all is well, 1 if none was, two share a node-ID, or one of --hand
     is missing or another device; 2 if it could not run.
     """
-    from skinnode.cli._bus import find_bus
+    from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
     from skinnode.technician.line import Line
     from skinnode.technician.survey import survey
 
-    place = find_bus(interface, channel, bitrate, fd, hand, bus)
-    with progress(as_json) as tell, Line(place.bus) as line:
-        found = survey(line, tell)
-    faults = _faults(found, place)
+    scans: list[tuple[Place, Survey]] = []
+    with progress(as_json) as tell:
+        for place in find_buses(interface, channel, bitrate, fd, hand, bus):
+            with Line(place.bus) as line:
+                scans.append((place, survey(line, tell)))
+    named = len(scans) > 1
+    faults = [
+        f"{place.bus.name}: {fault}" if named else fault
+        for place, found in scans
+        for fault in _faults(found, place)
+    ]
     if as_json:
-        print_json(_as_json(found, place, faults))
+        print_json(_as_json(scans, faults))
     else:
-        _print(found, place, faults)
+        _print(scans, faults)
     if faults:
         raise typer.Exit(1)
 
 
 def _faults(found: Survey, place: Place) -> list[str]:
     """What is not as it should be, one line each."""
+    from skinnode.technician.line import no_answer
+    from skinnode.words import known
+
     faults = [
         f"node {node.node_id}: two nodes have this node-ID: {node.duplicate}"
         for node in found.nodes
@@ -58,33 +69,63 @@ def _faults(found: Survey, place: Place) -> list[str]:
         if node is None:
             faults.append(f"patch {patch.name!r}: no node {patch.node_id}")
         elif not node.answers:
-            faults.append(f"patch {patch.name!r}: node {patch.node_id} is {node.state} and does not answer")
+            answer = "does not answer" if not node.wrong_answer else no_answer(node.wrong_answer)
+            faults.append(f"patch {patch.name!r}: node {patch.node_id} is {node.state} and {answer}")
         elif not node.is_patch:
-            faults.append(f"patch {patch.name!r}: node {patch.node_id} is another device ({node.name})")
+            faults.append(
+                f"patch {patch.name!r}: node {patch.node_id} is another device ({node.name or 'unnamed'})"
+            )
         elif patch.serial not in (None, node.serial):
             faults.append(
-                f"patch {patch.name!r}: node {patch.node_id} has serial {node.serial}, not {patch.serial}"
+                f"patch {patch.name!r}: node {patch.node_id} has serial {known(node.serial)}, "
+                f"not {patch.serial}"
             )
     if not found.nodes and not found.unconfigured:
         faults.insert(0, "nobody answered: cable, termination, supply, bit rate?")
     return faults
 
 
-def _as_json(found: Survey, place: Place, faults: list[str]) -> dict[str, object]:
+def _as_json(scans: list[tuple[Place, Survey]], faults: list[str]) -> dict[str, object]:
+    """Return the scans as JSON, in the same shape for one bus and for several: each node names its bus."""
     from dataclasses import asdict
 
+    first = scans[0][0].bus
+    alone = {"interface": first.interface, "channel": first.channel} if len(scans) == 1 else {}
     return {
-        "interface": place.bus.interface,
-        "channel": place.bus.channel,
-        "nodes": [{**asdict(node), "patch": place.patch_name(node.node_id) or None} for node in found.nodes],
-        "unconfigured": [address._asdict() for address in found.unconfigured],
-        "more_unconfigured": found.more_unconfigured,
+        **alone,
+        "buses": [
+            {"name": place.bus.name, "interface": place.bus.interface, "channel": place.bus.channel}
+            for place, _ in scans
+        ],
+        "nodes": [
+            {**asdict(node), "patch": place.patch_name(node.node_id) or None, "bus": place.bus.name}
+            for place, found in scans
+            for node in found.nodes
+        ],
+        "unconfigured": [
+            {**address._asdict(), "bus": place.bus.name}
+            for place, found in scans
+            for address in found.unconfigured
+        ],
+        "more_unconfigured": any(found.more_unconfigured for _, found in scans),
         "faults": faults,
-        "seconds": round(found.seconds, 3),
+        "seconds": round(sum(found.seconds for _, found in scans), 3),
     }
 
 
-def _print(found: Survey, place: Place, faults: list[str]) -> None:
+def _print(scans: list[tuple[Place, Survey]], faults: list[str]) -> None:
+    from skinnode.cli._console import console
+
+    out = console()
+    for number, (place, found) in enumerate(scans):
+        if number:
+            out.print()
+        _print_bus(found, place)
+    for fault in faults:
+        out.print(f"fault: {fault}")
+
+
+def _print_bus(found: Survey, place: Place) -> None:
     from skinnode.cli._console import console, table
     from skinnode.words import counted
 
@@ -112,12 +153,13 @@ def _print(found: Survey, place: Place, faults: list[str]) -> None:
         out.print("more nodes without a node-ID: skinnode lss list")
     nodes = counted(len(found.nodes), "node")
     out.print(f"{nodes} on {place.bus.interface} {place.bus.channel}, {found.seconds:.1f} s")
-    for fault in faults:
-        out.print(f"fault: {fault}", markup=False)
 
 
 def _device(node: FoundNode, place: Place) -> str:
-    name = node.name or ("unknown, answers" if node.answers else "does not answer")
+    if node.answers:
+        name = node.name or f"unnamed, {node.profile.replace('device ', '') or 'answers'}"
+    else:
+        name = "no valid answer" if node.wrong_answer else "does not answer"
     patch = place.patch_name(node.node_id)
     return f"{name} ({patch})" if patch else name
 

@@ -6,7 +6,7 @@ tester, its SDO client and its reader of EDS files are its own.
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict
 from skinnode.conformance.dut import Dut
-from skinnode.conformance.eds import Eds, parse_eds
+from skinnode.conformance.eds import Eds, parse_eds, parse_eds_file
 from skinnode.conformance.run import Report, connect, run_case, run_cases
 from skinnode.conformance.suite import CASES, select
 
@@ -21,6 +21,7 @@ __all__ = [
     "Verdict",
     "connect",
     "parse_eds",
+    "parse_eds_file",
     "run_case",
     "run_cases",
     "select",

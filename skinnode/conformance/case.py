@@ -17,6 +17,8 @@ class Verdict(StrEnum):
     """What a case found."""
 
     PASSED = "passed"
+    WARNING = "warning"
+    """The device passes, but does something that CiA advises against or that some tools cannot handle."""
     FAILED = "failed"
     NOT_APPLICABLE = "not applicable"
 
@@ -26,9 +28,13 @@ class NotApplicable(Exception):
     the answer on the bus that says so."""
 
 
+class Warned(Exception):
+    """The device passes, but something is doubtful; the text says what."""
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One case. ``run`` raises Failed or NotApplicable, or returns."""
+    """One case. ``run`` returns if the device passes; otherwise it raises Failed, NotApplicable or Warned."""
 
     id: str
     """Area and number: "SDO-07"."""
@@ -50,7 +56,8 @@ class Result:
     case: Case
     verdict: Verdict
     why: str = ""
-    """What was expected and what came, or why the case does not apply; empty when passed."""
+    """What was expected and what was received, what is doubtful, or why the case does not apply; empty if
+    the device passed."""
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
     """The frames of the case."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Final
 
 from skinnode.conformance.bus import QUIET_S, Failed, Tester, describe
 from skinnode.conformance.case import NotApplicable
 from skinnode.conformance.eds import Eds, EdsEntry
-from skinnode.conformance.sdo import SdoClient
+from skinnode.conformance.sdo import Aborted, SdoClient
 from skinnode.errors import NodeTimeout
 
 START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
@@ -26,6 +27,8 @@ _ASK_EACH_S: Final = 0.25
 HEARTBEAT: Final = 0x1017
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 STORE, RESTORE = 0x1010, 0x1011
+_ABSENT: Final = (0x0602_0000, 0x0609_0011)
+"""SDO abort codes: object does not exist, sub-index does not exist."""
 
 
 class Dut:
@@ -68,8 +71,13 @@ class Dut:
             raise Failed(f"the boot-up message 0x{self.error_control_id:03X} [1] 00", describe(frame))
 
     def prepare(self) -> None:
-        """Reset the node to PRE-OPERATIONAL. A boot-up message that is missing is for other cases to find:
-        a node that answers is ready. Raises NodeTimeout where it stays silent."""
+        """Reset the node and bring it to PRE-OPERATIONAL. Another case (STATE-01) checks the boot-up message
+        and whether the node starts by itself; here a node that answers is ready, and is commanded to enter
+        PRE-OPERATIONAL. Raises NodeTimeout if the node stays silent."""
+        self._await_reset()
+        self.nmt(PRE_OPERATIONAL)
+
+    def _await_reset(self) -> None:
         self.bus.clear()
         self.nmt(RESET_NODE)
         self.up = False
@@ -139,7 +147,12 @@ class Dut:
         """NotApplicable where the device does not store (0x1010) or restore (0x1011) on command: bit 0 of the
         value (CiA 301, 7.5.2.13 and 7.5.2.14)."""
         self.need(index, subindex)
-        capability = self.sdo.integer(index, subindex)
+        try:
+            capability = self.sdo.integer(index, subindex)
+        except Aborted as abort:
+            if abort.code not in _ABSENT:
+                raise
+            raise NotApplicable(f"0x{index:04X}:{subindex:02X} does not exist: {abort}") from abort
         if not capability & 1:
             what = "saving on command" if index == STORE else "restoring"
             entry = f"0x{index:04X}:{subindex:02X}"
@@ -147,7 +160,8 @@ class Dut:
 
     def to_defaults(self) -> None:
         """Reset, with defaults restored where the device does that on command."""
-        if self.eds.find(RESTORE, 1) is not None and self.sdo.integer(RESTORE, 1) & 1:
+        with contextlib.suppress(NotApplicable):
+            self.need_storage(RESTORE, 1)
             self.restore(1)
         self.reset()
 

@@ -11,11 +11,15 @@ import configparser
 import re
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 from skinnode.errors import ProfileError, Shown
-from skinnode.wire.eds import no_eds
+from skinnode.input_file import read_input
+from skinnode.printable import printable
+from skinnode.wire.eds_encoding import MOST_EDS_BYTES, EdsText, for_people, octets, read_eds_text
+from skinnode.wire.eds_form import check_form, no_eds
 
 SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
@@ -23,11 +27,14 @@ SIZES: Final = {
 }  # fmt: skip
 """Bytes of a value by its data type (CiA 301 v4.2.0, table 44); types not listed vary in length."""
 
+_MOST_ENTRIES: Final = 1 << 16
 _VARIABLE: Final = (0x09, 0x0A, 0x0B, 0x0F)
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
 UNSIGNED: Final = (0x05, 0x06, 0x07, 0x16, 0x18, 0x19, 0x1A, 0x1B)
 _REAL: Final = {0x08: "<f", 0x11: "<d"}
 _TEXT: Final = 0x09
+_UNICODE: Final = 0x0B
+_OCTETS: Final = (0x0A, 0x0F)
 ACCESS: Final = ("ro", "wo", "rw", "rwr", "rww", "const")
 _READABLE: Final = ("ro", "rw", "rwr", "rww", "const")
 _WRITABLE: Final = ("wo", "rw", "rwr", "rww")
@@ -52,6 +59,8 @@ class EdsEntry:
     mappable: bool
     flags: int
     """ObjFlags: bit 0 refuse write on download, bit 1 refuse read on scan."""
+    given: bytes | None = None
+    """Default as raw bytes, if the file gives it in that form and :attr:`default` is empty."""
 
     @property
     def size(self) -> int:
@@ -82,11 +91,16 @@ class EdsEntry:
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def default_bytes(self, node_id: int) -> bytes | None:
-        """The default as it travels; None where the file has none or the length varies without a text."""
-        if not self.default:
-            return None
+        """Return the default as transferred by SDO; None if the file has none, or none known to fit the type.
+        A string is transferred as the bytes in the file. Raises ValueError if a number is malformed."""
+        if self.given is not None or not self.default:
+            return self.given
         if self.data_type == _TEXT:
-            return self.default.encode("latin-1")
+            return octets(self.default)
+        if self.data_type == _UNICODE:
+            return self.default.encode("utf-16-le") if self.default.isascii() else None
+        if self.data_type in _OCTETS:
+            return _hex(self.default)
         if not self.size:
             return None
         if self.data_type in _REAL and not self.default.lower().startswith("0x"):
@@ -141,16 +155,41 @@ def number(text: str, node_id: int = 0) -> int:
     return total
 
 
-def parse_eds(text: str, source: str) -> Eds:
-    """Read an EDS or DCF. Raises ProfileError where it is none."""
+def _hex(text: str) -> bytes | None:
+    """Return the bytes of a hexadecimal text, the form of an OCTET_STRING in CiA 306; None for other text."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        return None
+
+
+def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
+    """Read an EDS or DCF in any encoding; if that is not ASCII, the source of the Eds says so. Returns the
+    EDS and its text. Raises ConfigError, naming ``key``, if the file cannot be read, and ProfileError if it
+    is not an EDS."""
+    name, data = str(path), read_input(key, path, MOST_EDS_BYTES)
+    try:
+        read = read_eds_text(data)
+    except UnicodeDecodeError:
+        raise ProfileError("EDS", Shown("malformed UTF-16"), "a file as in CiA 306", where=name) from None
+    eds = parse_eds(read.text, name, read.codec)
+    return (replace(eds, source=f"{name}, {read.note}") if read.note else eds), read
+
+
+def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
+    """Parse an EDS or DCF. ``codec``: codec of its non-ASCII names. Raises ProfileError if it is not one."""
     parser = configparser.ConfigParser(
         interpolation=None, strict=False, comment_prefixes=(";",), delimiters=("=",), allow_no_value=True
     )
     try:
         parser.read_string(text)
     except configparser.Error as error:
-        raise no_eds(error, source) from error
+        raise no_eds(error, source, for_people(text, codec)) from error
+    check_form(for_people(text, codec), source)
     sections = {name.lower(): {k: v or "" for k, v in parser.items(name)} for name in parser.sections()}
+    for options in sections.values():
+        if "parametername" in options:
+            options["parametername"] = for_people(options["parametername"], codec)
     if "deviceinfo" not in sections or "1000" not in sections:
         raise ProfileError(
             "EDS", Shown("no section DeviceInfo or 1000"), "a file as in CiA 306", where=source
@@ -169,14 +208,20 @@ def parse_eds(text: str, source: str) -> Eds:
                 _object(entries, index, sections[title], found)
         except (ValueError, KeyError) as error:
             found.append(f"[{title}]: {error}")
-    found += _listed(sections, {index for index, _ in entries})
+        if len(entries) > _MOST_ENTRIES:  # a compact array of 60 characters has 255
+            got = Shown(f"more than {_MOST_ENTRIES} values, up to section {title}")
+            raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
     dummies = sections.get("dummyusage", {})
+    try:
+        found += _listed(sections, {index for index, _ in entries})
+        dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
+    except ValueError as error:  # a word in place of a number
+        allowed = "numbers as in CiA 306 in the lists of objects and dummies"
+        raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
         source=source,
-        device=sections["deviceinfo"],
-        dummies=frozenset(
-            kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")
-        ),
+        device={key: for_people(value, codec) for key, value in sections["deviceinfo"].items()},
+        dummies=frozenset(dummy_types),
         entries=dict(sorted(entries.items())),
         contradictions=tuple(found),
     )
@@ -197,6 +242,9 @@ def _object(
     if kind not in (_ARRAY, _RECORD):
         found.append(f"[{index:04X}]: object type 0x{kind:X}, must be 2, 7, 8 or 9")
     compact = number(options.get("compactsubobj") or "0")
+    if compact > 254:
+        found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
+        compact = 0
     if compact:  # sub-objects alike, not written one by one
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
@@ -212,7 +260,7 @@ def _add(
     entries[index, subindex] = EdsEntry(
         index,
         subindex,
-        options.get("parametername", ""),
+        printable(options.get("parametername", "")),
         data_type,
         options["accesstype"].strip().lower(),
         options.get("defaultvalue", "").strip(),

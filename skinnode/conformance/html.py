@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import datetime
-from html import escape
+import html
 from typing import Final
 
 from skinnode.conformance.case import Result, Verdict
 from skinnode.conformance.report import summary_line
 from skinnode.conformance.run import Report
+from skinnode.printable import printable_lines
 
 AREA_NAMES: Final = {
     "EDS": "Data sheet",
@@ -25,13 +26,18 @@ AREA_NAMES: Final = {
     "TRANS": "NMT transitions",
 }
 
-_CLASS: Final = {Verdict.PASSED: "passed", Verdict.FAILED: "failed", Verdict.NOT_APPLICABLE: "na"}
+_CLASS: Final = {
+    Verdict.PASSED: "passed",
+    Verdict.WARNING: "warned",
+    Verdict.FAILED: "failed",
+    Verdict.NOT_APPLICABLE: "na",
+}
 
 _STYLE: Final = """
 :root { color-scheme: light dark; --ink: #1d2430; --dim: #667085; --paper: #fff; --line: #e3e7ee; --soft:
-#f6f8fb; --ok: #18794e; --bad: #c62a2f; --na: #8a94a6; }
+#f6f8fb; --ok: #18794e; --warn: #a05c00; --bad: #c62a2f; --na: #8a94a6; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e6e9ef; --dim: #98a2b3; --paper: #14171c; --line:
-#2b313b; --soft: #1c2129; --ok: #4cc38a; --bad: #ff6369; --na: #7e8796; } }
+#2b313b; --soft: #1c2129; --ok: #4cc38a; --warn: #ffb454; --bad: #ff6369; --na: #7e8796; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 68rem; padding: 2rem 1.25rem 4rem;
   background: var(--paper); color: var(--ink);
@@ -40,10 +46,12 @@ h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.05rem; margin: 2.2rem 0 .
 p { margin: .3rem 0; } .dim, h2 span { color: var(--dim); font-weight: normal; }
 .bar { display: flex; height: .7rem; border-radius: .35rem; overflow: hidden; margin: 1.2rem 0 .6rem;
   background: var(--line); }
-.bar i { display: block; } .bar .passed { background: var(--ok); } .bar .failed { background: var(--bad); }
+.bar i { display: block; } .bar .passed { background: var(--ok); }
+.bar .warned { background: var(--warn); } .bar .failed { background: var(--bad); }
 .bar .na { background: var(--na); }
 .counts { display: flex; gap: 2rem; flex-wrap: wrap; } .counts b { font-size: 1.5rem; }
-.counts .passed b { color: var(--ok); } .counts .failed b { color: var(--bad); } .counts .na b { color:
+.counts .passed b { color: var(--ok); } .counts .warned b { color: var(--warn); }
+.counts .failed b { color: var(--bad); } .counts .na b { color:
 var(--na); } .areas { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap:
 .4rem 1.5rem; margin-top: 1.4rem; } .areas a { display: flex; align-items: center; gap: .6rem; color: inherit;
   text-decoration: none; } .areas .bar { flex: 1; margin: 0; height: .4rem; } .areas span { min-width: 4rem; }
@@ -52,6 +60,7 @@ summary { display: grid; grid-template-columns: 5.5rem 7.5rem 1fr auto; gap: .6r
   cursor: pointer; list-style: none; align-items: baseline; } summary::-webkit-details-marker { display:
   none; } summary:hover { background: var(--soft); } summary code { font-weight: 600; }
 .verdict { font-size: .8rem; font-weight: 600; } .verdict.passed { color: var(--ok); }
+.verdict.warned { color: var(--warn); }
 .verdict.failed { color: var(--bad); } .verdict.na { color: var(--na); }
 summary small { color: var(--dim); display: block; overflow-wrap: anywhere; }
 .failed small { color: var(--bad); } time { color: var(--dim); font-size: .8rem; white-space: nowrap; }
@@ -63,29 +72,33 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 """
 
 
+def _text(text: str) -> str:
+    return html.escape(printable_lines(text))
+
+
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
     """The report. ``title`` says which node on which bus; cases that failed are unfolded."""
     areas: dict[str, list[Result]] = {}
     for result in report.results:
         areas.setdefault(result.case.area, []).append(result)
     body = [
-        f"<h1>CANopen conformance: {escape(title)}</h1>",
-        f'<p class="dim">{escape(summary_line(report))}</p>',
+        f"<h1>CANopen conformance: {_text(title)}</h1>",
+        f'<p class="dim">{_text(summary_line(report))}</p>',
         f'<p class="dim">{when:%Y-%m-%d %H:%M}; clauses are of CiA 301 v4.2.0 unless they name another</p>',
         _bar(report.results),
         f'<div class="counts">{"".join(_count(report, verdict) for verdict in Verdict)}</div>',
-        *(f'<p class="verdict failed">{escape(problem)}</p>' for problem in report.problems),
+        *(f'<p class="verdict failed">{_text(problem)}</p>' for problem in report.problems),
         f'<div class="areas">{"".join(_area_link(area, results) for area, results in areas.items())}</div>',
     ]
     for area, results in areas.items():
         name = AREA_NAMES.get(area, area)
         count = f"{len(results)} case{'s' if len(results) > 1 else ''}"
-        body.append(f'<h2 id="{escape(area)}">{escape(name)} <span>{escape(area)}, {count}</span></h2>')
+        body.append(f'<h2 id="{_text(area)}">{_text(name)} <span>{_text(area)}, {count}</span></h2>')
         body += map(_case, results)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>CANopen conformance: {escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<title>CANopen conformance: {_text(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
         + "\n".join(body)
         + "\n</body>\n</html>\n"
     )
@@ -105,17 +118,17 @@ def _count(report: Report, verdict: Verdict) -> str:
 
 
 def _area_link(area: str, results: list[Result]) -> str:
-    return f'<a href="#{escape(area)}"><span>{escape(area)}</span>{_bar(results)}</a>'
+    return f'<a href="#{_text(area)}"><span>{_text(area)}</span>{_bar(results)}</a>'
 
 
 def _case(result: Result) -> str:
     kind = _CLASS[result.verdict]
-    why = f"<small>{escape(result.why)}</small>" if result.why else ""
-    frames = escape("\n".join(map(str, result.trace))) or "no frames"
+    why = f"<small>{_text(result.why)}</small>" if result.why else ""
+    frames = _text("\n".join(map(str, result.trace))) or "no frames"
     return (
         f'<details class="{kind}"{" open" if kind == "failed" else ""}><summary>'
-        f'<code>{escape(result.case.id)}</code><span class="verdict {kind}">{result.verdict}</span>'
-        f"<span>{escape(result.case.title)}{why}</span>"
-        f"<time>{escape(result.case.clause)} · {result.seconds:.2f} s</time></summary>"
+        f'<code>{_text(result.case.id)}</code><span class="verdict {kind}">{result.verdict}</span>'
+        f"<span>{_text(result.case.title)}{why}</span>"
+        f"<time>{_text(result.case.clause)} · {result.seconds:.2f} s</time></summary>"
         f"<pre>{frames}</pre></details>"
     )

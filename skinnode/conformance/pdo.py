@@ -12,6 +12,7 @@ from skinnode.conformance.case import NotApplicable
 from skinnode.conformance.dut import Dut
 from skinnode.conformance.sdo import Aborted
 from skinnode.transport import Frame
+from skinnode.words import counted
 
 INVALID: Final = 1 << 31
 NO_REMOTE: Final = 1 << 30
@@ -88,8 +89,9 @@ def set_up(
     start: int = 0,
     remote: bool = False,
 ) -> int:
-    """Disable the PDO, write its parameters (inhibit time in 100 µs), enable it; returns its CAN-ID. Raises
-    Unsupported where it does not take them."""
+    """Disable the PDO, write its parameters (inhibit time in 100 µs), enable it. Returns its CAN-ID. Discards
+    frames that the PDO sent before, as from a node that starts by itself. Raises Unsupported if the node
+    rejects the parameters."""
     cob_id = disable(dut, pdo)
     _set(dut, pdo, KIND, kind, 1)
     for subindex, value, size in ((INHIBIT, inhibit, 2), (EVENT_TIMER, event_ms, 2), (SYNC_START, start, 1)):
@@ -99,6 +101,7 @@ def set_up(
             raise Unsupported(f"{pdo} has no sub-index {subindex}")
     valid = cob_id & ~INVALID
     _set(dut, pdo, COB_ID, valid & ~NO_REMOTE if remote else valid, 4)
+    dut.bus.pending(cob_id & CAN_ID)
     return cob_id & CAN_ID
 
 
@@ -145,7 +148,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
     """The next frame of a PDO, which must have the length of its mapping."""
     frame = dut.bus.expect(can_id, what)
     if len(frame.data) != length:
-        raise Failed(f"{length} bytes as mapped, {what}", describe(frame))
+        raise Failed(f"{counted(length, 'byte')} as mapped, {what}", describe(frame))
     return frame
 
 

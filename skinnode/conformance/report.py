@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from typing import Any
 from xml.etree import ElementTree
 
 from skinnode.conformance.case import Case, Result, Verdict
 from skinnode.conformance.run import Report
+from skinnode.printable import printable_lines
+from skinnode.words import counted
 
 _ID_WIDTH = 9
 _VERDICT_WIDTH = 15
-_NOT_XML = re.compile(r"[^\t\n\r\x20-\uD7FF\uE000-\uFFFD]")
 
 
 def result_line(result: Result) -> str:
@@ -35,7 +35,8 @@ def summary_line(report: Report) -> str:
     seconds = sum(result.seconds for result in report.results)
     return (
         f"{len(report.results)} cases, {applicable} applicable: {report.count(Verdict.PASSED)} passed, "
-        f"{report.failed} failed, {not_applicable} not applicable; {seconds:.1f} s; EDS: {report.eds}"
+        f"{counted(report.count(Verdict.WARNING), 'warning')}, {report.failed} failed, "
+        f"{not_applicable} not applicable; {seconds:.1f} s; EDS: {report.eds}"
     )
 
 
@@ -45,6 +46,7 @@ def as_json(report: Report) -> dict[str, Any]:
     return {
         "eds": report.eds,
         "passed": report.count(Verdict.PASSED),
+        "warnings": report.count(Verdict.WARNING),
         "failed": report.failed,
         "not_applicable": report.count(Verdict.NOT_APPLICABLE),
         "problems": list(report.problems),
@@ -64,7 +66,8 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def as_junit(report: Report) -> str:
-    """JUnit XML, a suite an area: failures carry the frames, cases that do not apply are skipped."""
+    """Return JUnit XML with a suite for each area: failures carry the frames, cases that do not apply are
+    skipped, warnings are passed tests with the warning as their output."""
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}
     for result in report.results:
@@ -94,12 +97,14 @@ def _add_case(suite: ElementTree.Element, result: Result) -> None:
         name=f"{result.case.id} {result.case.title}",
         time=f"{result.seconds:.3f}",
     )
-    why = _NOT_XML.sub("?", result.why)
+    why = printable_lines(result.why)
     if result.verdict is Verdict.FAILED:
         failure = ElementTree.SubElement(case, "failure", message=_one_line(why), type="Failed")
         failure.text = "\n".join([why, f"CiA 301 v4.2.0, {result.case.clause}", *map(str, result.trace)])
     elif result.verdict is Verdict.NOT_APPLICABLE:
         ElementTree.SubElement(case, "skipped", message=_one_line(why))
+    elif result.verdict is Verdict.WARNING:
+        ElementTree.SubElement(case, "system-out").text = f"warning: {why}"
 
 
 def _one_line(text: str) -> str:

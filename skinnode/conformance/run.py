@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.conformance.bus import Failed, Tester
-from skinnode.conformance.case import Case, NotApplicable, Result, Verdict
+from skinnode.conformance.case import Case, NotApplicable, Result, Verdict, Warned
 from skinnode.conformance.configuration import read_configuration, write_back
 from skinnode.conformance.dut import Dut
 from skinnode.conformance.eds import Eds, parse_eds
@@ -16,7 +16,7 @@ from skinnode.conformance.sdo import SdoClient
 from skinnode.errors import BusError, ConfigError, NodeTimeout
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile, eds_name, eds_text
+from skinnode.wire.profile import BusType, PatchProfile, eds_name, eds_text
 
 SILENT_CASES: Final = 3
 """Cases in a row before which the node does not come up; the others are then not run."""
@@ -64,7 +64,9 @@ def _own_eds(sdo: SdoClient) -> Eds:
                 od.PDO_BYTES,
             )
             rows, columns, upper, lower, bits, pdo_bytes = (sdo.integer(od.DESCRIPTOR, sub) for sub in sizes)
-            patch = PatchProfile(rows, columns, upper, lower, bits, bus="classic" if pdo_bytes == 8 else "fd")
+            checked = sdo.integer(od.IDENTITY, od.IDENTITY_REVISION) > od.UNCHECKED_REVISION_NUMBER
+            bus: BusType = "classic" if pdo_bytes == 8 else "fd"
+            patch = PatchProfile(rows, columns, upper, lower, bits, bus=bus, checked=checked)
             return parse_eds(eds_text(patch), f"{eds_name(patch)}, generated")
     except Failed as failure:
         raise ConfigError(
@@ -111,6 +113,8 @@ def run_case(dut: Dut, case: Case) -> Result:
         case.run(dut)
     except NotApplicable as reason:
         verdict, why = Verdict.NOT_APPLICABLE, str(reason)
+    except Warned as doubt:
+        verdict, why = Verdict.WARNING, str(doubt)
     except (Failed, NodeTimeout) as failure:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:

@@ -12,6 +12,7 @@ from typing import Final
 
 from skinnode.conformance.bus import ANSWER_S, Failed, Tester, describe
 from skinnode.transport import Frame
+from skinnode.words import counted
 
 GENERAL_ERROR: Final = 0x0800_0000
 """A device may answer this in place of any more telling code."""
@@ -155,7 +156,7 @@ class SdoClient:
         size = int.from_bytes(answer[4:8], "little") if answer[0] & 1 else None
         data = self._read_segments(what)
         if size is not None and size != len(data):
-            raise Failed(f"{size} bytes as announced, {what}", f"{len(data)} bytes")
+            raise Failed(f"{counted(size, 'byte')} as announced, {what}", counted(len(data), "byte"))
         return data
 
     def _read_segments(self, what: str) -> bytes:
@@ -198,7 +199,7 @@ class SdoClient:
         data = data[: len(data) - (end[0] >> 2 & 7)]
         self.send(b"\xa1")
         if announced is not None and announced != len(data):
-            raise Failed(f"{announced} bytes as announced, {what}", f"{len(data)} bytes")
+            raise Failed(f"{counted(announced, 'byte')} as announced, {what}", counted(len(data), "byte"))
         if checked and int.from_bytes(end[1:3], "little") != crc16(data):
             raise Failed(f"CRC {crc16(data):04X}, {what}", f"{int.from_bytes(end[1:3], 'little'):04X}")
         return data

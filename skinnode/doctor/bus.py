@@ -33,7 +33,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "the interface does not work",
             Sure.CERTAIN,
             bus.failure,
-            "bring it up: ip link set NAME up type can bitrate BPS; see that the adapter is plugged in",
+            "bring it up: ip link set NAME up type can bitrate BPS; check that the adapter is plugged in",
         )
         return
     if bus.link_state is not None and bus.link_state not in ("ERROR-ACTIVE", "ERROR-WARNING"):
@@ -48,7 +48,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "the interface has another bit rate than the hand file",
             Sure.CERTAIN,
             f"{bus.link_bitrate_bps} bit/s, the hand file says {bus.bitrate_bps}",
-            "set one to the other: at two bit rates nobody understands anybody",
+            "set both to the same bit rate",
         )
     if bus.error_frames:
         yield found(

@@ -8,6 +8,8 @@ from typing import Final
 from skinnode.doctor import bus, configuration, nodes, skin, timing
 from skinnode.doctor.facts import BusFacts, Finding, Sure
 from skinnode.doctor.quiet import LEAST_SCANS
+from skinnode.technician.line import no_answer
+from skinnode.wire.emergency import register_text
 from skinnode.words import counted
 
 _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
@@ -33,6 +35,26 @@ def diagnose(facts: BusFacts) -> list[Finding]:
     ]
 
 
+def others(facts: BusFacts) -> list[str]:
+    """Describe each device that is neither a patch nor in the hand file, in one line: what it is, not what is
+    wrong."""
+    lines = []
+    for node in facts.strangers:
+        if node.is_patch:
+            continue
+        why = f" ({node.state_known_by})" if node.state == "unknown" else ""
+        known = [*node.identity, f"NMT state {node.state}{why}"]
+        if not node.answers:
+            known.append(no_answer(node.wrong_answer))
+        if node.error_register:
+            register = register_text(node.error_register)
+            known.append(f"error register 0x{node.error_register:02X} ({register})")
+        name = f" ({node.name})" if node.name else ""
+        whose = "not a skinnode patch" if facts.period_s is None else "not in the hand file"
+        lines.append(f"{facts.name}: node {node.node_id}{name}, {whose}: {', '.join(known)}")
+    return lines
+
+
 def not_judged(facts: BusFacts) -> list[str]:
     """What could not be looked at, and why, a line each."""
     if facts.failure:
@@ -53,8 +75,8 @@ def not_judged(facts: BusFacts) -> list[str]:
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(
-                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the noise told, "
-                f"{patch.scans.told_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch it while the "
-                "doctor listens; if this comes again, the converter has stopped"
+                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the stated "
+                f"noise, {patch.scans.told_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch the "
+                "patch while the doctor listens; if this line comes again, the converter has stopped"
             )
     return lines

@@ -57,7 +57,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """As the host sets them; judged only where a host has been: a node at its defaults gets them later."""
+    """Compare the PDOs with what the host sets. A value that the host has yet to write is no fault."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:
@@ -103,8 +103,11 @@ def _check_inhibit(
     own = patch.info.patch if patch.info is not None else None
     assert own is not None
     sizes = own.upper_wires, own.lower_wires, own.upper_electrodes, own.lower_electrodes, own.code_bits
-    chunks = PatchProfile(*sizes, bus="classic" if own.pdo_bytes == 8 else "fd").n_chunks
-    inhibit_s = (chunk.inhibit_100us or 0) * 1e-4
+    profile = PatchProfile(*sizes, bus="classic" if own.pdo_bytes == 8 else "fd")
+    at_default = chunk.inhibit_100us == profile.default_inhibit_100us
+    if at_default and not running and patch.inhibit_100us is not None:
+        return  # no host has configured the node since it was powered up; bring-up replaces the default
+    chunks, inhibit_s = profile.n_chunks, (chunk.inhibit_100us or 0) * 1e-4
     if chunks * inhibit_s > period_s:
         yield found(
             "a scan takes longer than a SYNC period",

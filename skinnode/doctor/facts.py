@@ -83,7 +83,7 @@ class PatchFacts:
     layout_hash: int | None = None
     """The one that the hand file asks for."""
     inhibit_100us: int | None = None
-    """The one that the host sets."""
+    """Inhibit time that the host sets; None if it configures no node of this bus."""
     eds_problem: str = ""
     """Why the EDS of the hand file is not that of the patch; empty where it is, or where none is given."""
     found: FoundNode | None = None
@@ -130,12 +130,15 @@ class BusFacts:
     sync_counters: tuple[int, ...] = ()
     """As they came with them; 0 where there was none."""
     sync_ours: bool = False
+    own_period_s: float = 0.0
+    """Period of our own SYNC; 0 if another node sends it. Longer than ``period_s`` if a node that no host has
+    configured needs longer for a scan."""
     active: bool = False
     """Whether nodes that do not run were to be started."""
     role: str = "master"
     """Of the host on this bus, as the hand file says."""
     nmt_commands: int = 0
-    """Heard; none of them is ours."""
+    """NMT commands heard that a host of this hand does not send."""
     master_node_id: int | None = None
     """With which the host beats, as the hand file says."""
     master_beats_s: Float | None = None

@@ -7,7 +7,7 @@ import functools
 import json
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Final, TypeVar
 
@@ -25,7 +25,7 @@ from skinnode.technician.sheet import read_profile
 from skinnode.technician.survey import survey
 from skinnode.wire import indices as od
 from skinnode.wire.codec import CodeScale
-from skinnode.wire.plan import inhibit_time_100us
+from skinnode.wire.plan import SCAN_SHARE, inhibit_time_100us
 from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
@@ -84,12 +84,14 @@ def _wanted(patch: PatchConfig, hand: HandConfig, bus: BusConfig) -> PatchFacts:
         except ProfileError as error:
             problem = str(error)
     known = patch.layout.coordinates == "preset"
+    configures = bus.role == "master" or bus.guest_sends == "sdo"
+    inhibit_100us = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1)
     return PatchFacts(
         patch.name,
         patch.node_id,
         patch,
         layout_hash=patch.layout.build().layout_hash if known else None,
-        inhibit_100us=inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1),
+        inhibit_100us=inhibit_100us if configures else None,
         eds_problem=problem,
     )
 
@@ -118,6 +120,8 @@ def _examine(
                 profiles[patch.node_id] = profile
         asked.append(replace(patch, found=node))
     period_s = facts.period_s or DEFAULT_PERIOD_MS * 1e-3
+    if active:
+        period_s = max([period_s, *(_scan_s(patch, profiles) for patch in asked)])
     ours, load = _listen(line, capture, asked, profiles, period_s, active, facts.name, progress)
     stats = line.link.stats()
     heard = line.heard
@@ -129,14 +133,15 @@ def _examine(
         error_frames=heard.errors,
         dropped=stats.dropped,
         outages=stats.outages,
-        foreign=_foreign(heard, list(nodes)),
+        foreign=_foreign(heard, {*nodes, *(patch.node_id for patch in patches)}, line.bus),
         unconfigured=found.unconfigured,
         strangers=tuple(n for n in found.nodes if n.node_id not in {p.node_id for p in asked}),
         sync_s=np.empty(0) if ours else np.array([t_ns for t_ns, _ in list(capture.syncs)]) * 1e-9,
         sync_counters=() if ours else tuple(counter for _, counter in list(capture.syncs)),
         sync_ours=ours,
+        own_period_s=period_s if ours else 0.0,
         active=active,
-        nmt_commands=heard.cob_ids[od.NMT_COB_ID],
+        nmt_commands=_commands_of_others(heard, {patch.node_id for patch in patches}),
         master_beats_s=None
         if facts.master_node_id is None
         else np.array([beat.t_ns for beat in list(heard.node(facts.master_node_id).beats)]) * 1e-9,
@@ -203,6 +208,22 @@ def _listen(
             line.link.send(od.NMT_COB_ID, bytes((_PRE_OPERATIONAL, node_id)))
 
 
+def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
+    """Return the shortest SYNC period, s, at which a node that no host has configured finishes each scan
+    before the next; 0 for any other node. Bring-up sets an inhibit time that fits the hand's period."""
+    profile = profiles.get(patch.node_id)
+    if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
+        return 0.0
+    default = profile.default_inhibit_100us
+    if all(
+        pdo.inhibit_100us != default
+        for pdo in patch.info.pdos
+        if pdo.cob_id == od.chunk_cob_id(patch.node_id)
+    ):
+        return 0.0
+    return (profile.n_chunks + 1) * default * 1e-4 / SCAN_SHARE
+
+
 def _overflow(line: Line, node_id: int) -> int:
     read = functools.partial(line.od(node_id).read, od.SYNC_COUNTER_OVERFLOW, 0, "u8")
     value = int(_asked(read)[0] or 0)
@@ -222,11 +243,23 @@ def _with_scans(
     return replace(patch, boot_ups=node.boot_ups, emergencies=tuple(node.emergencies), scans=scans)
 
 
-def _foreign(heard: Heard, node_ids: Sequence[int]) -> dict[int, int]:
-    """COB-IDs that neither the services nor the nodes found explain: those of the pre-defined connection set
-    of a node that was found belong to it, whatever it is."""
+def _commands_of_others(heard: Heard, node_ids: Collection[int]) -> int:
+    """Count NMT commands that a host of this hand does not send: it starts its patches one by one, and
+    commands them to pre-operational. A second host of the same hand is detected by its SYNCs."""
+    return sum(
+        count
+        for data, count in dict(heard.nmt).items()
+        if len(data) != 2 or data[0] not in (_START, _PRE_OPERATIONAL) or data[1] not in node_ids
+    )
+
+
+def _foreign(heard: Heard, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
+    """Count the frames of COB-IDs that neither the services, nor the nodes, nor ``others`` of the hand file
+    explain. COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the
+    device; those of a patch of the hand that does not answer come from a host that polls it."""
     kinds = {0x080, *range(0x180, 0x680, 0x80), 0x700}
     explained = {kind + node_id for kind in kinds for node_id in node_ids} | _KNOWN_TO_ALL
+    explained |= {other.can_id for other in bus.others}
     return {cob_id: count for cob_id, count in dict(heard.cob_ids).items() if cob_id not in explained}
 
 

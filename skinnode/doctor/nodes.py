@@ -6,8 +6,9 @@ from collections import Counter
 from collections.abc import Iterator
 
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
+from skinnode.technician.line import no_answer
 from skinnode.wire.emergency import error_text, register_text
-from skinnode.words import counted
+from skinnode.words import counted, known
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:
@@ -27,13 +28,22 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
     for patch in bus.patches:
         yield from _check_node(bus, patch)
     for node in bus.strangers:
+        if node.duplicate:
+            yield Finding(
+                "nodes",
+                bus.name,
+                f"two nodes have node-ID {node.node_id}",
+                Sure.CERTAIN if "answers" in node.duplicate else Sure.LIKELY,
+                node.duplicate,
+                "unplug one and give it another node-ID",
+            )
         if node.is_patch:
             yield Finding(
                 "nodes",
                 bus.name,
                 f"patch at node {node.node_id} is not in the hand file",
                 Sure.CERTAIN,
-                f"serial {node.serial}, {node.state}",
+                f"serial {known(node.serial)}, {node.state}",
                 "add it, or give it the node-ID that it should have (skinnode lss set)",
             )
 
@@ -47,7 +57,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "the node is not there",
             Sure.CERTAIN,
-            f"node {patch.node_id} neither answers nor beats; others on {bus.name} do",
+            f"node {patch.node_id} neither answers SDO nor sends heartbeats; other nodes on {bus.name} do",
             "its supply and connector; skinnode scan shows whether it has another node-ID",
         )
         return
@@ -60,9 +70,9 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         )
     if not node.answers:
         yield found(
-            f"the node is {node.state} and does not answer",
+            f"the node is {node.state} and does not answer{' as CiA 301 says' if node.wrong_answer else ''}",
             Sure.CERTAIN,
-            "its heartbeat is heard",
+            "its heartbeat is heard" + (f"; it {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
             f"skinnode nmt {patch.node_id} reset-communication",
         )
         return
@@ -70,7 +80,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "another device has its node-ID",
             Sure.CERTAIN,
-            f"{node.name!r}, vendor {node.vendor_id}, product {node.product_code}",
+            ", ".join([f"'{node.name}'" if node.name else "unnamed", *node.identity]),
             "give one of them another node-ID",
         )
         return
@@ -78,7 +88,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "another patch than the hand file says",
             Sure.CERTAIN,
-            f"serial {node.serial}, the hand file says {wanted.serial}",
+            f"serial {known(node.serial)}, the hand file says {wanted.serial}",
             "two patches exchanged? Put them back, or correct the hand file and its calibration",
         )
     if patch.failure:
@@ -104,13 +114,15 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the node reports an error",
             Sure.CERTAIN,
             f"error register 0x{info.error_register:02X} ({register_text(info.error_register)}); "
-            f"last: {info.errors[0] if info.errors else 'none told'}",
-            "what it says is wrong; skinnode info has its history",
+            f"last: {info.errors[0] if info.errors else 'none reported'}",
+            "fix the fault it names; skinnode info shows its history",
         )
     told = [emergency for emergency in patch.emergencies if emergency.code]
     if told:
-        kinds = Counter(error_text(emergency.code, emergency.detail) for emergency in told)
+        kinds = Counter(
+            error_text(emergency.code, emergency.detail, ours=node.is_patch) for emergency in told
+        )
         shown = "; ".join(f"{count} × {text}" for text, count in kinds.most_common(3))
         yield found(
-            "emergency messages while it was watched", Sure.CERTAIN, shown, "the cause is what they name"
+            "emergency messages while it was watched", Sure.CERTAIN, shown, "fix the faults they name"
         )

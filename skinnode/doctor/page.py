@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from skinnode.doctor.checks import not_judged
+from skinnode.doctor.causes import Group
+from skinnode.doctor.checks import not_judged, others
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts
 from skinnode.doctor.quiet import LEAST_SCANS, analyse
 from skinnode.model.layout import Float
+from skinnode.printable import printable_lines
+from skinnode.words import counted, known
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
@@ -28,17 +31,18 @@ svg { max-width: 100%; height: auto; margin-top: 1.2rem }
 """
 
 
-def as_html(buses: Sequence[BusFacts], findings: Sequence[Finding], title: str) -> str:
+def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> str:
     """The report. Needs matplotlib where there are scans."""
     when = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
     parts = [
         "<!doctype html>",
         f'<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}: examination</title>',
         f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{_text(title)}: {len(findings)} finding{'' if len(findings) == 1 else 's'}</h1>",
+        f"<h1>{_text(title)}: {counted(len(groups), 'finding')}</h1>",
         f"<p>{_text(when)}</p>",
-        *(_finding(finding) for finding in findings),
-        *([] if findings else ["<p>Nothing is wrong with what was looked at.</p>"]),
+        *(_group(group) for group in groups),
+        *([] if groups else ["<p>No fault found in what was checked.</p>"]),
+        *(f"<p>Also on the bus: {_text(line)}</p>" for bus in buses for line in others(bus)),
         *(f"<p>Not judged: {_text(line)}</p>" for bus in buses for line in not_judged(bus)),
     ]
     for bus in buses:
@@ -48,14 +52,20 @@ def as_html(buses: Sequence[BusFacts], findings: Sequence[Finding], title: str) 
 
 
 def _text(text: object) -> str:
-    return html.escape(str(text))
+    return html.escape(printable_lines(str(text)))
 
 
-def _finding(finding: Finding) -> str:
+def _group(group: Group) -> str:
+    """Render a cause with its probable consequences below it."""
+    below = "".join(_finding(finding) for finding in group.consequences)
+    return _finding(group.cause, f"<p>Probable consequences:</p>{below}" if below else "")
+
+
+def _finding(finding: Finding, below: str = "") -> str:
     return (
         f'<div class="finding {finding.sure}"><p><b>{_text(finding.where)}: {_text(finding.what)}</b> '
         f'<span class="sure">{finding.sure}</span></p><p>{_text(finding.evidence)}</p>'
-        f"<p>→ {_text(finding.advice)}</p></div>"
+        f"<p>→ {_text(finding.advice)}</p>{below}</div>"
     )
 
 
@@ -77,7 +87,7 @@ def _patch(patch: PatchFacts) -> str:
     if node is None:
         rows.append(("state", "not there"))
     else:
-        rows += [("state", node.state), ("serial", node.serial)]
+        rows += [("state", node.state), ("serial", known(node.serial))]
     if patch.info is not None and patch.info.patch is not None:
         own = patch.info.patch
         rows.append(("layout", f"{own.layout}, {own.upper_wires} × {own.lower_wires} wires"))
@@ -100,7 +110,9 @@ def _maps(scans: ScanFacts) -> str:
     """Noise over what is told, and R/R0, crossing by crossing."""
     quiet = analyse(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
-    title = "noise / noise told, grey: none" + (", with what a touch left in it" if quiet.is_touched else "")
+    title = "noise / stated noise, grey: none" + (
+        ", including the effect of a touch" if quiet.is_touched else ""
+    )
     _map(figure, axes[0], quiet.noise / quiet.told, title, "viridis", 0.0, None)
     off = 100 * (quiet.level - 1.0)
     known = off[np.isfinite(off)]

@@ -13,6 +13,7 @@ import numpy as np
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts, Sure
 from skinnode.doctor.quiet import LEAST_SCANS, Mask, Quiet, analyse
 from skinnode.model.layout import Float
+from skinnode.wire.codec import TIME_WRAP_US
 from skinnode.words import counted
 
 NOISY: Final = 5.0
@@ -128,7 +129,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, quiet: Quiet) -> Iterator[
     figures = ""
     if noisy.any():
         median, worst = float(np.median(quiet.noise[noisy])), float(np.max(factor[noisy]))
-        figures = f"{median:.1e} of R0 in the median, {worst:.0f} times what is told at worst, {over}"
+        figures = f"{median:.1e} of R0 in the median, {worst:.0f} times the stated noise at worst, {over}"
     all_alike = noisy.sum() > 0.5 * judged.sum()
     if quiet.is_touched:
         levels = (quiet.floor, np.median(quiet.upper), np.median(quiet.lower))
@@ -139,7 +140,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, quiet: Quiet) -> Iterator[
             Sure.LIKELY,
             f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
             if all_alike
-            else f"all crossings together, {quiet.supply:.0f} times what is told, {over}",
+            else f"all crossings together, {quiet.supply:.0f} times the stated noise, {over}",
             "supply and shield of the patch; is relative_noise in the hand file the converter's?",
         )
         return
@@ -168,7 +169,7 @@ def _stands_out(levels: Float, wire: int) -> bool:
 
 
 def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
-    device = scans.device_us[scans.device_us >= 0]
+    device = scans.device_us[scans.device_us >= 0] % TIME_WRAP_US  # upper bits: host clock
     if len(device) >= LEAST_SCANS and len(np.unique(device)) == 1:
         yield Finding(
             "wires",
@@ -186,7 +187,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             "the values are frozen",
             Sure.LIKELY,
             f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
-            f"though a noise of {scans.told_noise:.0e} is told and a code is {scans.step:.0e}",
+            f"though the stated noise is {scans.told_noise:.0e} and a code is {scans.step:.0e}",
             "the converter has stopped: power the patch off and on",
         )
 
@@ -220,7 +221,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 f"{counted(own.baseline_missing, 'crossing has', 'crossings have')} no baseline",
                 Sure.CERTAIN,
                 "R0 is 0 (0x2301)",
-                f"leave the skin alone and tare: skinnode od {patch.node_id} 2021:4 --write 0x65726174",
+                f"leave the skin alone: skinnode tare {patch.node_id}",
             )
     for patch, scans, quiet in _judged(bus):
         at_rest = np.isfinite(quiet.level) & ~quiet.touched & ~quiet.steps
@@ -238,7 +239,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 "the baseline is no longer that of the skin at rest",
                 Sure.LIKELY,
                 figures,
-                "temperature or age: tare with nothing touching the skin",
+                "temperature or age: skinnode tare with nothing touching the skin",
             )
         elif share > 0.02 and not quiet.is_touched:
             yield Finding(
@@ -247,7 +248,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 "a part of the skin is not at its baseline",
                 Sure.POSSIBLE,
                 figures,
-                "something presses there; if nothing does, tare",
+                "something presses there; if nothing does, skinnode tare",
             )
 
 

@@ -70,12 +70,13 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
         if patch.scans is None or bus.period_s is None:
             continue
         latency_s = patch.scans.latency_s[np.isfinite(patch.scans.latency_s)]
-        if len(latency_s) and float(np.median(latency_s)) > _LATE * bus.period_s:
+        period_s = max(bus.period_s, bus.own_period_s)
+        if len(latency_s) and float(np.median(latency_s)) > _LATE * period_s:
             yield found(
                 patch.name,
                 "scans end when the next has begun",
                 Sure.CERTAIN,
-                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {bus.period_s * 1e3:g} ms",
+                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
                 "a shorter inhibit time, a longer period, less load on the bus",
             )
 
@@ -123,13 +124,21 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 counted(stats.conflicts, "time"),
                 "two nodes with one node-ID: skinnode scan",
             )
-        wrong = stats.bad_length + stats.bad_index + stats.bad_counter
+        if stats.scans_corrupt:
+            yield found(
+                patch.name,
+                "codes are not those that the node packed",
+                Sure.CERTAIN,
+                f"the check of {stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed",
+                "check gateways on the path, memory and software of the node; CAN itself detects bus errors",
+            )
+        wrong = stats.bad_length + stats.bad_index + stats.bad_counter + stats.bad_form
         if wrong:
             yield found(
                 patch.name,
                 "frames that are no chunks of this patch",
                 Sure.CERTAIN,
                 f"{stats.bad_length} of wrong length, {stats.bad_index} of wrong index, "
-                f"{stats.bad_counter} of wrong counter",
+                f"{stats.bad_counter} of wrong counter, {stats.bad_form} summaries without a check",
                 "another node uses its COB-IDs, or its mapping was changed",
             )

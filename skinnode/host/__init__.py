@@ -1,4 +1,42 @@
-"""The host: discover, configure, start, supervise; receive, assemble, solve, publish."""
+"""The host: discover, configure, start, supervise; receive, assemble, solve, publish.
+
+**Containment.** No exception ends a thread of the host. An exception raised while serving a patch makes that
+patch faulty with the reason: its scans are withheld, and it is brought up again after a pause of 0.1 s that
+doubles with each defect, up to 1 s; a boot-up of the node ends the pause. An exception raised while serving a
+bus pauses that bus, or reopens its interface, after the same pauses. An exception raised while serving a
+subscriber, a callback or a tap loses only the item meant for it. All exceptions are counted by subject
+(``Host.stats().defects``), published as events, and logged once for each distinct complaint:
+:mod:`skinnode.host.containment`.
+
+==========  ==============================  ==============================  ==============================
+thread      calls                           an exception there affects      recovers
+==========  ==============================  ==============================  ==============================
+receive     the port                        the bus: it is away             interface reopened
+receive     anything else                   a look at the interface         20 ms later
+mainline    handlers, pollers, jobs of a    the frame or call; the patch    patch brought up again
+            patch                           is faulty
+mainline    other handlers, listeners       the frame or batch, for them    with the next
+mainline    its queue, counting, the load   the bus: it pauses, or lacks a  after the pause
+                                            figure
+reopen      the port, a new receive thread  that attempt                    after the pause
+sync        a bus                           one SYNC of that bus            with the next SYNC
+solve       decoding, solving               the scan; the patch is faulty   patch brought up again
+solve       a subscriber's queue            that subscriber's field         with the next field
+supervisor  the state of a patch            the patch is faulty             patch brought up again
+supervisor  the master's heartbeat          one heartbeat on that bus       with the next
+rejoin      SDO                             that transfer                   tried three times
+rejoin      bring-up, baseline, register    the patch is faulty             patch brought up again
+rejoin      search by LSS                   that search                     after a second
+bring-up    a node, at the start            that attempt                    tried three times
+health      patches, buses, defects         one check of them               50 ms later; events may repeat
+health      a subscriber of events          that subscriber's event         with the next
+callback    the program's function          that field, of that callback    with the next field
+record      the disk                        the recording                   never; the host continues
+record      anything else                   that entry                      with the next
+any         a tap                           that entry, of that tap         with the next
+the user's  subscriptions, hand frames      that iteration                  when iterated again
+==========  ==============================  ==============================  ==============================
+"""
 
 from skinnode.host.facade import Host, HostStats
 from skinnode.host.hand_frame import HandFrame

@@ -16,10 +16,10 @@ def discrepancies(stats: HostStats) -> list[str]:
     ===========  ==========================================================================================
     of a bus     frames read = received + ignored + error frames + dropped + waiting
     of a bus     received = foreign + handled, the PDOs of its patches among the handled
-    of a bus     malformed = those of wrong length of its patches, and of SDO, heartbeat and EMCY
-    of a patch   frames = accepted + duplicates + conflicts + late + of wrong length, index, counter
-    of a patch   scans assembled, complete or torn = offered + withheld + partial
-    of a patch   offered = solved + skipped
+    of a bus     malformed = those of wrong length or form of its patches, and of SDO, heartbeat, EMCY
+    of a patch   frames = accepted + duplicates + conflicts + late + of wrong length, index, counter, form
+    of a patch   scans assembled, complete, torn or unchecked = offered + withheld + partial
+    of a patch   offered = solved + failed + skipped
     ===========  ==========================================================================================
     """
     found: list[str] = []
@@ -31,10 +31,13 @@ def discrepancies(stats: HostStats) -> list[str]:
     pdos = sum(lane.frames for lane in stats.patches.values())
     if pdos > handled:
         found.append(f"got {pdos} PDOs, must be at most the {handled} frames that were handled")
-    rejected = sum(lane.assembler.bad_length for lane in stats.patches.values())
+    assemblers = [lane.assembler for lane in stats.patches.values()]
+    rejected = sum(each.bad_length + each.bad_form for each in assemblers)
     malformed = sum(bus.malformed for bus in stats.buses.values())
     if rejected > malformed:
-        found.append(f"got {rejected} PDOs of wrong length, must be at most the {malformed} malformed frames")
+        found.append(
+            f"got {rejected} PDOs of wrong length or form, must be at most the {malformed} malformed frames"
+        )
     return found
 
 
@@ -57,7 +60,8 @@ def losses_of_lane(lane: LaneStats) -> dict[str, str]:
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
         ("scans_missed", "scan missed", "scans missed"),
-        ("scans_mixed", "scan thrown away as mixed", "scans thrown away as mixed"),
+        ("scans_mixed", "scan discarded as mixed", "scans discarded as mixed"),
+        ("scans_corrupt", "scan discarded by its check", "scans discarded by their check"),
         ("chunks_lost", "chunk lost", "chunks lost"),
         ("summaries_lost", "summary lost", "summaries lost"),
     )
@@ -75,6 +79,7 @@ def frames_counted(assembler: AssemblerStats) -> int:
         + assembler.bad_length
         + assembler.bad_index
         + assembler.bad_counter
+        + assembler.bad_form
     )
 
 
@@ -91,9 +96,14 @@ def _of_lane(lane: LaneStats) -> list[str]:
             "scans offered or withheld",
             lane.offered + lane.withheld + lane.partial,
             "those assembled",
-            assembler.scans_complete + assembler.scans_torn,
+            assembler.scans_complete + assembler.scans_torn + assembler.scans_unchecked,
         ),
-        *_unless_equal("scans offered", lane.offered, "those solved or skipped", lane.solved + lane.skipped),
+        *_unless_equal(
+            "scans offered",
+            lane.offered,
+            "those solved, failed or skipped",
+            lane.solved + lane.failed + lane.skipped,
+        ),
     ]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
 from skinnode.host.hand_files import load_baseline
-from skinnode.host.network import RemoteOd
+from skinnode.host.network import Abandoned, RemoteOd
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.wire import indices as od
@@ -24,6 +24,7 @@ from skinnode.wire.codec import CodeScale
 from skinnode.wire.coordinates import unpack_coordinates
 from skinnode.wire.plan import inhibit_time_100us
 from skinnode.wire.profile import PatchProfile
+from skinnode.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
 """How long a node may take to answer for the first time; controllers boot and tare within a second."""
@@ -39,6 +40,9 @@ _INVALID: Final = 1 << 31
 _NO_OBJECT: Final = 0x0602_0000
 _NO_COMMAND: Final = 0x0504_0001
 """Abort codes: object does not exist; command specifier (such as that of a block transfer) unknown."""
+
+_INCOMPATIBLE: Final = 0x0604_0043
+"""SDO abort code of 0x1016: another entry has the same node-ID."""
 
 _POLL_S: Final = 0.02
 
@@ -57,14 +61,12 @@ class NodeFacts:
     """None where nobody could ask."""
     heartbeat_s: float
     """How often the node sends one."""
+    checked: bool = False
+    """Whether the node is known to send a check with every scan; False if its revision could not be read."""
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
         """The same patch after a tare."""
         return replace(self, baseline_ohm=baseline_ohm)
-
-
-class Abandoned(Exception):
-    """Somebody gave up on the bring-up; this node stops where it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +93,17 @@ class Bringer:
         or does not keep its configuration, SdoAbort where it refuses, ConfigError for a baseline file that
         does not fit the patch.
         """
-        master = self.bus.role == "master"
-        if not (master or self.bus.guest_sends == "sdo"):
+        if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
             return self._from_files(patch, profile)
+        with remote.until(self.abandoned):
+            return self._bring_up(patch, profile, remote)
+
+    def _bring_up(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
+        master = self.bus.role == "master"
         self._wait_for(patch, remote)
         self.on_answer(patch)
-        serial = self._identify(patch, remote)
+        serial, revision = self._identify(patch, remote)
+        profile = replace(profile, checked=revision > od.UNCHECKED_REVISION_NUMBER)
         layout = self._check_layout(patch, profile, remote)
         if master:
             stand_by(self.send, patch.node_id)
@@ -108,8 +115,10 @@ class Bringer:
             remote.read(od.DESCRIPTOR, od.CODE_LO, "f32"),
             remote.read(od.DESCRIPTOR, od.CODE_HI, "f32"),
         )
-        baseline_ohm = self.settle_baseline(patch, profile, remote)
-        return NodeFacts(patch, layout, profile, scale, baseline_ohm, serial, heartbeat_s)
+        baseline_ohm = self._settle_baseline(patch, profile, remote)
+        return NodeFacts(
+            patch, layout, profile, scale, baseline_ohm, serial, heartbeat_s, checked=profile.checked
+        )
 
     def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
         assert patch.baseline is not None  # the hand file was checked
@@ -133,7 +142,8 @@ class Bringer:
                     f"allowed: one within {self.boot_deadline_s:g} s",
                 )
 
-    def _identify(self, patch: PatchConfig, remote: RemoteOd) -> int:
+    def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
+        """Return the node's serial number and revision number."""
         for subindex, what, wanted in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
@@ -141,14 +151,14 @@ class Bringer:
             got = remote.read(od.IDENTITY, subindex, "u32")
             if got != wanted:
                 raise _mismatch(patch, what, f"0x{got:08X}", f"0x{wanted:08X} (a skinnode patch)")
-        revision = remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32")
+        revision = int(remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32"))
         if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision names the CANopen behaviour
             allowed = f"{od.REVISION_NUMBER >> 16}.x"
             raise _mismatch(patch, "revision", f"{revision >> 16}.{revision & 0xFFFF}", allowed)
         serial = int(remote.read(od.IDENTITY, od.IDENTITY_SERIAL, "u32"))
         if patch.serial is not None and serial != patch.serial:
             raise _mismatch(patch, "serial number", str(serial), f"{patch.serial} as in the hand file")
-        return serial
+        return serial, revision
 
     def _check_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
         for subindex, what, wanted in (
@@ -179,7 +189,7 @@ class Bringer:
         try:
             return unpack_coordinates(data, profile, resistivity)
         except ValueError as error:  # ConfigError is one
-            raise _mismatch(patch, "electrode coordinates", f"{len(data)} bytes", str(error)) from None
+            raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
         """What a master decides: SYNC, and whose heartbeat is watched."""
@@ -190,11 +200,12 @@ class Bringer:
         remote.configure(od.CYCLE_PERIOD, 0, "u32", 0)
         remote.configure(od.SYNC_COUNTER_OVERFLOW, 0, "u8", sync.counter_overflow)
         remote.configure(od.CYCLE_PERIOD, 0, "u32", sync.period_ms * 1000)
+        _open_window(remote)
         watched = 0
         if self.bus.heartbeat_node_id is not None:
             within_ms = HEARTBEATS_WATCHED * self.hand.bring_up.heartbeat_ms
             watched = self.bus.heartbeat_node_id << 16 | within_ms
-        remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
+        _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
         """Tell the node to beat; a guest does so only where nobody else has. Returns the period, s."""
@@ -239,7 +250,8 @@ class Bringer:
                 remote.configure(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """The profile's mapping is the only one that the decoder understands."""
+        """Check that the PDOs have the mapping of the node's revision, the only one that the decoder
+        understands."""
         wanted = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(wanted[index][0].default or 0)
@@ -255,6 +267,10 @@ class Bringer:
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         """(U, K) R0 that the node encodes with, in ohm: its own or, written to it where it differs, that of
         the file. A node that still tares itself has zeros; it may take the boot deadline."""
+        with remote.until(self.abandoned):
+            return self._settle_baseline(patch, profile, remote)
+
+    def _settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         wanted = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = time.monotonic() + self.boot_deadline_s
         while True:
@@ -283,13 +299,15 @@ class Bringer:
         frames and single reads are 600: at 1 Mbit/s 86 ms, at the node's own pace, against 75 ms plus 300
         times what a node takes to answer, and never the bus whole."""
         try:
-            data = remote.read_block(od.BASELINE_DOMAIN)
+            data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
         except SdoAbort as abort:
             if abort.code not in (_NO_OBJECT, _NO_COMMAND):
                 raise
             return self._read_baseline_singly(profile, remote)
         if len(data) != 4 * profile.n_codes:
-            raise _mismatch(patch, "baseline (0x2301)", f"{len(data)} bytes", f"{4 * profile.n_codes} bytes")
+            raise _mismatch(
+                patch, "baseline (0x2301)", counted(len(data), "byte"), f"{4 * profile.n_codes} bytes"
+            )
         return np.frombuffer(data, dtype="<f4").reshape(profile.rows, profile.columns).astype(np.float64)
 
     def _read_baseline_singly(self, profile: PatchProfile, remote: RemoteOd) -> Float:
@@ -301,6 +319,18 @@ class Bringer:
         return baseline
 
 
+def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
+    """Read back what decides whether the node sends scans: True if it is as a master configures it. A node
+    that was reset unseen while it was brought up, or was configured by another master, has other values.
+    Raises as :class:`RemoteOd`."""
+    wanted = (
+        (od.SYNC_COUNTER_OVERFLOW, 0, "u8", hand.sync.counter_overflow),
+        (od.TPDO1_PARAMETER, od.PDO_COB_ID, "u32", od.chunk_cob_id(patch.node_id)),
+        (od.TPDO2_PARAMETER, od.PDO_COB_ID, "u32", od.summary_cob_id(patch.node_id)),
+    )
+    return all(remote.read(index, subindex, kind) == value for index, subindex, kind, value in wanted)
+
+
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
     """NMT: go operational."""
     send(od.NMT_COB_ID, bytes([_NMT_START, node_id]))
@@ -309,6 +339,31 @@ def start(send: Callable[[int, bytes], None], node_id: int) -> None:
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
     """NMT: go pre-operational; the node falls silent but for its heartbeat and SDO."""
     send(od.NMT_COB_ID, bytes([_NMT_PRE_OPERATIONAL, node_id]))
+
+
+def _open_window(remote: RemoteOd) -> None:
+    """Disable the synchronous window (0x1007), because a summary follows only after its whole scan. A node
+    without the object has no window."""
+    try:
+        remote.configure(od.SYNC_WINDOW, 0, "u32", 0)
+    except SdoAbort as abort:
+        if abort.code != _NO_OBJECT:
+            raise
+
+
+def _watch_master(remote: RemoteOd, watched: int) -> None:
+    """Write entry 1 of 0x1016, which watches the host. Other entries stay unchanged, except one that also
+    watches the host: a node-ID may occur only once."""
+    try:
+        remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
+    except SdoAbort as abort:
+        if abort.code != _INCOMPATIBLE:
+            raise
+        for subindex in range(2, int(remote.read(od.HEARTBEAT_CONSUMER, 0, "u8")) + 1):
+            entry = int(remote.read(od.HEARTBEAT_CONSUMER, subindex, "u32"))
+            if entry >> 16 == watched >> 16:
+                remote.configure(od.HEARTBEAT_CONSUMER, subindex, "u32", 0)
+        remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
 
 
 def _mismatch(patch: PatchConfig, what: str, got: str, allowed: str) -> NodeError:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Final
 
 from skinnode.errors import SkinError
+from skinnode.host.containment import Defects, keep_on
 from skinnode.host.publish import Subscription
 from skinnode.model.frames import FieldFrame
 
@@ -22,8 +23,14 @@ class FieldCallback:
     """Calls ``function`` with each field of ``fields``, one after the other, until :meth:`close` or the end
     of the host. What it raises is counted, the first logged with its traceback; the next field follows."""
 
-    def __init__(self, function: Callable[[FieldFrame], object], fields: Subscription) -> None:
+    def __init__(
+        self,
+        function: Callable[[FieldFrame], object],
+        fields: Subscription,
+        defects: Defects | None = None,
+    ) -> None:
         self._function, self._fields = function, fields
+        self._defects = Defects("host") if defects is None else defects
         self._failed = 0
         self._thread = threading.Thread(target=self._run, name="callback", daemon=True)
         self._thread.start()
@@ -57,22 +64,31 @@ class FieldCallback:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        keep_on(self._turn, self._defects, "waiting for a field")
+
+    def _turn(self) -> bool:
+        """Wait for the next field and process it. Returns False at the end of the fields."""
         try:
-            for field in self._fields:
-                try:
-                    self._function(field)
-                except Exception as error:
-                    self._failed += 1
-                    if self._failed == 1:
-                        _log.warning("callback %s raised", _name(self._function), exc_info=error)
+            field = self._fields.take(None)
         except SkinError as error:  # what stopped the host; other subscribers are told too
             _log.debug("callback %s: %s", _name(self._function), error)
+            return False
+        if field is None:
+            return False
+        try:
+            self._function(field)
+        except Exception as error:
+            self._failed += 1
+            if self._failed == 1:
+                _log.warning("callback %s raised", _name(self._function), exc_info=error)
+        return True
 
 
 class Callbacks:
-    """All callbacks of a host."""
+    """All callbacks of a host. Exceptions raised outside their functions are reported to ``defects``."""
 
-    def __init__(self) -> None:
+    def __init__(self, defects: Defects | None = None) -> None:
+        self._defects = defects
         self._all: list[FieldCallback] = []
 
     def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
@@ -80,9 +96,9 @@ class Callbacks:
         if not callable(function):
             raise TypeError(f"function: got {function!r}, must be a function of a field")
         if inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(type(function).__call__):
-            raise TypeError(f"function: got async {_name(function)}, must not be (see async for)")
+            raise TypeError(f"function: got async {_name(function)}, must not be async (use async for)")
         self._all = [callback for callback in self._all if not callback.ended]
-        callback = FieldCallback(function, fields)
+        callback = FieldCallback(function, fields, self._defects)
         self._all.append(callback)
         return callback
 

@@ -33,6 +33,8 @@ from numpy.typing import NDArray
 from skinnode.wire.assembler import Scan
 from skinnode.wire.codec import Codes, CodeScale, SummaryFlag
 
+_CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
+
 FALSE_ALARM: Final = 1e-12
 """A hand of 16 patches at 80 scans/s would be called frozen wrongly once in 25 years."""
 FLICKERS: Final = 10
@@ -87,7 +89,7 @@ class CodeWatch:
 
     def on_scan(self, scan: Scan) -> None:
         """The next scan."""
-        if not scan.complete or (scan.flags and scan.flags & SummaryFlag.CHANGED_ONLY):
+        if not scan.complete or scan.flags & _CHANGED_ONLY:
             return
         codes, last = scan.codes, self._last
         self._last = codes

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import CodecError
+from skinnode.host.containment import Defects
 from skinnode.model.config import BusConfig
 from skinnode.transport import Frame
 from skinnode.transport.bus_state import BusState, bus_state
@@ -77,7 +78,8 @@ class Dealer:
         self.config = config
         self.first_malformed: CodecError | None = None
         self._handlers = dict(handlers)
-        self._pollers: tuple[Callable[[int], None], ...] = ()
+        self._owners: dict[int, Defects] = {}
+        self._pollers: tuple[tuple[Callable[[int], None], Defects | None], ...] = ()
         self._listeners: tuple[Callable[[Sequence[Frame]], None], ...] = ()
         self._complained: set[int] = set()
         self._foreign = self._ignored = self._malformed = self._received = 0
@@ -92,8 +94,11 @@ class Dealer:
         self._load = 0.0
         self._polled_ns = 0
 
-    def handle(self, cob_id: int, handler: Handler) -> None:
-        """From now on ``handler`` gets the data frames of ``cob_id``, on the mainline."""
+    def handle(self, cob_id: int, handler: Handler, defects: Defects | None = None) -> None:
+        """Pass the data frames of ``cob_id`` to ``handler`` from now on, on the mainline. Its exceptions are
+        reported to ``defects``, by default those of the bus."""
+        if defects is not None:
+            self._owners[cob_id] = defects
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
@@ -105,10 +110,16 @@ class Dealer:
         """From now on ``listener`` gets no more. On the mainline."""
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
-    def poll_with(self, poller: Callable[[int], None]) -> None:
+    def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         """From now on ``poller`` is told the time, monotonic ns, after a batch of frames and when none come;
-        not more often than every 2 ms."""
-        self._pollers = (*self._pollers, poller)
+        not more often than every 2 ms. Its exceptions are reported to ``defects``, by default those of the
+        bus."""
+        self._pollers = (*self._pollers, (poller, defects))
+
+    def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
+        """Handle ``error``, raised while ``doing`` something with frames. Raises it if there is no bus to
+        continue with, as in a replay."""
+        raise error
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
         """Whoever is fed by a bus wants the frame that comes at one of these times without delay."""
@@ -118,22 +129,40 @@ class Dealer:
         self._outgoing.append((can_id, data))
 
     def deal(self, batch: Sequence[Frame]) -> None:
-        """Frames to their handlers, in order."""
+        """Pass frames to their handlers, in order. A handler that raises loses only that frame."""
         for listener in self._listeners:
-            listener(batch)
+            try:
+                listener(batch)
+            except Exception as defect:
+                self.contain(None, "a listener", defect)
         handlers, takes_fd = self._handlers, self.config.fd
         others: list[Frame] = []
-        for frame in batch:
-            can_id, data, t_ns, remote, error, extended, fd = frame
-            if remote or error or extended or (fd and not takes_fd):
-                others.append(frame)
-                continue
-            handler = handlers.get(can_id)
-            if handler is None:
-                self._foreign += 1
-                self._foreign_ids[can_id] = self._foreign_ids.get(can_id, 0) + 1
-                continue
-            handler(data, t_ns)
+        frames = iter(batch)
+        going_on = True
+        while going_on:
+            try:
+                for frame in frames:
+                    can_id, data, t_ns, remote, error, extended, fd = frame
+                    if remote or error or extended or (fd and not takes_fd):
+                        others.append(frame)
+                        continue
+                    handler = handlers.get(can_id)
+                    if handler is None:
+                        self._foreign += 1
+                        self._foreign_ids[can_id] = self._foreign_ids.get(can_id, 0) + 1
+                        continue
+                    handler(data, t_ns)
+                going_on = False
+            except Exception as defect:  # ``frames`` continues after the lost frame
+                self.contain(self._owners.get(can_id), f"frame 0x{can_id:03X}", defect)
+        try:
+            self._tally(batch, others)
+        except Exception as defect:
+            self.contain(None, "counting frames", defect)
+
+    def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
+        """Count the frames of a batch; ``others`` are those without a handler."""
+        takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
             batch = [frame for frame in batch if id(frame) not in set_aside]
@@ -152,8 +181,11 @@ class Dealer:
         """Tell the pollers the time, after a batch."""
         if not 0 <= now_ns - self._polled_ns < _POLL_NS:
             self._polled_ns = now_ns
-            for poll in self._pollers:
-                poll(now_ns)
+            for poll, owner in self._pollers:
+                try:
+                    poll(now_ns)
+                except Exception as defect:
+                    self.contain(owner, "polling", defect)
 
     def measure(self, now_ns: int) -> None:
         """Work out the load, when that is due. It takes as long as forty frames do, so whoever has several

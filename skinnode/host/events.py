@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
-from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.containment import Defects, DefectStats, keep_on
+from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.publish import check_capacity
 from skinnode.words import counted
 
@@ -30,8 +31,8 @@ _QUIET_NS: Final = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class HealthEvent:
-    """Something changed. ``subject`` is the name of a patch or of a bus, ``what`` the new condition, or the
-    counter of :class:`PatchHealth` or :class:`BusHealth` that grew."""
+    """A change of health. ``subject`` is the name of a patch or a bus, or ``host``; ``what`` is the new
+    condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that grew, or ``defects``."""
 
     t_ns: int
     """Monotonic."""
@@ -80,7 +81,8 @@ class EventSubscription:
 class Events:
     """All subscriptions to events. One thread tells, any thread subscribes."""
 
-    def __init__(self) -> None:
+    def __init__(self, defects: Defects | None = None) -> None:
+        self._defects = Defects("host") if defects is None else defects
         self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
         self._lock = threading.Lock()  # a set changes size while it is iterated over
         self._ended = False
@@ -96,8 +98,11 @@ class Events:
         return subscription
 
     def tell(self, event: HealthEvent) -> None:
-        """To all, and to the log."""
-        _log.info("%s", event)
+        """Pass ``event`` to all subscribers and to the log. Never raises."""
+        try:
+            _log.info("%s", event)
+        except Exception as error:
+            self._defects.report("logging an event", error)
         self._offer(event)
 
     def end(self) -> None:
@@ -107,14 +112,19 @@ class Events:
 
     def _offer(self, event: HealthEvent | None) -> None:
         with self._lock:
-            for subscription in list(self._subscriptions):
+            subscriptions = list(self._subscriptions)
+        for subscription in subscriptions:
+            try:
                 subscription._offer(event)
+            except Exception as error:
+                self._defects.report("passing an event to a subscriber", error)
 
 
 _PATCH_COUNTERS: Final = {
     "boot_ups": ("boot-up", ""),
     "emergencies": ("emergency", "emergencies"),
     "rejoins": ("rejoin", ""),
+    "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
 """Counters, and what is counted: one, and several where that is not one and an s."""
@@ -140,8 +150,13 @@ class HealthWatch:
         patches: Callable[[], Mapping[str, PatchHealth]],
         buses: Callable[[], Mapping[str, BusHealth]],
         events: Events,
+        defects: Defects | None = None,
+        all_defects: Callable[[], Mapping[str, DefectStats]] = dict,
     ) -> None:
         self._patches, self._buses, self._events = patches, buses, events
+        self._defects = Defects("host") if defects is None else defects
+        self._all_defects = all_defects
+        self._ended = False
         self._patch_before, self._bus_before = dict(patches()), dict(buses())
         self._told: dict[tuple[str, str], tuple[int, int]] = {}  # when, and how many
         self._stop = threading.Event()
@@ -162,28 +177,49 @@ class HealthWatch:
         self.close()
 
     def _run(self) -> None:
-        while not self._stop.wait(_LOOK_S):
-            self._look()
-        self._look()
+        keep_on(self._turn, self._defects, "watching the health")
 
-    def _look(self) -> None:
+    def _turn(self) -> bool:
+        """Wait, then compare the health with the last check. Returns False after the last check. A check that
+        raised is repeated: an event may come twice, but none is missed."""
+        if self._ended:
+            return False
+        self._ended = self._stop.wait(_LOOK_S)
+        for look in (self._look_at_patches, self._look_at_buses, self._look_at_defects):
+            try:
+                look()
+            except Exception as error:
+                self._defects.report("watching the health", error)
+        return True
+
+    def _look_at_patches(self) -> None:
         for name, health in self._patches().items():
-            before, self._patch_before[name] = self._patch_before[name], health
-            self._compare_patch(name, before, health)
+            self._compare_patch(name, self._patch_before[name], health)
+            self._patch_before[name] = health
+
+    def _look_at_buses(self) -> None:
         for name, bus in self._buses().items():
-            bus_before, self._bus_before[name] = self._bus_before[name], bus
-            if bus.away != bus_before.away:
-                self._tell(name, "away" if bus.away else "back", bus.away or "the bus is back")
-            if bus.no_sync != bus_before.no_sync:
-                text = "no SYNC of its master is heard" if bus.no_sync else "SYNC is heard"
-                self._tell(name, "no SYNC" if bus.no_sync else "SYNC", text)
-            if bus.controller is not bus_before.controller and bus.controller is not None:
-                self._tell(name, bus.controller.value, f"the controller is {bus.controller}")
-            self._compare_counters(name, bus_before, bus, _BUS_COUNTERS)
+            self._compare_bus(name, self._bus_before[name], bus)
+            self._bus_before[name] = bus
+
+    def _look_at_defects(self) -> None:
+        words = ("defect of the host", "defects of the host")
+        for name, stats in self._all_defects().items():
+            self._compare_count(name, "defects", 0, stats.count, words, f", last {stats.newest}")
+
+    def _compare_bus(self, name: str, before: BusHealth, now: BusHealth) -> None:
+        if now.away != before.away:
+            self._tell(name, "away" if now.away else "back", now.away or "the bus is back")
+        if now.no_sync != before.no_sync:
+            text = "no SYNC of its master is heard" if now.no_sync else "SYNC is heard"
+            self._tell(name, "no SYNC" if now.no_sync else "SYNC", text)
+        if now.controller is not before.controller and now.controller is not None:
+            self._tell(name, now.controller.value, f"the controller is {now.controller}")
+        self._compare_counters(name, before, now, _BUS_COUNTERS)
 
     def _compare_patch(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
         if now.condition is not before.condition:
-            why = f" ({now.refusal})" if now.condition is Condition.REFUSED else ""
+            why = f" ({now.reason})" if now.reason else ""
             self._tell(name, now.condition.value, f"{before.condition}, now {now.condition}{why}")
         if now.restarts_in_a_loop and not before.restarts_in_a_loop:
             self._tell(name, "restarts in a loop", "restarts in a loop: supply, or watchdog?")
@@ -199,17 +235,21 @@ class HealthWatch:
         self, name: str, before: object, now: object, counters: Mapping[str, tuple[str, str]]
     ) -> None:
         for counter, words in counters.items():
-            then, count = getattr(before, counter), getattr(now, counter)
-            when_ns, told = self._told.get((name, counter), (0, then))
-            t_ns = time.monotonic_ns()
-            if count > told and t_ns - when_ns > _QUIET_NS:
-                self._told[name, counter] = t_ns, count
-                detail = ""
-                if isinstance(now, BusHealth) and counter == "foreign":
-                    detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
-                elif isinstance(now, PatchHealth) and counter == "emergencies":
-                    detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
-                self._tell(name, counter, f"{counted(count - told, *words)}{detail}")
+            detail = ""
+            if isinstance(now, BusHealth) and counter == "foreign":
+                detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
+            elif isinstance(now, PatchHealth) and counter == "emergencies":
+                detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
+            self._compare_count(name, counter, getattr(before, counter), getattr(now, counter), words, detail)
+
+    def _compare_count(
+        self, name: str, counter: str, then: int, count: int, words: tuple[str, str], detail: str
+    ) -> None:
+        when_ns, told = self._told.get((name, counter), (0, then))
+        t_ns = time.monotonic_ns()
+        if count > told and t_ns - when_ns > _QUIET_NS:
+            self._told[name, counter] = t_ns, count
+            self._tell(name, counter, f"{counted(count - told, *words)}{detail}")
 
     def _tell(self, subject: str, what: str, text: str) -> None:
         self._events.tell(HealthEvent(time.monotonic_ns(), subject, what, text))

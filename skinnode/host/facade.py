@@ -14,6 +14,7 @@ from typing import Final
 from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
 from skinnode.host.callback import Callbacks, FieldCallback
+from skinnode.host.containment import Defects, DefectStats
 from skinnode.host.dealer import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthWatch
 from skinnode.host.hand_files import check_files
@@ -28,9 +29,11 @@ from skinnode.host.reception import receive_bus, receive_patch
 from skinnode.host.rivals import Rivals, RivalStats
 from skinnode.host.start import bring_up_all, go_on_unless, start_all
 from skinnode.host.station import Station
-from skinnode.host.supervisor import NodeStats, Supervisor
+from skinnode.host.supervised import NodeStats
+from skinnode.host.supervisor import Supervisor
 from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
-from skinnode.host.tap import HostTap, tap_bus, tap_link
+from skinnode.host.tap import ContainedTap, HostTap, tap_bus, tap_link
+from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS, tare
 from skinnode.host.workers import Workers
 from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
@@ -60,6 +63,8 @@ class HostStats:
     sync: SyncStats
     malformed: tuple[CodecError, ...]
     """The first frame of wrong length on each bus that had one."""
+    defects: Mapping[str, DefectStats]
+    """Exceptions that the host contained, by patch and by bus; under ``host`` those of neither."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +104,9 @@ class Host:
         publisher: Publisher,
         callbacks: Callbacks,
         events: Events,
+        defects: Defects,
     ) -> None:
-        self.hand = hand
+        self.hand, self._defects = hand, defects
         self._callbacks, self._events = callbacks, events
         self._buses = buses
         self._stations = {station.patch.name: station for station in stations}
@@ -167,22 +173,25 @@ class Host:
         check_plan(hand)
         check_files(hand)
         load_kernels()  # of the load of a bus: the mainline could not stop for that
-        publisher, callbacks = Publisher(tuple(patch.name for patch in hand.patches)), Callbacks()
+        defects = Defects("host")
+        publisher = Publisher(tuple(patch.name for patch in hand.patches), defects)
+        callbacks = Callbacks(defects)
         with contextlib.ExitStack() as stack:
             stack.callback(callbacks.join)
             stack.callback(publisher.end)
             buses = {
                 bus.name: _serve_bus(
                     hand,
-                    stack.enter_context(BusLink(bus, {}, publisher.fail, open_port)),
+                    stack.enter_context(BusLink(bus, {}, _logged_already, open_port)),
                     Ticks(hand.sync.counter_overflow),
                 )
                 for bus in hand.buses
                 if hand.patches_on(bus.name)
             }
-            workers = stack.enter_context(_workers(hand))
+            workers = stack.enter_context(_workers(hand, defects))
             stations = [_station(patch, hand, buses[patch.bus], workers, publisher) for patch in hand.patches]
             if tap is not None:
+                tap = ContainedTap(tap, defects)
                 for bus in buses.values():
                     tap_link(tap, bus.link)
                 for station in stations:
@@ -193,7 +202,7 @@ class Host:
             for station in stations:
                 stack.callback(station.lane.close)
             # Everybody knows by now what to do with what comes.
-            stack.enter_context(Mainline([bus.link for bus in buses.values()]))
+            stack.enter_context(Mainline([bus.link for bus in buses.values()], defects))
             for patch in hand.patches:
                 go_on_unless(cancelled)
                 check_solvable(patch, hand.solver)
@@ -206,23 +215,24 @@ class Host:
                 for bus in buses.values():
                     if bus.link.failure is not None:  # the nodes fell silent because the bus failed
                         raise bus.link.failure from bus.link.failure.__cause__
-                if publisher.failure is not None:
-                    raise publisher.failure from publisher.failure.__cause__
                 raise
             supervisor = stack.enter_context(
-                Supervisor(stations, list(ready), hand.bring_up.heartbeat_s, publisher.fail)
+                Supervisor(stations, list(ready), hand.bring_up.heartbeat_s, defects)
             )
             own = [bus for bus in buses.values() if bus.link.config.role == "master"]
             sync: SyncProducer | None = None
             if own:
                 lanes = [(each.lane, buses[each.patch.bus].ticks) for each in stations if not each.is_guest]
-                stack.callback(_let_scans_end, lanes, hand.sync.period_s, publisher)
+                stack.callback(_let_scans_end, lanes, hand.sync.period_s)
                 senders = [(bus.link.send, bus.ticks) for bus in own]
-                sync = stack.enter_context(SyncProducer(senders, hand.sync.period_s, hand.sync.stagger_s))
-            events = Events()
-            host = cls(hand, buses, stations, sync, supervisor, publisher, callbacks, events)
+                of_buses = [bus.link.defects for bus in own]
+                sync = SyncProducer(senders, hand.sync.period_s, hand.sync.stagger_s, of_buses)
+                stack.enter_context(sync)
+            events = Events(defects)
+            host = cls(hand, buses, stations, sync, supervisor, publisher, callbacks, events, defects)
             stack.callback(events.end)
-            stack.enter_context(HealthWatch(host._all_health, host._all_bus_health, events))
+            watch = HealthWatch(host._all_health, host._all_bus_health, events, defects, host._all_defects)
+            stack.enter_context(watch)
             yield host
 
     def fields(
@@ -275,6 +285,7 @@ class Host:
             station.heartbeat_s,
             self.hand.sync.period_s,
             station.lane.stats().assembler.conflicts,
+            station.lane.t_passed_ns,
         )
 
     def bus_health(self, bus: str) -> BusHealth:
@@ -327,10 +338,15 @@ class Host:
     def _all_bus_health(self) -> dict[str, BusHealth]:
         return {bus: self.bus_health(bus) for bus in self._buses}
 
+    def _all_defects(self) -> dict[str, DefectStats]:
+        of_buses = [bus.link.defects for bus in self._buses.values()]
+        of_patches = [station.defects for station in self._stations.values()]
+        return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
+
     def tap(self, tap: HostTap) -> Callable[[], None]:
         """Let ``tap`` write down what passes, from now until what is returned is called or the host closes.
         One at a time."""
-        ends = []
+        ends, tap = [], ContainedTap(tap, self._defects)
         for bus in self._buses.values():
             lanes = [station.lane for station in self._stations.values() if station.link is bus.link]
             ends.append(tap_bus(tap, bus.link, lanes))
@@ -341,15 +357,26 @@ class Host:
 
         return untap
 
-    def tare(self, patch: str) -> None:
-        """Have a patch take what it feels now for being untouched, by RPDO1, which nobody answers: the host
-        notices the new baseline and reads it, ``stats().nodes[patch].baselines`` counts. The node forgets it
-        at power-off unless told to store (0x1010).
+    def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
+        """Tare a patch: its present resistances become the baseline. Returns once the host has read the new
+        baseline and solves with it. The event ``baselines`` confirms it to all subscribers.
 
-        Raises KeyError for no such patch, NodeError where it must not be done (the host is a guest there, or
-        the baseline is that of a file) or cannot (the node is not operational), BusError.
+        The command is RPDO1. The node loses the baseline at power-off unless it is stored (0x1010).
+        ``deadline_s`` is 5 s and three SYNC periods by default.
+
+        Raises KeyError if there is no such patch; NodeError if the host is a guest on its bus, if a file
+        keeps its baseline, or if the node is not operational; NodeTimeout if no new baseline came in time;
+        BusError if the command cannot be sent.
         """
-        self._stations[patch].tare()
+        station = self._stations[patch]
+        if deadline_s is None:
+            deadline_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
+        tare(
+            station,
+            lambda: self._supervisor.stats()[patch].baselines,
+            lambda: self.health(patch),
+            deadline_s,
+        )
 
     def stats(self) -> HostStats:
         """All counters."""
@@ -368,19 +395,21 @@ class Host:
                 irregular=sum(follower.irregular for follower in followers),
             ),
             malformed=tuple(error for error in rejected if error is not None),
+            defects=self._all_defects(),
         )
 
 
-def _workers(hand: HandConfig) -> Workers:
+def _workers(hand: HandConfig, defects: Defects) -> Workers:
     count = hand.solver.workers or len(os.sched_getaffinity(0))
-    return Workers(min(count, len(hand.patches)), "solve")
+    return Workers(min(count, len(hand.patches)), "solve", defects)
 
 
 def _station(
     patch: PatchConfig, hand: HandConfig, bus: _Bus, workers: Workers, publisher: Publisher
 ) -> Station:
-    reception = receive_patch(patch, hand, bus.link, bus.ticks, workers, publisher)
-    return Station(patch, hand, bus.link, reception, bus.lss)
+    defects = Defects(patch.name)
+    reception = receive_patch(patch, hand, bus.link, bus.ticks, workers, publisher, defects)
+    return Station(patch, hand, bus.link, reception, bus.lss, defects)
 
 
 def _serve_bus(hand: HandConfig, link: BusLink, ticks: Ticks) -> _Bus:
@@ -389,10 +418,14 @@ def _serve_bus(hand: HandConfig, link: BusLink, ticks: Ticks) -> _Bus:
     return _Bus(link, ticks, heard.rivals, heard.follower, lss)
 
 
-def _let_scans_end(lanes: Sequence[tuple[Lane, Ticks]], period_s: float, publisher: Publisher) -> None:
+def _logged_already(error: Exception) -> None:
+    """Ignore a defect of a bus: the health watch reports it."""
+
+
+def _let_scans_end(lanes: Sequence[tuple[Lane, Ticks]], period_s: float) -> None:
     """Wait for the scans of the last SYNC, so that no scan is cut off by the end of the program."""
     end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
-    while not all(lane.settled(ticks.newest) for lane, ticks in lanes) and publisher.failure is None:
+    while not all(lane.settled(ticks.newest) for lane, ticks in lanes):
         if time.monotonic() > end_s:
             return
         time.sleep(_POLL_S)
@@ -404,5 +437,5 @@ def _stand_by(station: Station) -> None:
     station.monitor.running = False
     try:
         bringup.stand_by(station.link.send, station.patch.node_id)
-    except BusError as error:  # the bus is gone; the rest of the shutdown must go on
+    except Exception as error:  # the bus is gone; the shutdown must continue
         _log.warning("node %d was not put on stand-by: %s", station.patch.node_id, error)

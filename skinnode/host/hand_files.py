@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from skinnode.errors import ConfigError, ProfileError, Shown
+from skinnode.input_file import read_input
 from skinnode.model.config import HandConfig
 from skinnode.model.layout import Float
-from skinnode.wire.eds import no_eds
+from skinnode.wire import indices as od
+from skinnode.wire.eds_encoding import MOST_EDS_BYTES, read_eds_text
+from skinnode.wire.eds_form import check_form, no_eds
 from skinnode.wire.profile import PatchProfile
 
 _LONGEST_SHOWN = 40
@@ -30,10 +35,7 @@ def load_baseline(path: Path, profile: PatchProfile) -> Float:
     """(U, K) resistances of a text file, ohm, as REAL32 has them. Raises ConfigError for what is no table of
     that many positive numbers."""
     allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise ConfigError("baseline", str(path), f"a file that can be read ({error.strerror})") from None
+    text = read_input("baseline", path).decode("utf-8", "replace")
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), 1):
         row = [_ohm(word, f"baseline, line {number}", allowed, str(path)) for word in line.split()]
@@ -57,19 +59,26 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file describes the wire format that the hand file asks for.
+    """Check that an EDS file describes the wire format of the hand file, in either revision.
 
-    Raises ProfileError for a file that is no EDS, and for the first object that differs or is missing.
+    Raises ConfigError if the file cannot be read, and ProfileError if it is not an EDS, or for the first
+    object that differs or is missing.
     """
     from canopen.objectdictionary.eds import import_eds  # whatever the file is called
 
+    data = read_input("EDS", path, MOST_EDS_BYTES)
     try:
-        described = import_eds(str(path), None)  # type: ignore[no-untyped-call]
-    except OSError as error:
-        raise ProfileError("EDS", str(path), f"a file that can be read ({error.strerror})") from None
+        text = read_eds_text(data).readable
+    except UnicodeDecodeError:
+        allowed = "a file as in CiA 306"
+        raise ProfileError("EDS", Shown("malformed UTF-16"), allowed, where=str(path)) from None
+    check_form(text, str(path))
+    try:
+        described = import_eds(io.StringIO(text), None)  # type: ignore[no-untyped-call]
     except Exception as error:  # the library lets its parser's errors through, whatever they are
-        raise no_eds(error, str(path)) from None
-    for item in profile.objects():
+        raise no_eds(error, str(path), text) from None
+    checked = described.get_variable(od.SUMMARY, od.SUMMARY_CHECK) is not None
+    for item in replace(profile, checked=checked).objects():
         for entry in item.entries:
             where = f"0x{entry.index:04X}:{entry.subindex}"
             found = described.get_variable(entry.index, entry.subindex)

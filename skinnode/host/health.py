@@ -15,7 +15,7 @@ from typing import Final
 from skinnode.errors import CodecError
 from skinnode.host.code_watch import CodeWatch, WireFault
 from skinnode.transport.bus_state import BusState
-from skinnode.wire.emergency import error_text
+from skinnode.wire.emergency import error_text, register_text, says_too_slow
 from skinnode.wire.indices import emcy_cob_id, heartbeat_cob_id
 
 _log = logging.getLogger(__name__)
@@ -39,6 +39,10 @@ SYNCS_MISSED: Final = 5
 RESTART_MEMORY_NS: Final = 5_000_000_000
 """How long after the last of its restarts a node that restarts in a loop is said to do so."""
 
+SETTLED_NS: Final = 500_000_000
+"""Time after the last restart in a loop during which a node counts as restarting although it is operational
+again, ns."""
+
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
 """A node that restarted by itself this often within this time does so in a loop."""
@@ -57,13 +61,15 @@ class Condition(enum.StrEnum):
     """Heard, not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
-    """Operational by its heartbeat, but no scan comes."""
+    """Operational by its heartbeat, but no scans arrive, or all are withheld."""
     RESTARTING = "restarting"
-    """In a loop, by itself: see :data:`LOOP_RESTARTS`. After a single restart it is what it does."""
+    """Restarting by itself in a loop: see :data:`LOOP_RESTARTS`. A node that restarted once, or that is
+    operational again and has not restarted for 0.5 s, has the condition of its present state."""
     FROZEN = "frozen"
     """Scans come, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
-    """Its error register is not zero."""
+    """The node's error register is not zero, or the host had a defect while serving the patch:
+    :attr:`PatchHealth.defect`."""
     REFUSED = "refused"
     """It answers, but is not what the hand file says, or does not keep its configuration."""
     LOST = "lost"
@@ -101,6 +107,62 @@ class PatchHealth:
     """Frames that contradict others of their scan: a node that counts wrongly, or two with one node-ID."""
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""
+    defect: str | None = None
+    """Operation of the host and the exception that it raised, until the patch has been brought up again."""
+    slow_overruns: int = 0
+    """Number of emergencies 0x8110 that report a computer or bus too slow for the node's scans."""
+    baselines: int = 0
+    """Number of times a changed baseline was read, as after a tare."""
+    complaint: str | None = None
+    """Why the last bring-up failed; None once a bring-up succeeded."""
+    withheld: bool = False
+    """Whether scans arrive that cannot be decoded yet, because the node is being brought up or its baseline
+    is being read."""
+
+    @property
+    def reason(self) -> str:
+        """Why the patch is not operational, in one line; empty if it is operational."""
+        match self.condition:
+            case Condition.OPERATIONAL:
+                return ""
+            case Condition.REFUSED:
+                return self.refusal or "refused"
+            case Condition.NEVER_SEEN:
+                return self.complaint or f"node {self.node_id} has sent nothing"
+            case Condition.LOST:
+                silence = f"no heartbeat of node {self.node_id} for {self.heartbeat_age_s or 0.0:.1f} s"
+                return f"{silence}; {self.complaint}" if self.complaint else silence
+            case Condition.RESTARTING:
+                return f"node {self.node_id} restarts by itself in a loop; {self.boot_ups} boot-ups so far"
+            case Condition.BOOTING:
+                state = _STATES.get(self.nmt_state or 0, f"in NMT state {self.nmt_state}")
+                booting = f"node {self.node_id} is {state}, not operational yet"
+                return f"{booting}; {self.complaint}" if self.complaint else booting
+            case Condition.FAULTY:
+                return self.defect or self._error()
+            case Condition.STALE if self.withheld:
+                held = "its scans are withheld until its configuration and baseline have been read"
+                return f"{held}; {self.complaint}" if self.complaint else held
+            case Condition.STALE if self.scan_age_s is None:
+                return f"no scan of node {self.node_id} received yet"
+            case Condition.STALE:
+                return f"no scan of node {self.node_id} for {self.scan_age_s or 0.0:.2f} s"
+            case Condition.FROZEN:
+                return f"node {self.node_id} sends the same codes again and again"
+
+    def _error(self) -> str:
+        register = f"error register 0x{self.error_register:02X} ({register_text(self.error_register)})"
+        if self.last_emergency is None:
+            return register
+        return f"{register}; newest emergency 0x{self.last_emergency:04X} {self.emergency_text}"
+
+
+_STATES: Final = {
+    BOOT_UP: "booting",
+    PRE_OPERATIONAL: "pre-operational",
+    OPERATIONAL: "operational",
+    STOPPED: "stopped",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,15 +213,16 @@ class NodeMonitor:
         self.nmt_state: int | None = None
         self._t_heartbeat_ns: int | None = None
         self._t_scan_ns: int | None = None
-        self._boot_ups = self._emergencies = self._error_register = 0
+        self._boot_ups = self._emergencies = self._slow_overruns = self._error_register = 0
         self._registers_said = 0
-        self._last_emergency: int | None = None
-        self._emergency_text = ""
+        self._last_emergency: tuple[int, bytes] | None = None  # code and detail
         self.running = False
         """Set once the node was started: from then on a boot-up is a restart."""
-        self.rejoins = 0
+        self.rejoins = self.baselines = 0
         self.refusal: str | None = None
-        """Set by the supervisor."""
+        self.defect: str | None = None
+        self.complaint: str | None = None
+        """All three set by the supervisor."""
 
     @property
     def boot_ups(self) -> int:
@@ -202,7 +265,8 @@ class NodeMonitor:
         self._on_register(data[2])
         if code:
             self._emergencies += 1
-            self._last_emergency, self._emergency_text = code, error_text(code, data[3:])
+            self._last_emergency = code, data[3:]
+            self._slow_overruns += says_too_slow(code, data[3:])
 
     @property
     def error_register(self) -> int:
@@ -232,22 +296,35 @@ class NodeMonitor:
     def on_scan(self, t_ns: int) -> None:
         self._t_scan_ns = t_ns
 
-    def health(self, now_ns: int, heartbeat_s: float, scan_s: float, conflicts: int = 0) -> PatchHealth:
-        """The conclusion at ``now_ns``, for a node that sends a heartbeat and a scan this often."""
+    def health(
+        self,
+        now_ns: int,
+        heartbeat_s: float,
+        scan_s: float,
+        conflicts: int = 0,
+        t_passed_ns: int | None = None,
+    ) -> PatchHealth:
+        """Return the health at ``now_ns`` of a node with these heartbeat and scan periods.
+        ``t_passed_ns``: monotonic time at which the newest scan that was not withheld was received; 0 before
+        the first, None if scans are never withheld."""
 
         def age_s(t_ns: int | None) -> float | None:
             return None if t_ns is None else max(0, now_ns - t_ns) * 1e-9
 
         heartbeat_age_s, scan_age_s = age_s(self._t_heartbeat_ns), age_s(self._t_scan_ns)
+        passed_age_s = scan_age_s if t_passed_ns is None else age_s(t_passed_ns or None)
+        late_scans = None if passed_age_s is None else passed_age_s / scan_s
         in_a_loop = self._in_a_loop(now_ns)
+        settled = in_a_loop and self.nmt_state == OPERATIONAL and now_ns - self._restarts[-1] > SETTLED_NS
         condition = judge(
             nmt_state=self.nmt_state,
             late_heartbeats=None if heartbeat_age_s is None else heartbeat_age_s / heartbeat_s,
-            late_scans=None if scan_age_s is None else scan_age_s / scan_s,
-            restarting=in_a_loop,
+            late_scans=late_scans,
+            restarting=in_a_loop and not settled,
             error_register=self._error_register,
             refused=self.refusal is not None,
             frozen=self._watch is not None and self._watch.frozen,
+            defective=self.defect is not None,
         )
         return PatchHealth(
             patch=self.patch,
@@ -258,16 +335,28 @@ class NodeMonitor:
             scan_age_s=scan_age_s,
             boot_ups=self._boot_ups,
             emergencies=self._emergencies,
-            last_emergency=self._last_emergency,
-            emergency_text=self._emergency_text,
+            last_emergency=None if self._last_emergency is None else self._last_emergency[0],
+            emergency_text="" if self._last_emergency is None else self._told(*self._last_emergency),
             error_register=self._error_register,
             rejoins=self.rejoins,
+            slow_overruns=self._slow_overruns,
+            baselines=self.baselines,
             refusal=self.refusal,
             restarts_in_a_loop=in_a_loop,
             duplicate_id=self._beats_too_often(now_ns, heartbeat_s),
             conflicts=conflicts,
             wires=() if self._watch is None else self._watch.wires,
+            defect=self.defect,
+            complaint=self.complaint,
+            withheld=condition is Condition.STALE
+            and scan_age_s is not None
+            and scan_age_s <= SCANS_MISSED * scan_s,
         )
+
+    def _told(self, code: int, detail: bytes) -> str:
+        """Return the text of an emergency: that of a skinnode patch, unless the node is refused, because it
+        may be another device."""
+        return error_text(code, detail, ours=self.refusal is None)
 
     def _in_a_loop(self, now_ns: int) -> bool:
         restarts = list(self._restarts)
@@ -292,10 +381,13 @@ def judge(
     error_register: int,
     refused: bool = False,
     frozen: bool = False,
+    defective: bool = False,
 ) -> Condition:
     """The worst that the facts say. Ages are in periods, None for never."""
     if refused:
         return Condition.REFUSED
+    if defective:
+        return Condition.FAULTY
     if late_heartbeats is None:
         return Condition.NEVER_SEEN
     if late_heartbeats > HEARTBEATS_MISSED:

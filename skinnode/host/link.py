@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from skinnode.errors import BusError, CodecError, SkinError
+from skinnode.host.containment import Defects, Pause, keep_on, one_line
 from skinnode.host.dealer import BusStats, Dealer, Handler
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.model.config import BusConfig
@@ -27,31 +28,39 @@ class BusLink(Dealer):
     """An open bus, from construction to :meth:`close` or the end of a ``with`` block. A
     :class:`~skinnode.host.mainline.Mainline` makes it deal out what comes.
 
-    ``handlers`` get the data frames of their COB-IDs, on the mainline. ``on_failure`` is called once if a
-    handler fails; nothing is dealt out any more then. Raises BusError where the interface does not open. An
-    interface that fails later is opened again and again until it is back.
+    ``handlers`` get the data frames of their COB-IDs, on the mainline. An exception in a handler, a poller, a
+    listener or a job loses that frame or call; an exception in the mainline's own work pauses the bus, while
+    received frames wait. ``on_defect`` is called with the first occurrence of each complaint, on the thread
+    that raised it. Raises BusError if the interface does not open. An interface that fails later is reopened
+    until it is back.
     """
 
     def __init__(
         self,
         config: BusConfig,
         handlers: Mapping[int, Handler],
-        on_failure: Callable[[SkinError], None],
+        on_defect: Callable[[SkinError], object],
         open_port: Callable[[BusConfig], CanPort] = CanPort,
     ) -> None:
         super().__init__(config, handlers, time.monotonic_ns())
-        self._on_failure = on_failure
+        self.defects = Defects(config.name, on_defect)
+        """Exceptions raised while serving the bus, but no patch on it."""
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
-        self._jobs: deque[Callable[[], object]] = deque()
+        self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
         """Why the bus is away; None while it is there."""
         self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
         self._outages = 0
         self.t_dealt_ns = 0
         """What was received up to then has been dealt out, monotonic."""
-        self._rests = False  # while the bus is away, and for good after a defect
+        self._rests = False  # while the bus is away, and for a while after a defect
+        self._rest_end_s = 0.0
+        self._opening = False
+        self._pause = Pause()
+        self._load_pause, self._load_due_s = Pause(), 0.0
         self._resume: Callable[[], None] = lambda: None
         self._reopening: threading.Thread | None = None
+        self._reopen_s = _REOPEN_S
         self._stop = threading.Event()
         self._port = open_port(config)
         self.intake = Intake(self._port)
@@ -62,14 +71,24 @@ class BusLink(Dealer):
         """Send a data frame, from any thread. Raises BusError."""
         t_ns = time.monotonic_ns()
         self._port.send(can_id, data)
-        if can_id != SYNC_COB_ID:
-            self.intake.asked(t_ns)
-        self.count_sent(can_id, data)
-        for listener in self._sent_listeners:
-            listener(Frame(can_id, data, t_ns, fd=len(data) > 8))
+        try:  # the frame is sent; a listener must not fail the caller
+            if can_id != SYNC_COB_ID:
+                self.intake.asked(t_ns)
+            self.count_sent(can_id, data)
+            for listener in self._sent_listeners:
+                listener(Frame(can_id, data, t_ns, fd=len(data) > 8))
+        except Exception as error:
+            self.defects.report("a listener to sent frames", error)
 
-    def remote_od(self, node_id: int, on_answer: Callable[[int], None] = lambda t_ns: None) -> RemoteOd:
-        """The object dictionary of a node on this bus; ``on_answer`` is told when it answers."""
+    def remote_od(
+        self,
+        node_id: int,
+        on_answer: Callable[[int], None] = lambda t_ns: None,
+        defects: Defects | None = None,
+    ) -> RemoteOd:
+        """Return the object dictionary of a node on this bus; ``on_answer`` is called when it answers.
+        ``defects`` as in :meth:`handle`; with them, an exception in a transfer that is retried counts as a
+        defect of the bus."""
 
         def on_response(data: bytes, t_ns: int) -> None:
             if len(data) != 8:
@@ -78,8 +97,11 @@ class BusLink(Dealer):
             on_answer(t_ns)
             self.network.notify(sdo_response_cob_id(node_id), bytearray(data), t_ns * 1e-9)
 
-        self.handle(sdo_response_cob_id(node_id), on_response)
-        return RemoteOd(self.network, node_id)
+        self.handle(sdo_response_cob_id(node_id), on_response, defects)
+        if defects is None:
+            return RemoteOd(self.network, node_id)
+        doing = f"SDO transfer with node {node_id}"
+        return RemoteOd(self.network, node_id, lambda error: self.defects.report(doing, error))
 
     def ask_remote(self, can_id: int) -> None:
         """Send a remote frame, as guarding does, from any thread. Raises BusError."""
@@ -98,9 +120,14 @@ class BusLink(Dealer):
         """From now on ``listener`` gets no more. On the mainline."""
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
-    def call(self, job: Callable[[], object]) -> None:
-        """Have ``job`` done by the mainline, before any frame that is received from now on."""
-        self._jobs.append(job)
+    def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
+        """Run ``job`` on the mainline, before any frame received from now on. ``defects`` as in
+        :meth:`handle`."""
+        self._jobs.append((job, self.defects if defects is None else defects))
+
+    def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
+        """Report ``error`` and continue."""
+        (self.defects if owner is None else owner).report(doing, error)
 
     def stats(self) -> BusStats:
         return self.count(
@@ -135,27 +162,30 @@ class BusLink(Dealer):
         self._resume = resume
 
     def turn(self) -> None:
-        """What was received since the last turn, to its handlers. Raises nothing."""
+        """Pass the frames received since the last turn to their handlers."""
         if self._rests:
+            self._rest()
             return
         try:
             heard = self._deal_out()
             if self.failure is not None and (heard or time.monotonic() > self._due_s):
                 self.failure = None
                 _log.warning("%s: the bus is back", self.config.name)
-        except BusError as error:
-            self._go_away(error)
-        except Exception as error:  # a defect of ours: it must reach the user, and the other buses go on
-            self._fail(error)
+        except Exception as error:
+            if self.intake.failed:
+                self._go_away(error)
+                return
+            self._rests, self._rest_end_s = True, time.monotonic() + self._pause.next_s()
+            self.defects.report("dealing out frames", error)
 
     def measure_load(self) -> None:
         """As :meth:`measure`, at the time up to which was dealt out. Raises nothing."""
-        if self._rests:
-            return
         try:
-            self.measure(self.t_dealt_ns)
-        except Exception as error:  # a defect of ours
-            self._fail(error)
+            if not self._rests and self.t_dealt_ns * 1e-9 >= self._load_due_s:
+                self.measure(self.t_dealt_ns)
+        except Exception as error:
+            self._load_due_s = self.t_dealt_ns * 1e-9 + self._load_pause.next_s()
+            self.defects.report("measuring the load", error)
 
     def end(self) -> None:
         """After the last turn: open the interface no more."""
@@ -168,7 +198,11 @@ class BusLink(Dealer):
         seen_ns = self.intake.seen_ns  # first: whatever came before it is in the batch
         batch = self.intake.take()
         while self._jobs:
-            self._jobs.popleft()()
+            job, owner = self._jobs.popleft()
+            try:
+                job()
+            except Exception as error:
+                owner.report("a job of the mainline", error)
         # While frames wait, here or in the interface, time is that of the newest one dealt out: nothing is
         # late because we are.
         if batch:
@@ -181,35 +215,55 @@ class BusLink(Dealer):
         self.poll(self.t_dealt_ns)
         return bool(batch)
 
-    def _go_away(self, error: BusError) -> None:
-        """Have the interface opened again, on a thread of its own: that may take long."""
+    def _rest(self) -> None:
+        """Pause until the interface is open again, or until the pause is over."""
+        if not self._opening:
+            self._rests = time.monotonic() < self._rest_end_s
+        elif (
+            self._reopening is None or not self._reopening.is_alive()
+        ) and self._opening:  # the thread did not start
+            self._begin_reopening()
+
+    def _go_away(self, error: Exception) -> None:
+        """Mark the bus as away and start reopening its interface."""
+        self._rests = self._opening = True
+        if not isinstance(error, BusError):
+            self.defects.report("receiving", error)
+            error = BusError(f"{self.config.name}: does not receive ({one_line(error)})")
         if self.failure is None:
             self._outages += 1
             self.failure = error
-            _log.warning("%s; tried again until it is back", error)
-        self._rests = True
+            _log.warning("%s; reopening the interface until it is back", error)
+        self._begin_reopening()
+
+    def _begin_reopening(self) -> None:
+        """Start a thread that reopens the interface, which may take some time."""
+        if self._stop.is_set():
+            return
         name = f"reopen {self.config.name}"
-        self._reopening = threading.Thread(target=self._reopen, name=name, daemon=True)
-        self._reopening.start()
+        thread = threading.Thread(target=self._reopen, name=name, daemon=True)
+        thread.start()
+        self._reopening = thread  # set after start(): a thread that did not start cannot be joined
 
     def _reopen(self) -> None:
-        """One that does not open, or fails at once, is tried after a pause."""
-        try:
-            while not self._stop.wait(_REOPEN_S):
-                try:
-                    self._port.reopen()
-                except BusError:
-                    continue
-                self._due_s = time.monotonic() + _REOPEN_S
-                self._resume()
-                self._rests = False
-                return
-        except Exception as error:
-            self._fail(error)
+        """Reopen the interface. If it does not open, or fails at once, retries after a pause, longer after a
+        defect."""
+        keep_on(self._reopens_not, self.defects, "reopening the interface")
 
-    def _fail(self, error: Exception) -> None:
-        self._rests = True
-        _log.debug("bus %s", self.config.name, exc_info=True)
-        failure = SkinError(f"bus {self.config.name!r}: {type(error).__name__}: {error}")
-        failure.__cause__ = error
-        self._on_failure(failure)
+    def _reopens_not(self) -> bool:
+        """Try once to reopen the interface. Returns whether to try again."""
+        if self._stop.wait(self._reopen_s):
+            return False
+        try:
+            self._reopen_s = _REOPEN_S
+            self._port.reopen()
+            self._due_s = time.monotonic() + _REOPEN_S
+            self._resume()
+        except BusError:
+            return True
+        except Exception:
+            self._reopen_s = self._pause.next_s()
+            raise
+        self._opening = False
+        self._rests = False
+        return False

@@ -31,6 +31,10 @@ from skinnode.wire.lss import (
 ANSWER_S: Final = 0.1
 """How long an answer may take; the frame has the lowest priority but for heartbeats."""
 
+STORE_ANSWER_S: Final = 2.0
+"""Longest time to the answer to the store command: the node writes to flash memory, or to a file that it
+synchronises to disk. CANopenNode's LSS master waits 1 s for any answer."""
+
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
 """The same within a fastscan, where every *no* is waited for; the longer one where the first found nobody
 who agrees in the end."""
@@ -45,8 +49,9 @@ _UNDER_WAY_S: Final = 0.4
 """After which an answer that was due is not waited for, nor feared, any more."""
 
 _PARTS: Final = 4
-_LIKELY: Final = (od.VENDOR_ID, od.PRODUCT_CODE, od.REVISION_NUMBER)
-"""A patch of ours: three questions in place of 96."""
+_REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
+_LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
+"""Addresses of skinnode patches, which fastscan tries first: three or four requests in place of 96."""
 
 _NMT_RESET_COMMUNICATION: Final = 0x82
 
@@ -74,7 +79,7 @@ class LssMaster:
         not take it. A patch that is there already is left alone. Nothing is stored in it: that is for
         technicians. Raises BusError."""
         with self._dialogue:
-            if not self.select(LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, od.REVISION_NUMBER, serial)):
+            if self.select_patch(serial) is None:
                 return False
             try:
                 active = self.node_id()
@@ -91,9 +96,12 @@ class LssMaster:
     # --- who is there
 
     def any_unconfigured(self) -> bool:
-        """Whether there is a node without a node-ID (identify non-configured remote slave)."""
+        """Return whether there is a node without a node-ID. Sends *identify non-configured remote slave* and
+        the first request of fastscan, because some stacks (CANopenNode) support fastscan only."""
         wanted = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
-        return any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) for _ in range(_TRIES))
+        if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) for _ in range(_TRIES)):
+            return True
+        return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
     def find_unconfigured(self) -> LssAddress | None:
         """One node without a node-ID, by fastscan; it is in configuration until :meth:`release`. None where
@@ -116,8 +124,9 @@ class LssMaster:
     def _scan_part(self, part: int, answer_s: float) -> int | None:
         """The part of the address of the node that stays in the race; None where nobody agrees in the end."""
         following = (part + 1) % _PARTS
-        if part < len(_LIKELY) and self._scan(_LIKELY[part], 0, part, following, answer_s) is not None:
-            return _LIKELY[part]
+        for likely in _LIKELY[part] if part < len(_LIKELY) else ():
+            if self._scan(likely, 0, part, following, answer_s) is not None:
+                return likely
         value = 0
         for bit in range(31, -1, -1):
             if self._scan(value, bit, part, part, answer_s) is None:
@@ -145,6 +154,15 @@ class LssMaster:
             return True
         self.release()
         return False
+
+    def select_patch(self, serial: int) -> LssAddress | None:
+        """Switch the patch with this serial number, of any revision, to LSS configuration state. Returns its
+        address, or None if there is no such patch."""
+        for revision in _REVISIONS:
+            address = LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, revision, serial)
+            if self.select(address):
+                return address
+        return None
 
     def _is_in_configuration(self, address: LssAddress) -> bool:
         """Whether the node in configuration says that it has that address."""
@@ -175,7 +193,7 @@ class LssMaster:
 
     def store(self) -> None:
         """Have the node keep its node-ID and bit rate over a power cycle. Raises LssFailed."""
-        answer = self._must(LssCommand.STORE, b"", "the store command")
+        answer = self._must(LssCommand.STORE, b"", "the store command", STORE_ANSWER_S)
         _require_done(answer, "the store command")
 
     def release(self) -> None:
@@ -184,11 +202,11 @@ class LssMaster:
 
     # --- frames
 
-    def _must(self, command: int, data: bytes, what: str) -> bytes:
-        answer = self._ask(command, data)
+    def _must(self, command: int, data: bytes, what: str, answer_s: float = ANSWER_S) -> bytes:
+        answer = self._ask(command, data, answer_s=answer_s)
         if answer is None:
             time.sleep(_UNDER_WAY_S)
-            raise LssFailed(f"{what}: got no answer by LSS, allowed: one within {ANSWER_S:g} s")
+            raise LssFailed(f"{what}: got no answer by LSS, allowed: one within {answer_s:g} s")
         return answer
 
     def _ask(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Final, Self
 
+from skinnode.host.containment import Defects, keep_on
 from skinnode.host.link import BusLink
 from skinnode.transport import Receiver
 
@@ -21,12 +22,18 @@ class Mainline:
     ``with`` block. What goes wrong on one of them does not keep the others from it.
 
     One thread for all: frames of all buses come at the same time, and waking costs as much as twenty of them.
+    Exceptions raised outside the service of a bus are reported to ``defects``, by default those of the first
+    bus.
     """
 
-    def __init__(self, links: Sequence[BusLink]) -> None:
+    def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:
         self._links = tuple(links)
+        self._defects = links[0].defects if defects is None else defects
+        self._measured = itertools.cycle(self._links)
         self._stop = threading.Event()
-        self._receiver = Receiver([link.intake for link in links])
+        self._receiver = Receiver(
+            [link.intake for link in links], lambda error: self._defects.report("receiving", error)
+        )
         for link in links:
             link.begin(functools.partial(self._receiver.resume, link.intake))
         self._thread = threading.Thread(target=self._run, name="mainline", daemon=True)
@@ -49,10 +56,16 @@ class Mainline:
         self.stop()
 
     def _run(self) -> None:
-        for measured in itertools.cycle(self._links):
-            if self._stop.is_set():
-                return
-            self._receiver.wait(_WAIT_S)
-            for link in self._links:
+        keep_on(self._turn, self._defects, "the mainline")
+
+    def _turn(self) -> bool:
+        if self._stop.is_set():
+            return False
+        self._receiver.wait(_WAIT_S)
+        for link in self._links:
+            try:
                 link.turn()
-            measured.measure_load()
+            except Exception as error:
+                link.defects.report("a turn of the mainline", error)
+        next(self._measured).measure_load()
+        return True

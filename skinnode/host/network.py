@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import canopen
-from canopen.objectdictionary import ObjectDictionary
-from canopen.sdo.client import BlockUploadStream
-from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+from canopen.sdo.client import ReadableStream
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
-from skinnode.errors import NodeError, NodeTimeout, SdoAbort
+from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
+from skinnode.host.containment import one_line
+from skinnode.host.sdo_streams import SEGMENT_BYTES, BlockDownload, BlockUpload, Client, Download
 from skinnode.wire.indices import DEVICE_TYPE
+from skinnode.words import counted
 
 ATTEMPTS: Final = 3
 """Tries of a transfer that was not answered or whose answer belongs to an earlier one."""
@@ -25,11 +29,35 @@ ATTEMPTS: Final = 3
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
 """What canopen says where nothing came, the second after it asked for segments again."""
 
+_OUT_OF_STEP: Final = (0x0503_0000, 0x0504_0000, 0x0504_0001, 0x0504_0002, 0x0504_0003, 0x0504_0004)
+"""SDO abort codes of a node that missed a frame of the transfer: toggle bit, time-out, command specifier,
+block size, sequence number, CRC. The transfer is retried."""
+
+MOST_BYTES: Final = 4 * 254 * 254
+"""Maximum length of a value in bytes: the baseline of the largest patch."""
+
+MOST_TEXT_BYTES: Final = 4096
+"""Maximum length of a value in bytes where a number or a text is expected."""
+
+_MOST_NUMBER_BYTES: Final = 8
+
+_TRANSFER_S: Final = 5.0
+_SEGMENT_S: Final = 0.02
+"""A transfer may take 5 s, and 20 ms for each segment of the longest value allowed."""
+
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
 # What goes wrong in a transfer is raised here with the node and the object; the library's own log lines
 # would reach a terminal as well, because Python prints warnings that nobody handles.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+
+class Abandoned(Exception):
+    """The caller no longer wants the result; the transfer was aborted."""
+
+
+class _Endless(Exception):
+    """The node sends more than a value can have, or takes too long over it."""
 
 
 class SkinNetwork(canopen.Network):
@@ -50,57 +78,88 @@ class RemoteOd:
     """The object dictionary of a node, read and written by SDO.
 
     Values have one of the types ``u8 u16 u32 f32``. Raises NodeTimeout where the node does not answer,
-    SdoAbort where it refuses, NodeError where it answers something else.
+    SdoAbort if it refuses, NodeError if its response is malformed, longer than allowed, or has no end. A
+    transfer is also retried after an exception that is not a response of the node; ``on_defect`` is then
+    called with it.
+
+    ``abandoned`` is asked after each segment. If it returns True, the transfer is aborted and Abandoned
+    raised.
     """
 
-    def __init__(self, network: SkinNetwork, node_id: int) -> None:
-        self.node_id = node_id
-        empty: Any = ObjectDictionary  # values are decoded here; its constructor is not typed
-        self._client = network.add_node(node_id, empty()).sdo
+    def __init__(
+        self,
+        network: SkinNetwork,
+        node_id: int,
+        on_defect: Callable[[Exception], object] = lambda error: None,
+    ) -> None:
+        self.node_id, self._on_defect = node_id, on_defect
+        self.abandoned: Callable[[], bool] = lambda: False
+        self._client = Client(network, node_id)
+
+    @contextmanager
+    def until(self, abandoned: Callable[[], bool]) -> Iterator[None]:
+        """Abort the transfers of this ``with`` block once ``abandoned`` returns True."""
+        before, self.abandoned = self.abandoned, abandoned
+        try:
+            yield
+        finally:
+            self.abandoned = before
 
     def answers(self) -> bool:
         """Whether the node answers at all, be it with an abort. One try."""
         try:
-            self._client.upload(DEVICE_TYPE, 0)
+            self._upload(DEVICE_TYPE, 0, _MOST_NUMBER_BYTES)
         except SdoAbortedError:
             return True
-        except SdoCommunicationError:
+        except _Endless:
+            self._client.give_up(DEVICE_TYPE, 0)
+            return True
+        except Abandoned:
+            self._client.give_up(DEVICE_TYPE, 0)
+            raise
+        except SkinError:
+            raise
+        except Exception as error:  # no response, or not one of CiA 301
+            if not isinstance(error, SdoError):
+                self._on_defect(error)
+            self._client.give_up(DEVICE_TYPE, 0)
             return False
         return True
 
-    def read_bytes(self, index: int, subindex: int) -> bytes:
-        """The value as it came."""
-        return bytes(self._transfer(index, subindex, "read", lambda: self._client.upload(index, subindex)))
+    def read_bytes(self, index: int, subindex: int, most: int = MOST_TEXT_BYTES) -> bytes:
+        """The value as it came, of at most ``most`` bytes."""
+        return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
-    def read_block(self, index: int) -> bytes:
-        """A value of many bytes by block transfer with CRC."""
+    def read_block(self, index: int, most: int = MOST_BYTES) -> bytes:
+        """A value of many bytes, at most ``most``, by block transfer with CRC."""
 
         def ask() -> bytes:
-            with _BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
-                return bytes(stream.readall())
+            with BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
+                return self._whole(stream, most)
 
         return bytes(self._transfer(index, 0, "block read", ask))
 
-    def read_large(self, index: int) -> bytes:
+    def read_large(self, index: int, most: int = MOST_BYTES) -> bytes:
         """By block transfer, or segment by segment from a node that refuses that."""
         try:
-            return self.read_block(index)
+            return self.read_block(index, most)
         except SdoAbort:
-            return self.read_bytes(index, 0)
+            return self.read_bytes(index, 0, most)
 
     def write_block(self, index: int, data: bytes) -> None:
         """Write a value of many bytes by block transfer with CRC."""
 
         def ask() -> None:
-            with self._client.open(index, 0, "wb", size=len(data), block_transfer=True) as stream:
-                stream.write(data)
+            with BlockDownload(self._client, index, data) as stream:
+                _send(stream, data)
+                stream.finish()
 
         self._transfer(index, 0, "block write", ask)
 
     def read(self, index: int, subindex: int, kind: str) -> Any:
         """The value, decoded."""
         layout = struct.Struct(_PLAIN[kind])
-        data = self.read_bytes(index, subindex)
+        data = self.read_bytes(index, subindex, _MOST_NUMBER_BYTES)
         if len(data) != layout.size:
             shown = data.hex(" ") or "nothing"
             raise NodeError(
@@ -115,7 +174,12 @@ class RemoteOd:
 
     def write_bytes(self, index: int, subindex: int, data: bytes) -> None:
         """Write the value as it is to travel."""
-        self._transfer(index, subindex, "write", lambda: self._client.download(index, subindex, data))
+
+        def ask() -> None:
+            with Download(self._client, index, subindex, len(data)) as stream:  # type: ignore[no-untyped-call]
+                _send(stream, data)
+
+        self._transfer(index, subindex, "write", ask)
 
     def ensure(self, index: int, subindex: int, kind: str, value: float) -> None:
         """Write, and read back, only what differs."""
@@ -134,41 +198,78 @@ class RemoteOd:
 
     def _transfer(self, index: int, subindex: int, verb: str, ask: Callable[[], Any]) -> Any:
         where = f"{verb} of object {_name(index, subindex)}"
-        failure: SdoCommunicationError | None = None
+        failure: Exception | None = None
         for _ in range(ATTEMPTS):
             try:
                 return ask()
-            except SdoAbortedError as error:
-                text = SdoAbortedError.CODES.get(error.code, "no such code in CiA 301")
-                raise SdoAbort(self.node_id, error.code, f"{where}: {text}") from None
-            except SdoCommunicationError as error:
+            except SkinError:  # the interface does not take the request
+                raise
+            except _Endless as endless:
+                self._client.give_up(index, subindex)
+                raise NodeError(self.node_id, f"{where}: got {endless}") from None
+            except Abandoned:
+                self._client.give_up(index, subindex)
+                raise
+            except SdoAbortedError as abort:
+                failure = abort
+                if abort.code not in _OUT_OF_STEP:
+                    break
+            except Exception as error:  # canopen's own bugs also raise: AttributeError, struct.error …
                 failure = error
+                if not isinstance(error, SdoError):
+                    self._on_defect(error)
+                self._client.give_up(index, subindex)
+        raise self._failed(where, failure) from (None if isinstance(failure, SdoError) else failure)
+
+    def _upload(self, index: int, subindex: int, most: int) -> bytes:
+        with ReadableStream(self._client, index, subindex) as stream:  # type: ignore[no-untyped-call]
+            return self._whole(stream, most)
+
+    def _whole(self, stream: Any, most: int) -> bytes:
+        """Read a stream to its end. Raises SdoCommunicationError if the data is not as long as announced,
+        _Endless if it is longer than ``most`` or takes too long, and Abandoned."""
+        if stream.size is not None and stream.size > most:
+            raise _Endless(f"a value of {counted(stream.size, 'byte')}, allowed: {most} at most")
+        limit_s = _TRANSFER_S + _SEGMENT_S * most / SEGMENT_BYTES
+        end_s = time.monotonic() + limit_s
+        data = bytearray()
+        while segment := stream.read(SEGMENT_BYTES):
+            data += segment
+            if len(data) > (most if stream.size is None else stream.size):
+                if stream.size is None:
+                    raise _Endless(f"more than {counted(most, 'byte')}, allowed: {most} at most")
+                break
+            if self.abandoned():
+                raise Abandoned
+            if time.monotonic() > end_s:
+                raise _Endless(f"{counted(len(data), 'byte')} and no end, allowed: within {limit_s:.1f} s")
+        if stream.size is not None and len(data) != stream.size:
+            raise SdoCommunicationError(f"{len(data)} of {stream.size} bytes")
+        return bytes(data)
+
+    def _failed(self, where: str, failure: Exception | None) -> NodeError:
+        if isinstance(failure, SdoAbortedError):
+            text = SdoAbortedError.CODES.get(failure.code, "no such code in CiA 301")
+            return SdoAbort(self.node_id, failure.code, f"{where}: {text}")
         if any(silence in str(failure) for silence in _SILENCES):
             waited_s = ATTEMPTS * self._client.RESPONSE_TIMEOUT
-            raise NodeTimeout(
-                self.node_id, f"{where}: got no answer, allowed: one within {waited_s:.1f} s"
-            ) from None
+            return NodeTimeout(self.node_id, f"{where}: got no answer, allowed: one within {waited_s:.1f} s")
         if "returned a value for" in str(failure):  # to a question that was not ours, or from another node
             got = f"{where}: got the answer for another object, allowed: that for this one"
             why = f"two nodes answer with node-ID {self.node_id}, or another SDO client asks it"
-            raise NodeError(self.node_id, f"{got}; {why}")
-        raise NodeError(self.node_id, f"{where}: got {failure}, allowed: an answer of CiA 301") from None
+            return NodeError(self.node_id, f"{got}; {why}")
+        if isinstance(failure, SdoError):
+            return NodeError(self.node_id, f"{where}: got {failure}, allowed: an answer of CiA 301")
+        return NodeError(
+            self.node_id, f"{where}: the transfer failed ({one_line(failure)}), allowed: an answer of CiA 301"
+        )
 
 
-class _BlockUpload(BlockUploadStream):
-    """canopen 2.4 asks twice for a segment that did not come in time, and leaves out the first answer: every
-    pause longer than its time-out ended in a wrong CRC. One that comes out of order it asks for once, so a
-    segment that is late is made to look like that."""
-
-    def read(self, size: int = -1) -> bytes:
-        """One segment, as canopen has it."""
-        if size >= 0 and not self._done:
-            try:
-                response = self.sdo_client.read_response()
-            except SdoCommunicationError:
-                response = bytes(8)  # no segment has number 0
-            self.sdo_client.responses.queue.appendleft(response)
-        return bytes(super().read(size))  # type: ignore[no-untyped-call]  # as all of canopen
+def _send(stream: Any, data: bytes) -> None:
+    """Write all of ``data``; empty data is sent as one empty segment."""
+    at = stream.write(data[:SEGMENT_BYTES])
+    while at < len(data):
+        at += stream.write(data[at : at + SEGMENT_BYTES])
 
 
 def _name(index: int, subindex: int) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 
 from skinnode.errors import ConfigError, SkinError
 from skinnode.host.bringup import NodeFacts
+from skinnode.host.containment import Defects, one_line
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
 from skinnode.host.workers import Inline, Workers
@@ -33,6 +34,8 @@ from skinnode.wire.codec import Decoder, SummaryFlag, as_baseline
 
 _log = logging.getLogger(__name__)
 
+
+_BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 WATCH_AFTER_NS: Final = 5_000_000
 """How long after its last frame a scan is looked at for what is wrong with it: the fields that a program
@@ -111,7 +114,7 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
 @dataclass(frozen=True, slots=True)
 class LaneStats:
     """What became of a patch's scans: those assembled = ``offered`` + ``withheld`` + ``partial``, and
-    ``offered`` = ``solved`` + ``skipped`` + at most two in work."""
+    ``offered`` = ``solved`` + ``failed`` + ``skipped`` + at most two in work."""
 
     frames: int
     """Chunks and summaries handed to the lane, whatever became of them."""
@@ -119,7 +122,7 @@ class LaneStats:
     withheld: int
     """Came while the patch was being brought up or its baseline being read: nobody could decode them."""
     partial: int
-    """Had chunks missing and were withheld, as ``stream.partial`` of the hand file wants it."""
+    """Scans that were not complete and therefore withheld, as ``stream.partial`` of the hand file demands."""
     solved: int
     skipped: int
     """Overtaken by a newer scan before a worker was free."""
@@ -128,6 +131,8 @@ class LaneStats:
     invalid_codes: int
     """Codes that were over range, short, open or missing, over all scans solved."""
     assembler: AssemblerStats
+    failed: int = 0
+    """Scans whose decoding or solving raised an exception: a defect."""
 
 
 class LaneTap(Protocol):
@@ -150,7 +155,8 @@ class LaneTap(Protocol):
 class Lane:
     """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
     them. ``on_scan`` is told of each at once, ``watch`` a while later. ``under_way``: others start the node,
-    which may be sending already whenever its scans are let through."""
+    which may be sending already whenever its scans are let through. A scan whose decoding or solving
+    raises is lost, and the exception is reported to ``defects``; without ``defects`` the publisher fails."""
 
     def __init__(
         self,
@@ -164,12 +170,14 @@ class Lane:
         watch: Callable[[Scan], None] = lambda scan: None,
         *,
         under_way: bool = False,
+        defects: Defects | None = None,
     ) -> None:
         self._patch, self._passes_partial = patch, partial == "pass"
         self._solver: Solver | None = None  # None: withhold
         self._assembler, self._workers, self._publisher = assembler, workers, publisher
+        assembler.on_thrown = self._doubt
         self._tick, self._on_scan = tick, on_scan
-        self._watch, self._under_way = watch, under_way
+        self._watch, self._under_way, self._defects = watch, under_way, defects
         self._unwatched: deque[tuple[int, Scan]] = deque()
         self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
@@ -179,10 +187,14 @@ class Lane:
         self.withholdings = 0
         """How often scans began to be withheld."""
         self.doubtful = False
-        """A summary was lost, which may have said that the baseline changed."""
+        """Whether a summary was lost, or discarded with its scan, that may have announced a new baseline."""
         self._frames = self._withheld = self._partial = 0
-        self._offered = self._taken = self._solved = self._untrusted = self._invalid = 0
+        self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
+        self._solving = 0
+        """Number of the scan that the worker in the lane is solving."""
+        self.t_passed_ns = 0
+        """Monotonic time at which the newest scan that was not withheld was received; 0 before the first."""
 
     # --- mainline
 
@@ -234,8 +246,11 @@ class Lane:
             return
         self._solver = solver
         self.doubtful = False
+        checked = solver.facts.checked
         if anew:
-            self._assembler.reset(under_way=self._under_way)
+            self._assembler.reset(under_way=self._under_way, checked=checked)
+        elif checked:
+            self._assembler.expect_check()
         if self.tap is not None:
             self.tap.resumed(self._patch, solver, anew=anew)
 
@@ -248,14 +263,17 @@ class Lane:
         """Take no scan that is still in the box. Called when the mainline has ended."""
         self._box.clear()
         while self._unwatched:
-            self._watch(self._unwatched.popleft()[1])
+            scan = self._unwatched.popleft()[1]
+            with contextlib.suppress(Exception):  # no caller is left
+                self._watch(scan)
+
+    def _doubt(self) -> None:
+        self.doubtful = True
 
     def _offer(self, scan: Scan) -> None:
         self._on_scan(scan)
         self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
-        if (
-            scan.flags and scan.flags & SummaryFlag.BASELINE_CHANGED
-        ):  # this scan is the first with the new one
+        if scan.flags & _BASELINE_CHANGED:  # this scan is the first with the new baseline
             self.withhold()
         elif scan.device_time_us is None:
             self.doubtful = True
@@ -263,6 +281,8 @@ class Lane:
         if solver is None:
             self._withheld += 1
             return
+        if not scan.empty:
+            self.t_passed_ns = scan.t_last_ns
         tick = self._tick(scan.counter)
         stamp = ScanStamp(
             patch=self._patch,
@@ -309,29 +329,60 @@ class Lane:
             self._token.pop()
         except IndexError:
             return  # a worker is in the lane and looks into the box when it is done
-        self._workers.submit(self._work)
+        try:
+            self._workers.submit(self._work, self._work_failed)
+        except Exception:
+            self._token.append(None)
+            raise
 
     def _work(self) -> None:
+        try:
+            self._solve_next()
+        except Exception as error:
+            self._report(error)
+        self._leave()
+
+    def _solve_next(self) -> None:
         self._taken += 1  # before it leaves the box, so that no reader of the counters sees it nowhere
         try:
             scan, stamp, solver = self._box.popleft()
         except IndexError:  # the lane was closed
             self._taken -= 1
             return
+        self._solving = stamp.scan
         try:
             field, invalid = solver.solve(scan, stamp)
-            self._solved += 1
-            self._untrusted += not field.trusted
-            self._invalid += invalid
-            self._publisher.publish(field, stamp.patch)
-        except Exception as error:  # a defect of ours: it must reach the user, not die with the job
-            _log.debug("patch %s", stamp.patch, exc_info=True)
-            failure = SkinError(f"patch {stamp.patch!r}, scan {stamp.scan}: {type(error).__name__}: {error}")
-            failure.__cause__ = error
-            self._publisher.fail(failure)
+        except Exception:
+            self._failed += 1
+            raise
+        self._solved += 1
+        self._untrusted += not field.trusted
+        self._invalid += invalid
+        self._publisher.publish(field, stamp.patch)
+
+    def _work_failed(self, error: Exception) -> None:
+        """Handle a worker that could not start."""
+        self._report(error)
+        self._leave()
+
+    def _leave(self) -> None:
+        """Release the lane to the next worker, at once if a scan is waiting. Never raises: the holder must
+        return the token exactly once."""
         self._token.append(None)
-        if self._box:
-            self._call_worker()
+        try:
+            if self._box:
+                self._call_worker()
+        except Exception as error:  # the scan waits for the next
+            self._report(error)
+
+    def _report(self, error: Exception) -> None:
+        if self._defects is not None:
+            self._defects.report("solving", error)
+            return
+        _log.debug("patch %s", self._patch, exc_info=error)
+        failure = SkinError(f"patch {self._patch!r}, scan {self._solving}: {one_line(error)}")
+        failure.__cause__ = error
+        self._publisher.fail(failure)
 
     def stats(self) -> LaneStats:
         """Counters. Read in this order, no scan counts as skipped that may still be solved."""
@@ -346,4 +397,5 @@ class Lane:
             untrusted=self._untrusted,
             invalid_codes=self._invalid,
             assembler=self._assembler.stats,
+            failed=self._failed,
         )

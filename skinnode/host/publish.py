@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from skinnode.errors import SkinError
+from skinnode.host.containment import Defects
 from skinnode.model.frames import FieldFrame
 
 
@@ -35,7 +36,7 @@ _END: Final = _End()
 def check_timeout(timeout_s: float | None) -> None:
     """Raises ValueError for one that nobody can wait for."""
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
-        raise ValueError(f"timeout_s: got {timeout_s!r}, must be None or 0 to {threading.TIMEOUT_MAX:.0f}")
+        raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
 
 
 def check_capacity(capacity: int) -> None:
@@ -182,10 +183,12 @@ class Subscription:
 
 
 class Publisher:
-    """All subscriptions of a host, and the newest field of each patch."""
+    """All subscriptions of a host, and the newest field of each patch. An exception while passing a field to
+    a subscriber is reported to ``defects``, and that subscriber loses the field."""
 
-    def __init__(self, patches: tuple[str, ...]) -> None:
+    def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
         self._patches = frozenset(patches)
+        self._defects = Defects("host") if defects is None else defects
         self._latest: dict[str, FieldFrame] = {}
         self._subscriptions: dict[int, weakref.ref[Subscription]] = {}
         self._keys = itertools.count()
@@ -237,5 +240,9 @@ class Publisher:
     def _tell(self, item: _Item, patch: str) -> None:
         for reference in list(self._subscriptions.values()):
             subscription = reference()
-            if subscription is not None:
+            if subscription is None:
+                continue
+            try:
                 subscription._offer(item, patch)
+            except Exception as error:
+                self._defects.report("passing a field to a subscriber", error)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.host.code_watch import CodeWatch
+from skinnode.host.containment import Defects
 from skinnode.host.dealer import Dealer
 from skinnode.host.health import BOOT_UP, NodeMonitor
 from skinnode.host.pipeline import Lane
@@ -61,9 +62,11 @@ def receive_patch(
     ticks: Ticks,
     workers: Workers | Inline,
     publisher: Publisher,
+    defects: Defects | None = None,
 ) -> PatchReception:
     """From now on frames of the patch go to its monitor and its lane, which withholds scans until it is told
-    how to decode them: a node that an earlier host left operational may be sending already."""
+    how to decode them: a node that an earlier host left operational may be sending already. Exceptions
+    there are reported to ``defects``; without ``defects`` they are raised, and the publisher fails."""
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
     monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject, watch)
@@ -72,7 +75,8 @@ def receive_patch(
     dealer.expect(patch.name, ())  # until its first scan
 
     def on_scan(scan: Scan) -> None:
-        monitor.on_scan(scan.t_last_ns)
+        if not scan.empty:
+            monitor.on_scan(scan.t_last_ns)
         dealer.expect(patch.name, rhythm.next_ns(scan.t_last_ns))
 
     assembler = ScanAssembler(
@@ -86,7 +90,7 @@ def receive_patch(
     )
     lane = Lane(
         patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial, watch.on_scan,
-        under_way=dealer.config.role == "guest",
+        under_way=dealer.config.role == "guest", defects=defects,
     )  # fmt: skip
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
@@ -94,11 +98,11 @@ def receive_patch(
         if len(data) == 1 and data[0] & 0x7F == BOOT_UP:
             lane.withhold()  # what it sends from here on is not as it was configured
 
-    dealer.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat)
-    dealer.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency)
-    dealer.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk)
-    dealer.handle(od.summary_cob_id(patch.node_id), lane.on_summary)
-    dealer.poll_with(lane.poll)
+    dealer.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, defects)
+    dealer.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, defects)
+    dealer.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk, defects)
+    dealer.handle(od.summary_cob_id(patch.node_id), lane.on_summary, defects)
+    dealer.poll_with(lane.poll, defects)
     return PatchReception(lane, monitor)
 
 

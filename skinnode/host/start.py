@@ -9,25 +9,36 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from typing import Final
 
-from skinnode.errors import BusError, NodeTimeout, SkinError
-from skinnode.host.bringup import Abandoned
+from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
+from skinnode.host import bringup
 from skinnode.host.health import OPERATIONAL
+from skinnode.host.network import Abandoned
 from skinnode.host.pipeline import Solver
 from skinnode.host.station import Station
 from skinnode.host.supervisor import START_DEADLINE_S
 from skinnode.model.config import Missing, PatchConfig
+from skinnode.words import known
 
 BRING_UP_THREADS: Final = 16
 """Nodes brought up at the same time; more would only queue for the bus."""
 
 _BRING_UPS: Final = 3
-"""Tries for a node that boots while it is brought up, as those do that LSS has just found."""
+"""Maximum attempts to bring up a node that boots meanwhile, as nodes just found by LSS do, or whose bring-up
+raises an unforeseen exception."""
+
+_START_AGAIN_NAPS: Final = 50
+"""Naps (a quarter of a second in all) after which an unconfirmed start command is sent again, because it may
+have been lost."""
 
 _POLL_S: Final = 0.005
 
 
 class BringUpCancelled(SkinError):
     """Bring-up was called off by whoever asked for it."""
+
+
+class _Defective(NodeError):
+    """The host had a defect at each bring-up of the node."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
@@ -56,18 +67,28 @@ def bring_up_all(
         if station.is_silent:
             _listen(station, deadline_s, abandoned)
             answered.append(station.patch)
-        for _ in range(_BRING_UPS - 1):
+        for left in reversed(range(_BRING_UPS)):
             try:
                 solver = station.bring_up(deadline_s, abandoned, answered.append)
-                if station.monitor.boot_ups == station.boot_ups:
+                if not left or station.monitor.boot_ups == station.boot_ups:
                     return solver
             except BusError:
-                if station.patch not in answered or station.monitor.boot_ups == station.boot_ups:
+                booted = station.monitor.boot_ups != station.boot_ups
+                if not left or station.patch not in answered or not booted:
                     raise
-        return station.bring_up(deadline_s, abandoned, answered.append)
+            except (SkinError, Abandoned):
+                raise
+            except Exception as error:
+                station.defects.report("bring-up", error)
+                if not left:
+                    patch = station.patch
+                    text = f"patch {patch.name!r} on {patch.bus}: {station.defects.newest}"
+                    raise _Defective(patch.node_id, text) from error
+        raise AssertionError("the last try returns or raises")
 
     def may_wait(station: Station, failure: BaseException | None) -> bool:
-        return missing == "wait" and isinstance(failure, NodeTimeout) and station.patch not in answered
+        silent = isinstance(failure, NodeTimeout) and station.patch not in answered
+        return missing == "wait" and (silent or isinstance(failure, _Defective))
 
     with ThreadPoolExecutor(min(len(stations), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
         try:
@@ -88,6 +109,8 @@ def bring_up_all(
             continue
         if failure is None:
             ready[station] = job.result()
+        elif isinstance(failure, _Defective) and may_wait(station, failure):
+            continue  # the supervisor keeps trying
         elif isinstance(failure, NodeTimeout) and station.patch not in answered:
             if not may_wait(station, failure):
                 raise _silence(station, stations, answered, deadline_s) from None
@@ -110,10 +133,12 @@ def start_all(ready: dict[Station, Solver]) -> None:
             if naps == 0:
                 raise NodeTimeout(
                     patch.node_id,
-                    f"patch {patch.name!r} on {patch.bus}: got NMT state {monitor.nmt_state} after the start "
-                    f"command, allowed: {OPERATIONAL} (operational) within {START_DEADLINE_S:g} s",
+                    f"patch {patch.name!r} on {patch.bus}: got NMT state {known(monitor.nmt_state)} after "
+                    f"the start command, allowed: {OPERATIONAL} (operational) within {START_DEADLINE_S:g} s",
                 )
             naps -= 1
+            if naps % _START_AGAIN_NAPS == 0:
+                bringup.start(station.link.send, patch.node_id)
             time.sleep(_POLL_S)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import queue
+import time
 from collections.abc import Callable
 from typing import Final
 
 from skinnode.errors import BusError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.bringup import Bringer, NodeFacts
+from skinnode.host.containment import Defects
 from skinnode.host.health import OPERATIONAL, STOPPED
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
@@ -22,6 +24,15 @@ from skinnode.wire.profile import PatchProfile
 _MAINLINE_S: Final = 1.0
 """How long the mainline may take to do a small job; it turns fifty times a second unless its bus is away."""
 
+_ANSWER_S: Final = 0.05
+"""Wait for the answers to a single SDO request, s. A failed bring-up is delayed by two of them if the node
+is alone."""
+
+_MUTE_S: Final = 0.4
+_MUTE_SCANS: Final = 5
+"""Time and SYNC periods without a scan after which the configuration of a node is read back: the stream must
+be back within a second."""
+
 
 class Station:
     """One patch. Its methods without a mark may be called by one thread at a time, which is not the mainline:
@@ -34,8 +45,9 @@ class Station:
         link: BusLink,
         reception: PatchReception,
         lss: LssMaster,
+        defects: Defects,
     ) -> None:
-        self.patch, self.link = patch, link
+        self.patch, self.link, self.defects = patch, link, defects
         self.lane, self.monitor = reception.lane, reception.monitor
         self.bus = hand.bus(patch.bus)
         self.is_guest = self.bus.role == "guest"
@@ -46,14 +58,17 @@ class Station:
         """Boot-up messages when its bring-up began: more of them, and it has to be done again."""
         self.t_answer_ns = 0
         """When it last answered an SDO request."""
+        self._answers = 0
+        """SDO answers with its node-ID so far."""
         self._hand, self._lss = hand, lss
         self._profile = PatchProfile.from_config(patch, self.bus)
-        self._remote = link.remote_od(patch.node_id, self._on_answer)
+        self._remote = link.remote_od(patch.node_id, self._on_answer, defects)
 
     # --- mainline
 
     def _on_answer(self, t_ns: int) -> None:
         self.t_answer_ns = t_ns
+        self._answers += 1
 
     # --- bring-up
 
@@ -85,7 +100,16 @@ class Station:
                 on_answer(patch)
 
         bringer = self._bringer(deadline_s, abandoned, answered)
-        self.facts = bringer.bring_up(self.patch, self._profile, self._remote)
+        answers = self._answers
+        try:
+            self.facts = bringer.bring_up(self.patch, self._profile, self._remote)
+        except NodeError as error:
+            if self._answers == answers or abandoned() or (count := self._answers_to_one_question()) < 2:
+                raise
+            node_id, kind = self.patch.node_id, NodeTimeout if isinstance(error, NodeTimeout) else NodeError
+            text = str(error).removeprefix(f"node {node_id}: ")
+            why = f"one question got {count} answers: two nodes have node-ID {node_id} (see skinnode scan)"
+            raise kind(node_id, f"{text}; {why}") from error
         try:
             return Solver(self.facts, self._hand.solver)
         except ValueError as error:  # of electrodes that only the node knew
@@ -95,7 +119,7 @@ class Station:
         """Let scans through to ``solver`` and, as master, tell the node to send them. Raises BusError."""
         # What a guest finds running goes on, heard since its bus was opened, unless the node has booted.
         anew = not self.is_guest or self.monitor.boot_ups > 0
-        self.link.call(lambda: self.lane.resume(solver, withholdings, anew=anew))
+        self.link.call(lambda: self.lane.resume(solver, withholdings, anew=anew), self.defects)
         if not self.is_guest:
             bringup.start(self.link.send, self.patch.node_id)
         self.monitor.running = True
@@ -109,15 +133,28 @@ class Station:
         baseline_ohm = bringer.settle_baseline(self.patch, self._profile, self._remote)
         if (baseline_ohm == facts.baseline_ohm).all() and not self.lane.withholding:
             return None
-        self.facts = facts.with_baseline(baseline_ohm)
-        return Solver(self.facts, self._hand.solver)
+        facts = facts.with_baseline(baseline_ohm)
+        solver = Solver(facts, self._hand.solver)
+        self.facts = facts  # only now: if there is no solver, the baseline in use is the old one
+        return solver
 
     def renew_register(self) -> None:
         """Ask the node for its error register: the emergency that takes an error back may have been lost.
         Raises as :class:`RemoteOd`."""
         said = self.monitor.registers_said
         register = self._remote.read(od.ERROR_REGISTER, 0, "u8")
-        self.link.call(lambda: self.monitor.on_register_read(register, said))
+        self.link.call(lambda: self.monitor.on_register_read(register, said), self.defects)
+
+    def is_mute(self, since_ns: int) -> bool:
+        """Whether the node, operational since ``since_ns``, has sent no scan for so long that it may have
+        lost its configuration. False on the bus of another master, who alone may restore it."""
+        scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
+        patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
+        return not self.is_guest and self.link.t_dealt_ns > scan_ns + patience_ns
+
+    def is_configured(self) -> bool:
+        """As :func:`bringup.is_configured`."""
+        return bringup.is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
         """Tell the node to take what it feels now for its baseline. Any thread. Raises as
@@ -126,7 +163,7 @@ class Station:
         if self.is_guest:
             raise NodeError(node_id, f"{said}: the host is a guest there")
         if self.patch.baseline is not None:  # it would be written back at once
-            raise NodeError(node_id, f"{said}: its baseline is that of {self.patch.baseline}")
+            raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if not self.monitor.running or self.monitor.nmt_state != OPERATIONAL:  # PDOs are heard by no other
             raise NodeError(node_id, f"{said}: it is not operational")
         self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
@@ -135,7 +172,7 @@ class Station:
         """Have the mainline withhold scans; returns the number that :meth:`start` wants. Raises NodeTimeout
         where the mainline is held up, as while the bus is away."""
         answer: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self.link.call(lambda: answer.put(self.lane.withhold()))
+        self.link.call(lambda: answer.put(self.lane.withhold()), self.defects)
         try:
             return answer.get(timeout=_MAINLINE_S)
         except queue.Empty:
@@ -147,6 +184,20 @@ class Station:
         """Ask the node for its device type, without waiting for the answer. Raises BusError."""
         request = b"\x40" + od.DEVICE_TYPE.to_bytes(2, "little") + bytes(5)
         self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
+
+    def _answers_to_one_question(self) -> int:
+        """Return how many answers a single SDO request gets: two if two nodes have this node-ID. The smaller
+        count of two requests, because an answer to an earlier request may be late. Raises BusError."""
+        time.sleep(_ANSWER_S)
+        counts = []
+        for _ in range(2):
+            before = self._answers
+            self.probe()
+            time.sleep(_ANSWER_S)
+            counts.append(self._answers - before)
+            if counts[-1] < 2:
+                break
+        return min(counts)
 
     @property
     def searchable(self) -> bool:

@@ -14,27 +14,35 @@ STARTING   told to go operational                    it says so: RUNNING; too la
 RUNNING    its scans go through                      booted, or in another state: JOINING;
                                                      no heartbeat: AWAITED
 =========  ========================================  =========================================
+
+A defect is an exception raised while serving a patch that is STARTING or RUNNING, or during its bring-up. It
+makes the patch faulty: its scans are withheld, and it is AWAITED for a pause of 0.1 s to 1 s that grows with
+each defect. A node whose bring-up failed is AWAITED likewise. Its boot-up ends the pause; after silence or a
+refusal, any frame from it does.
 """
 
 from __future__ import annotations
 
 import contextlib
-import enum
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Final, Self
 
-from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout, SkinError
-from skinnode.host.bringup import Abandoned
-from skinnode.host.health import HEARTBEATS_MISSED, OPERATIONAL
-from skinnode.host.pipeline import Solver
+import numpy as np
+
+from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout
+from skinnode.host import bringup
+from skinnode.host.containment import Defects, keep_on
+from skinnode.host.health import HEARTBEATS_MISSED, OPERATIONAL, STOPPED
+from skinnode.host.network import Abandoned
 from skinnode.host.station import Station
+from skinnode.host.supervised import Joined, NodeStats, Phase, Supervised
 from skinnode.wire import indices as od
+from skinnode.words import known
 
 _log = logging.getLogger(__name__)
 
@@ -53,75 +61,24 @@ _PROBE_NS: Final = 250_000_000
 heartbeat would never be noticed. 0.1 % of a bus for four."""
 _SEARCH_NS: Final = 1_000_000_000
 """Pause between two searches by LSS for a node that is not there."""
-_RETRY_NS: Final = 400_000_000
-"""Pause after a bring-up that failed: the stream is to be back within a second of the cause going away."""
 _FORGET_NS: Final = 2_000_000_000
-"""A node that has been silent for so long is no longer said to be refused."""
+"""Silence after which a node is no longer reported as refused or faulty, ns."""
 _LEAST_NS: Final = 300_000_000
 """Least time from one bring-up of a node to the next, for nodes that restart in a loop."""
+_MUTE_NS: Final = 1_000_000_000
+"""Minimum time between two readings of the configuration of a node that sends no scans."""
 _DOUBT_NS: Final = 2_000_000_000
-"""Least time between two readings of a baseline, or an error register, that may have changed unseen."""
-
-
-class Phase(enum.StrEnum):
-    """Where the supervisor has a node."""
-
-    AWAITED = "awaited"
-    JOINING = "joining"
-    STARTING = "starting"
-    RUNNING = "running"
-
-
-@dataclass(frozen=True, slots=True)
-class NodeStats:
-    """What the supervisor did about a node."""
-
-    phase: Phase
-    rejoins: int
-    """Bring-ups after the start that ended with the node running."""
-    failures: int
-    """Those that did not."""
-    baselines: int
-    """Times its baseline had changed and was read anew."""
-    complaint: str | None
-    """Why the last bring-up failed; None where it did not."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Joined:
-    """What a job brings back."""
-
-    solver: Solver | None
-    withholdings: int
-
-
-@dataclass(slots=True)
-class _Node:
-    """State of one node; of the supervisor's thread alone."""
-
-    station: Station
-    phase: Phase
-    since_ns: int
-    job: Future[_Joined | None] | None = None
-    """The one that talks to the node; without a result where it only asks for the error register."""
-    searching: Future[bool] | None = None
-    abandon: threading.Event = field(default_factory=threading.Event)
-    """Tells the job to stop where it is."""
-    not_before_ns: int = 0
-    probe_ns: int = 0
-    search_ns: int = 0
-    read_ns: int = 0
-    register_ns: int = 0
-    rejoins: int = 0
-    failures: int = 0
-    baselines: int = 0
-    complaint: str | None = None
+"""Minimum time between two readings of a baseline that may have changed unnoticed, ns."""
+_REGISTER_NS: Final = 500_000_000
+"""Minimum time between two readings of an error register that is not zero, ns. The emergency that clears an
+error may be lost, and the patch must be operational within a second of it. Costs four SDO frames a second."""
 
 
 class Supervisor:
     """Supervises ``stations``, those of ``running`` from where they are, from construction to :meth:`close`.
 
-    ``on_failure`` is told of a defect of its own. It sends the heartbeat of a master that has one.
+    Exceptions raised while serving no patch are reported to ``defects``. The supervisor also sends the
+    heartbeats of masters that have one.
     """
 
     def __init__(
@@ -129,15 +86,17 @@ class Supervisor:
         stations: Sequence[Station],
         running: Sequence[Station],
         heartbeat_s: float,
-        on_failure: Callable[[SkinError], None],
+        defects: Defects,
     ) -> None:
         now_ns = time.monotonic_ns()
         self._nodes = [
-            _Node(
+            Supervised(
                 station,
                 Phase.RUNNING if station in running else Phase.AWAITED,
                 now_ns,
                 read_ns=now_ns + _LEAST_NS,
+                defects=station.defects.count,
+                baseline_ohm=None if station.facts is None else station.facts.baseline_ohm,
             )
             for station in stations
         ]
@@ -147,7 +106,7 @@ class Supervisor:
             if station.link.config.heartbeat_node_id is not None
         }
         self._heartbeat_ns, self._beat_ns = int(heartbeat_s * 1e9), now_ns
-        self._on_failure = on_failure
+        self._defects = defects
         self._stop = threading.Event()
         self._pool = ThreadPoolExecutor(min(THREADS, len(self._nodes)), thread_name_prefix="rejoin")
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
@@ -181,16 +140,19 @@ class Supervisor:
     # --- its thread
 
     def _run(self) -> None:
-        try:
-            while not self._stop.wait(_TURN_S):
-                self._beat(time.monotonic_ns())
-                for node in self._nodes:
-                    self._look(node, time.monotonic_ns())
-        except Exception as error:  # a defect of ours: it must reach the user, not die with the thread
-            _log.debug("supervisor", exc_info=True)
-            failure = SkinError(f"supervisor: {type(error).__name__}: {error}")
-            failure.__cause__ = error
-            self._on_failure(failure)
+        keep_on(self._turn, self._defects, "supervision")
+
+    def _turn(self) -> bool:
+        if self._stop.wait(_TURN_S):
+            return False
+        for node in self._nodes:
+            try:
+                self._look(node, time.monotonic_ns())
+            except Exception as error:  # the next turn makes it faulty
+                node.upset = True
+                node.station.defects.report("supervision", error)
+        self._beat(time.monotonic_ns())
+        return True
 
     def _beat(self, now_ns: int) -> None:
         """The heartbeat of a master, on the buses where it has one."""
@@ -200,10 +162,21 @@ class Supervisor:
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
             assert node_id is not None  # of these
-            with contextlib.suppress(BusError):  # the nodes that do not hear it will say so
+            try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([OPERATIONAL]))
+            except BusError:  # nodes that miss it report that themselves
+                continue
+            except Exception as error:
+                link.defects.report("sending a heartbeat", error)
 
-    def _look(self, node: _Node, now_ns: int) -> None:
+    def _look(self, node: Supervised, now_ns: int) -> None:
+        count = node.station.defects.count
+        if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
+            self._make_faulty(node, now_ns)
+            return
+        if count != node.defects:  # a bring-up is due anyway; exceptions from frames must not delay it
+            node.defects = count
+            node.complaint = node.station.monitor.defect = node.station.defects.newest
         match node.phase:
             case Phase.AWAITED:
                 self._await(node, now_ns)
@@ -214,19 +187,17 @@ class Supervisor:
             case Phase.RUNNING:
                 self._watch(node, now_ns)
 
-    def _await(self, node: _Node, now_ns: int) -> None:
+    def _await(self, node: Supervised, now_ns: int) -> None:
         station, monitor = node.station, node.station.monitor
         booted = monitor.boot_ups != station.boot_ups
-        if now_ns < node.not_before_ns and not (booted and now_ns >= node.since_ns + _LEAST_NS):
-            return
-        heard_ns = max(monitor.t_heartbeat_ns or 0, station.t_answer_ns)
-        if station.is_silent:
-            heard_ns = max(heard_ns, monitor.t_scan_ns or 0)
+        heard_ns = max(monitor.t_heartbeat_ns or 0, station.t_answer_ns, monitor.t_scan_ns or 0)
         if booted or heard_ns > node.since_ns:
-            self._begin(node, now_ns)
+            at_once = (booted or node.was_silent) and now_ns >= node.begun_ns + _LEAST_NS
+            if at_once or now_ns >= node.not_before_ns:
+                self._begin(node, now_ns)
             return
         if now_ns - max(heard_ns, node.since_ns) > _FORGET_NS:
-            monitor.refusal = None  # whatever it was, it is gone
+            monitor.refusal = monitor.defect = None  # the node is gone, whatever it was
         if station.is_silent or station.link.failure is not None:
             return
         if now_ns >= node.probe_ns:
@@ -236,24 +207,24 @@ class Supervisor:
         search_is_over = node.searching is None or node.searching.done()
         if station.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
             node.search_ns = now_ns
-            node.searching = self._pool.submit(station.search)
+            node.searching = self._pool.submit(_search, station)
 
-    def _begin(self, node: _Node, now_ns: int) -> None:
+    def _begin(self, node: Supervised, now_ns: int) -> None:
         """Have the node brought up, once no job talks to it any more: asked for again until then."""
         if node.job is not None and not node.job.done():
             node.abandon.set()
             return
         station, abandon = node.station, threading.Event()
 
-        def bring_up() -> _Joined | None:
+        def bring_up() -> Joined | None:
             withholdings = station.withhold()
-            return _Joined(station.bring_up(JOIN_DEADLINE_S, abandon.is_set), withholdings)
+            return Joined(station.bring_up(JOIN_DEADLINE_S, abandon.is_set), withholdings)
 
         station.boot_ups = station.monitor.boot_ups
-        node.abandon, node.phase, node.since_ns = abandon, Phase.JOINING, now_ns
         node.job = self._pool.submit(bring_up)
+        node.abandon, node.phase, node.since_ns, node.begun_ns = abandon, Phase.JOINING, now_ns, now_ns
 
-    def _join(self, node: _Node, now_ns: int) -> None:
+    def _join(self, node: Supervised, now_ns: int) -> None:
         station, job = node.station, node.job
         assert job is not None  # of this phase
         if station.monitor.boot_ups != station.boot_ups:
@@ -270,44 +241,71 @@ class Supervisor:
             assert joined is not None  # of a bring-up
             assert joined.solver is not None
             station.start(joined.solver, joined.withholdings)
+            _note_baseline(node)
         except (BusError, ConfigError) as error:
             refused = isinstance(error, (NodeError, ConfigError)) and not isinstance(error, NodeTimeout)
             self._fail(node, str(error), now_ns, refused=refused)
             return
-        node.phase, node.since_ns = Phase.STARTING, now_ns
+        except Exception as error:
+            node.upset = True
+            station.defects.report("bring-up", error)
+            return
+        node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
         if station.is_guest:  # another master starts it when it likes
             self._running(node, now_ns)
 
-    def _starting(self, node: _Node, now_ns: int) -> None:
+    def _starting(self, node: Supervised, now_ns: int) -> None:
         station = node.station
         if station.monitor.boot_ups != station.boot_ups:
             self._begin(node, now_ns)
         elif station.monitor.said_since(OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif station.link.t_dealt_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            state = station.monitor.nmt_state
-            text = f"node {station.patch.node_id}: got NMT state {state} after the start command, allowed: 5"
-            self._fail(node, text, now_ns, refused=True)
+            silent = station.monitor.nmt_state == OPERATIONAL  # its state before the command
+            self._fail(node, _not_started(station, silent=silent), now_ns, refused=not silent)
+        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: it may have been lost
+            node.probe_ns = now_ns + _PROBE_NS
+            with contextlib.suppress(BusError):
+                bringup.start(station.link.send, station.patch.node_id)
 
-    def _running(self, node: _Node, now_ns: int) -> None:
+    def _running(self, node: Supervised, now_ns: int) -> None:
         station = node.station
         node.phase, node.since_ns, node.complaint = Phase.RUNNING, now_ns, None
+        node.unconfigured = False
         node.read_ns = now_ns + _LEAST_NS
         node.rejoins += 1
-        station.monitor.rejoins, station.monitor.refusal = node.rejoins, None
+        station.monitor.rejoins = node.rejoins
+        station.monitor.refusal = station.monitor.defect = None
+        station.monitor.complaint = None
         _log.warning("node %d (%s) was brought up and runs", station.patch.node_id, station.patch.name)
 
-    def _fail(self, node: _Node, complaint: str, now_ns: int, *, refused: bool) -> None:
+    def _fail(self, node: Supervised, complaint: str, now_ns: int, *, refused: bool) -> None:
         if complaint != node.complaint:
             _log.warning("%s; tried again", complaint)
         node.failures += 1
         node.complaint = complaint
         monitor = node.station.monitor
+        monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
         monitor.running = monitor.running and not refused  # it may be somebody else's now
-        node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, now_ns + _RETRY_NS
+        self._await_again(node, now_ns, was_silent=True)  # or refused: it may be another node by now
 
-    def _watch(self, node: _Node, now_ns: int) -> None:
+    def _make_faulty(self, node: Supervised, now_ns: int) -> None:
+        """Make a patch faulty after a defect. Repeated at the next turn if it raises."""
+        station = node.station
+        count = station.defects.count
+        node.abandon.set()
+        node.failures += 1
+        node.complaint = station.monitor.defect = station.defects.newest
+        station.link.call(station.lane.withhold, station.defects)
+        self._await_again(node, now_ns, was_silent=False)
+        node.defects, node.upset = count, False
+
+    def _await_again(self, node: Supervised, now_ns: int, *, was_silent: bool) -> None:
+        node.phase, node.since_ns, node.was_silent = Phase.AWAITED, now_ns, was_silent
+        node.not_before_ns = now_ns + int(node.pause.next_s() * 1e9)
+
+    def _watch(self, node: Supervised, now_ns: int) -> None:
         station, monitor = node.station, node.station.monitor
         said_ns = monitor.t_heartbeat_ns or 0
         if monitor.boot_ups != station.boot_ups:
@@ -315,6 +313,10 @@ class Supervisor:
             return
         if not station.is_guest and monitor.nmt_state != OPERATIONAL and said_ns > node.since_ns:
             self._begin(node, now_ns)
+            if node.phase is Phase.RUNNING and monitor.nmt_state == STOPPED and now_ns >= node.probe_ns:
+                node.probe_ns = now_ns + _PROBE_NS  # a job waits for a response that it does not send
+                with contextlib.suppress(BusError):
+                    bringup.stand_by(station.link.send, station.patch.node_id)
             if node.phase is Phase.JOINING:
                 _log.warning(
                     "node %d (%s) left NMT state %d for %s without the host's doing",
@@ -328,11 +330,20 @@ class Supervisor:
         if station.link.t_dealt_ns > max(said_ns, node.since_ns) + patience_ns and not station.is_silent:
             _log.warning("node %d (%s) is lost: no heartbeat", station.patch.node_id, station.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            station.link.call(station.lane.withhold)  # what it says until it is known again
+            station.link.call(station.lane.withhold, station.defects)  # until its state is known
+            return
+        if node.unconfigured:
+            node.unconfigured = False
+            _log.warning("node %d (%s) lost its configuration", station.patch.node_id, station.patch.name)
+            self._begin(node, now_ns)
+            return
+        if node.job is None and now_ns >= node.mute_ns and station.is_mute(node.since_ns):
+            node.mute_ns = now_ns + _MUTE_NS
+            node.job = self._pool.submit(_read_back, node)
             return
         self._watch_baseline(node, now_ns)
 
-    def _watch_baseline(self, node: _Node, now_ns: int) -> None:
+    def _watch_baseline(self, node: Supervised, now_ns: int) -> None:
         """Read it again where the node said that it changed, or may have said so in a summary that was
         lost. In the first case scans are withheld until then."""
         station, lane, job = node.station, node.station.lane, node.job
@@ -342,6 +353,7 @@ class Supervisor:
                 self._take_baseline(node, job, now_ns)
             return
         changed = lane.withholding
+        node.announced |= changed
         if not (changed or lane.doubtful) or now_ns < node.read_ns:
             self._watch_register(node, now_ns)
             return
@@ -352,27 +364,27 @@ class Supervisor:
         lane.doubtful = False
         abandon = node.abandon = threading.Event()
 
-        def read() -> _Joined | None:
+        def read() -> Joined | None:
             withholdings = station.withhold() if changed else lane.withholdings
-            return _Joined(station.renew_baseline(JOIN_DEADLINE_S, abandon.is_set), withholdings)
+            return Joined(station.renew_baseline(JOIN_DEADLINE_S, abandon.is_set), withholdings)
 
         node.job = self._pool.submit(read)
 
-    def _watch_register(self, node: _Node, now_ns: int) -> None:
+    def _watch_register(self, node: Supervised, now_ns: int) -> None:
         """Ask a node with an error for its error register: the emergency that ended it may have been lost."""
         station = node.station
         if not station.monitor.error_register or station.is_silent or now_ns < node.register_ns:
             return
 
-        def read() -> _Joined | None:
+        def read() -> Joined | None:
             with contextlib.suppress(BusError, ConfigError):  # asked again
                 station.renew_register()
             return None
 
-        node.register_ns = now_ns + _DOUBT_NS
+        node.register_ns = now_ns + _REGISTER_NS
         node.job = self._pool.submit(read)
 
-    def _take_baseline(self, node: _Node, job: Future[_Joined | None], now_ns: int) -> None:
+    def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
         if job.exception() is None and job.result() is None:  # it was the error register
             return
         station, lane = node.station, node.station.lane
@@ -385,8 +397,47 @@ class Supervisor:
             return
         except Abandoned:
             return
+        except Exception as error:
+            station.defects.report("reading the baseline or the error register", error)
+            return
         assert read is not None  # see above
         solver = read.solver
         if solver is not None:
-            node.baselines += 1
-            station.link.call(lambda: lane.resume(solver, read.withholdings, anew=False))
+            station.link.call(lambda: lane.resume(solver, read.withholdings, anew=False), station.defects)
+            node.announced = True  # or found after a lost summary
+            _note_baseline(node)
+
+
+def _note_baseline(node: Supervised) -> None:
+    """Note with which baseline the scans are solved now. A bring-up finds a new one too: after a reading that
+    failed, or if it changed while the node was away."""
+    facts, before = node.station.facts, node.baseline_ohm
+    assert facts is not None  # of a node that was brought up
+    node.baseline_ohm = facts.baseline_ohm
+    if node.announced or (before is not None and not np.array_equal(before, facts.baseline_ohm)):
+        node.announced = False
+        node.baselines += 1
+        node.station.monitor.baselines = node.baselines
+
+
+def _read_back(node: Supervised) -> None:
+    """Find out whether a node that sends no scans lost its configuration."""
+    with contextlib.suppress(BusError, ConfigError):  # asked again
+        node.unconfigured = not node.station.is_configured()
+
+
+def _search(station: Station) -> bool:
+    """Search for the patch by LSS. Returns whether it was found."""
+    try:
+        return station.search()
+    except Exception as error:
+        station.defects.report("search by LSS", error)
+        return False
+
+
+def _not_started(station: Station, *, silent: bool) -> str:
+    """Return why a node does not count as started."""
+    node = f"node {station.patch.node_id}"
+    if silent:
+        return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command, allowed: one"
+    return f"{node}: got NMT state {known(station.monitor.nmt_state)} after the start command, allowed: 5"

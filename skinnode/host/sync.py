@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from skinnode.errors import BusError
+from skinnode.host.containment import Defects, keep_on
 from skinnode.wire.indices import SYNC_COB_ID
 
 
@@ -96,11 +97,19 @@ class SyncProducer:
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
     first; a thread that wakes too late for a whole period skips it rather than send two in a row. No bus is
-    left out of a SYNC that was begun.
+    left out of a SYNC that was begun. An exception while sending on a bus is reported to its ``defects``.
     """
 
-    def __init__(self, buses: Sequence[tuple[Send, Ticks]], period_s: float, stagger_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        buses: Sequence[tuple[Send, Ticks]],
+        period_s: float,
+        stagger_s: float = 0.0,
+        defects: Sequence[Defects] = (),
+    ) -> None:
         self._buses = tuple(buses)
+        self._defects = tuple(defects) or tuple(Defects("SYNC") for _ in buses)
+        self._due_ns, self._number = time.monotonic_ns(), 0
         self._period_ns, self._stagger_ns = round(period_s * 1e9), round(stagger_s * 1e9)
         self._sent = self._missed = self._failed = self._latest_ns = 0
         self._stop = threading.Event()
@@ -124,26 +133,38 @@ class SyncProducer:
         self.close()
 
     def _run(self) -> None:
-        due_ns = time.monotonic_ns()
-        number = 0
-        while not self._wait(due_ns):
-            number += 1
+        self._due_ns = time.monotonic_ns()
+        keep_on(self._turn, self._defects[0], "sending SYNC")
+
+    def _turn(self) -> bool:
+        """Wait until the next SYNC is due and send it. Returns False at the end."""
+        if self._wait(self._due_ns):
+            return False
+        self._number += 1
+        due_ns, self._due_ns = self._due_ns, self._due_ns + self._period_ns
+        now_ns = time.monotonic_ns()  # one instant for all buses
+        for i in range(len(self._buses)):
+            try:
+                self._send(i, due_ns + i * self._stagger_ns, now_ns)
+            except BusError:  # a full or silent bus may recover; lost scans are counted elsewhere
+                self._failed += 1
+            except Exception as error:
+                self._failed += 1
+                self._defects[i].report("sending SYNC", error)
+        self._sent += 1
+        skipped = max(0, (time.monotonic_ns() - self._due_ns) // self._period_ns)
+        self._missed += skipped
+        self._due_ns += skipped * self._period_ns
+        return True
+
+    def _send(self, i: int, due_ns: int, now_ns: int) -> None:
+        send, ticks = self._buses[i]
+        if i and self._stagger_ns:
+            self._wait(due_ns)
             now_ns = time.monotonic_ns()
-            for i, (send, ticks) in enumerate(self._buses):
-                if i and self._stagger_ns:
-                    self._wait(due_ns + i * self._stagger_ns)
-                    now_ns = time.monotonic_ns()
-                self._latest_ns = max(self._latest_ns, now_ns - due_ns - i * self._stagger_ns)
-                payload = bytes([ticks.note(number, now_ns)])  # before it is sent: the answers must find it
-                try:
-                    send(SYNC_COB_ID, payload)
-                except BusError:  # a full or silent bus may recover; the scans it costs are counted there
-                    self._failed += 1
-            self._sent += 1
-            due_ns += self._period_ns
-            skipped = max(0, (time.monotonic_ns() - due_ns) // self._period_ns)
-            self._missed += skipped
-            due_ns += skipped * self._period_ns
+        self._latest_ns = max(self._latest_ns, now_ns - due_ns)
+        payload = bytes([ticks.note(self._number, now_ns)])  # before sending, so that the scans find it
+        send(SYNC_COB_ID, payload)
 
     def _wait(self, until_ns: int) -> bool:
         """Until then, or at once when there are to be no more; whether that is so."""

@@ -6,8 +6,9 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from skinnode.host.containment import Defects
 from skinnode.host.link import BusLink
-from skinnode.host.pipeline import Lane, LaneTap
+from skinnode.host.pipeline import Lane, LaneTap, Solver
 from skinnode.transport import Frame
 
 
@@ -19,6 +20,38 @@ class HostTap(LaneTap, Protocol):
 
     def sent(self, bus: str, frame: Frame) -> None:
         """A frame that the interface has taken. On whatever thread sent it."""
+
+
+class ContainedTap:
+    """A wrapper of ``tap`` that never raises: an exception is reported to ``defects``, and the tap loses that
+    entry."""
+
+    def __init__(self, tap: HostTap, defects: Defects) -> None:
+        self._tap, self._defects = tap, defects
+
+    def received(self, bus: str, frames: Sequence[Frame]) -> None:
+        self._do(lambda: self._tap.received(bus, frames))
+
+    def sent(self, bus: str, frame: Frame) -> None:
+        self._do(lambda: self._tap.sent(bus, frame))
+
+    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
+        self._do(lambda: self._tap.resumed(patch, solver, anew=anew))
+
+    def withheld(self, patch: str) -> None:
+        self._do(lambda: self._tap.withheld(patch))
+
+    def polled(self, patch: str, t_ns: int) -> None:
+        self._do(lambda: self._tap.polled(patch, t_ns))
+
+    def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
+        self._do(lambda: self._tap.overtaken(patch, scan, t_receive_ns))
+
+    def _do(self, entry: Callable[[], None]) -> None:
+        try:
+            entry()
+        except Exception as error:
+            self._defects.report("recording traffic", error)
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:

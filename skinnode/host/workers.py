@@ -1,7 +1,7 @@
 """The worker pool: threads that do the jobs they are handed, in order, as soon as one is free.
 
-A job leaves the mainline in half a microsecond: no result object, no lock but that of the queue. A job must
-not raise; what goes wrong in it is the job's own to report.
+Submitting a job costs the mainline half a microsecond: no result object, no lock except that of the queue. An
+exception in a job goes to the function passed with it, and the thread continues with the next job.
 """
 
 from __future__ import annotations
@@ -12,23 +12,29 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from skinnode.host.containment import Defects, keep_on
+
 Job = Callable[[], None]
+OnError = Callable[[Exception], object]
+"""Called with the exception of a job, on the thread that ran it; must not raise."""
 
 
 class Workers:
-    """``count`` threads, from construction to :meth:`close`."""
+    """``count`` threads, from construction to :meth:`close`. Exceptions raised outside jobs are reported to
+    ``defects``."""
 
-    def __init__(self, count: int, name: str) -> None:
-        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()  # None: end
+    def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:
+        self._jobs: queue.SimpleQueue[tuple[Job, OnError] | None] = queue.SimpleQueue()  # None: end
+        self._defects = Defects(name) if defects is None else defects
         self._threads = [
             threading.Thread(target=self._run, name=f"{name} {i}", daemon=True) for i in range(count)
         ]
         for thread in self._threads:
             thread.start()
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job: Job, on_error: OnError) -> None:
         """Have ``job`` done by the next thread that is free."""
-        self._jobs.put(job)
+        self._jobs.put((job, on_error))
 
     def close(self) -> None:
         """Do the jobs that were handed in, end and join the threads."""
@@ -46,12 +52,26 @@ class Workers:
         self.close()
 
     def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
+        keep_on(self._turn, self._defects, "taking a job")
+
+    def _turn(self) -> bool:
+        """Wait for the next job and run it. Returns False at the end."""
+        task = self._jobs.get()
+        if task is None:
+            return False
+        job, on_error = task
+        try:
             job()
+        except Exception as error:
+            on_error(error)
+        return True
 
 
 class Inline:
     """In place of :class:`Workers`: each job is done when it is handed in, by the thread that does so."""
 
-    def submit(self, job: Job) -> None:
-        job()
+    def submit(self, job: Job, on_error: OnError) -> None:
+        try:
+            job()
+        except Exception as error:
+            on_error(error)

@@ -25,7 +25,10 @@ class ScanStamp:
     counter: int
     """Scan number as on the wire, u8; the SYNC counter where there is one."""
     device_time_us: int
-    """Time of the node's own clock at the scan's SYNC, u32, wraps."""
+    """Time of the node's own clock at the scan's SYNC, µs, 0 to 2³² − 1, wraps; 0 if the summary was lost. In
+    steps of 64 µs; the host derives the upper 10 bits, at the first scan from its own clock. The node's own
+    32 bits, in steps of 1 µs, can be read from 0x2011:4. Patches of revision 1.0 send those with each
+    scan."""
     t_sync_ns: int
     """When the SYNC of this scan was sent or seen; 0 where it was not."""
     t_receive_ns: int

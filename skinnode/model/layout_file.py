@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import io
+import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from skinnode.errors import NOTHING, ConfigError, Shown
-from skinnode.model.layout import PatchLayout
+from skinnode.input_file import read_input
+from skinnode.model.layout import MOST_ELECTRODES, MOST_PAIRS, PatchLayout
 
 _ARRAYS = ("upper_m", "lower_m")
 _KEYS = (*_ARRAYS, "resistivity_ohm_per_m")
+_MOST_NPZ_BYTES: Final = 16 << 20
+_MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
+"""Maximum numbers in each array."""
+_MOST_ITEM_BYTES: Final = 32
+"""Maximum size of one number: a complex one of two long doubles, which is refused later, by its type."""
+_LONGEST_KEY: Final = 40
+_MOST_HEADER_BYTES: Final = 10_240
+"""Maximum size of what precedes the numbers; NumPy reads a header of at most 10,000 characters."""
 
 
 def read_npz(path: Path) -> PatchLayout:
@@ -23,13 +34,51 @@ def read_npz(path: Path) -> PatchLayout:
     Raises ConfigError for a file that is none of this.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        data = io.BytesIO(read_input("layout file", path, _MOST_NPZ_BYTES))
+        _require_sizes(data, path)
+        data.seek(0)
+        with np.load(data, allow_pickle=False) as file:
             table = {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
-        # np.load takes other files for pickles or a single array
+    except ConfigError:
+        raise
+    except Exception as error:  # zipfile, its decompressors and NumPy raise some fifteen types
         what = " ".join(str(error).split())[:80] or type(error).__name__
         raise ConfigError("layout file", str(path), f"an NPZ file ({what})") from None
     return from_electrodes(table, path)
+
+
+def _require_sizes(data: io.BytesIO, path: Path) -> None:
+    """Check what the members of an NPZ file claim to be, before one is unpacked: a file of some megabytes can
+    hold gigabytes. Raises ConfigError; and what zipfile and NumPy raise if it is no NPZ file."""
+    with zipfile.ZipFile(data) as members:
+        seen: set[str] = set()
+        for member in members.infolist():
+            key = member.filename.removesuffix(".npy")
+            if key not in _KEYS or key in seen:
+                got = Shown("a second array" if key in seen else "an unknown key")
+                raise ConfigError(key[:_LONGEST_KEY], got, f"one each of {', '.join(_KEYS)}", where=str(path))
+            seen.add(key)
+            if member.compress_type not in (
+                zipfile.ZIP_STORED,
+                zipfile.ZIP_DEFLATED,
+            ):  # others unpack at once
+                got = Shown(f"compression method {member.compress_type}")
+                raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
+            most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
+            behind_header = member.file_size - _MOST_HEADER_BYTES
+            _require_size(key, f"{member.file_size} bytes", behind_header, most_bytes, path)
+            with members.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0
+                read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, kind = read(file)
+            _require_size(key, f"shape {shape}", math.prod(shape), _MOST_VALUES[key], path)
+            _require_size(key, f"shape {shape} of {kind}", math.prod(shape) * kind.itemsize, most_bytes, path)
+
+
+def _require_size(key: str, got: str, size: int, most: int, path: Path) -> None:
+    if size > most:
+        raise ConfigError(key, Shown(got), f"at most {_MOST_VALUES[key]} numbers", where=str(path))
 
 
 def has_electrodes(table: Mapping[str, Any]) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from skinnode.errors import NOTHING, ConfigError, Shown
+from skinnode.input_file import read_input
 
 KeyPath = tuple[int | str, ...]
 """``patches[1].node_id`` as ``("patches", 1, "node_id")``."""
@@ -31,6 +32,9 @@ _KEY: Final = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|[A-Za-z0-9_-]+')
 _LONGEST_LINE: Final = 60
 _DEEPEST: Final = 32
 """Parts of a key; a hand file has six."""
+_PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
+_LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
+"""A key with many more parts than that; also a long run of numbers joined by dots, which no hand file has."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # an integer of TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -59,13 +63,13 @@ def read_toml(path: Path, what: str) -> Document:
     """Read a TOML file; ``what`` names it in errors. Raises ConfigError, in one line, for a file that cannot
     be read, is not TOML, nests deeper than anything of ours, or has integers that TOML does not promise."""
     try:
-        text = path.read_bytes().decode()
-    except OSError as error:
-        raise ConfigError(what, str(path), f"a file that can be read ({error.strerror})") from None
+        text = read_input(what, path).decode()
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"byte {error.start}", error.object[error.start : error.end], "UTF-8", where=str(path)
         ) from None
+    if _LONG_KEY.search(text):  # tomllib would take minutes
+        raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path))
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import queue
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -32,8 +34,6 @@ SLOWEST_S: Final = 0.5
 _LOG_LINES: Final = 500
 _BEGIN_S: Final = 3.0
 _MESSAGE_S: Final = 5.0
-_TARE_S: Final = 3.0
-"""How long a new baseline may take to be read."""
 
 HELP: Final = """\
  1 … 9, ← →, tab   choose a patch
@@ -94,11 +94,11 @@ class MonitorApp(App[None]):
         self._arrows = True
         self._message: tuple[float, str, Level] = (0.0, "", "good")
         self._history = History(source.hand, live=source.live)
-        self._baselines: Mapping[str, int] = {}
         self._lines: deque[LogLine] = deque(maxlen=_LOG_LINES)
         self._scale = Scale()
         self._view: View | None = None
-        self._tares: dict[str, tuple[float, int]] = {}
+        self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
+        """Result of each tare, with its level."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
@@ -150,7 +150,6 @@ class MonitorApp(App[None]):
     def _look_at_source(self) -> None:
         snapshot = self._source.snapshot()
         view = self._history.add(snapshot)
-        self._baselines = snapshot.baselines
         self.faults.look(view, time.monotonic_ns())
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
@@ -245,28 +244,24 @@ class MonitorApp(App[None]):
         )
 
     def _tare(self, names: list[str]) -> None:
-        told = []
-        for name in names:
-            count = self._baselines.get(name, 0)
+        """Tare on daemon threads, which nothing waits for, not even the exit of the monitor."""
+        self._say(f"{', '.join(names)}: tare requested")
+
+        def tare(name: str) -> None:
             try:
                 self._source.tare(name)
             except SkinError as error:
-                self._say(str(error), "bad")
+                self._tares.put((str(error), "bad"))
             else:
-                self._tares[name] = time.monotonic() + _TARE_S, count
-                told.append(name)
-        if told:
-            self._say(f"{', '.join(told)}: told to tare")
+                self._tares.put((f"{name}: tared, its new baseline is in use", "good"))
+
+        for name in names:
+            threading.Thread(target=tare, args=(name,), name=f"tare {name}", daemon=True).start()
 
     def _settle_tares(self) -> None:
         """Tell what became of tares."""
-        for name, (until_s, before) in list(self._tares.items()):
-            if self._baselines.get(name, 0) > before:
-                del self._tares[name]
-                self._say(f"{name}: tared, its new baseline is in use")
-            elif time.monotonic() > until_s:
-                del self._tares[name]
-                self._say(f"{name}: no new baseline within {_TARE_S:g} s of the tare", "bad")
+        while not self._tares.empty():
+            self._say(*self._tares.get())
 
     async def action_record(self) -> None:
         source = self._source

@@ -12,6 +12,7 @@ from rich.style import Style
 from skinnode.monitor.maps import Colours, Line
 from skinnode.monitor.source import Recording
 from skinnode.monitor.state import Level
+from skinnode.printable import printable
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +101,9 @@ def pad(line: Line, width: int, look: Look, style: Style | None = None) -> Line:
     for segment in line:
         if left <= 0:
             break
-        length = cell_len(segment.text)
-        text = segment.text if length <= left else set_cell_size(segment.text[: left - 1] + "…", left)
+        whole = segment.text if segment.text.isprintable() else printable(segment.text)
+        length = cell_len(whole)
+        text = whole if length <= left else set_cell_size(whole[: left - 1] + "…", left)
         made.append(Segment(text, segment.style))
         left -= min(length, left)
     if left > 0:

@@ -13,6 +13,7 @@ from skinnode.monitor.maps import Line
 from skinnode.monitor.paint_patch import GONE, alone, facts, tiles
 from skinnode.monitor.state import BusView, LogLine, PatchView, View
 from skinnode.monitor.touches import Touch
+from skinnode.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
@@ -30,7 +31,7 @@ def screen(
         ]
     worst_first = sorted(view.buses, key=lambda bus: ("bad", "note", "good").index(bus.level))
     shown = view.buses if len(view.buses) <= height // 6 else worst_first[: height // 6]
-    buses = [_bus_line(bus, look, width) for bus in shown]
+    buses = [_bus_line(bus, _losses(view, bus), look, width) for bus in shown]
     upper = height - 2 - len(buses) - (8 if height < 28 else 12)
     if ui.zoomed:
         patch = view.patch(ui.selected)
@@ -81,9 +82,26 @@ def _header(view: View, ui: Ui, look: Look, width: int) -> Line:
     return spread(left, [Segment(rates, bar)], width, look, bar)
 
 
-def _bus_line(bus: BusView, look: Look, width: int) -> Line:
+def _losses(view: View, bus: BusView) -> str:
+    """Describe the losses of the patches of a bus, the worst in words; empty if there are none."""
+    counts = [patch.lane.assembler for patch in view.patches if patch.bus == bus.name]
+    for name, one, several in (
+        ("chunks_lost", "chunk lost", "chunks lost"),
+        ("summaries_lost", "summary lost", "summaries lost"),
+        ("scans_torn", "scan torn", "scans torn"),
+        ("scans_missed", "scan missed", "scans missed"),
+        ("scans_mixed", "scan mixed", "scans mixed"),
+    ):
+        if total := sum(getattr(count, name) for count in counts):
+            return counted(total, one, several)
+    return ""
+
+
+def _bus_line(bus: BusView, losses: str, look: Look, width: int) -> Line:
     cells = 12 if width < 110 else 24
     full = min(cells, round(bus.load * cells))
+    words = [*bus.words, losses] if losses else list(bus.words)
+    style = look.note if losses and bus.level == "good" else look.of(bus.level)
     load = look.bad if bus.load > 0.9 else look.note if bus.load > 0.7 else look.gauge
     line = [
         Segment(f" {bus.name:<6.12}", look.strong),
@@ -93,7 +111,7 @@ def _bus_line(bus: BusView, look: Look, width: int) -> Line:
         Segment(f"{100 * bus.load:4.0f} %  ", look.text),
         Segment(f"{bus.frames_hz:5.0f}", look.text),
         Segment(" frames/s  ", look.dim),
-        Segment("; ".join(bus.words) or "nothing lost", look.of(bus.level)),
+        Segment("; ".join(words) or "nothing lost", style),
     ]
     where = [Segment(f"  {bus.where} ({bus.role}) ", look.dim)]
     if width_of(line) + width_of(where) > width:
@@ -132,12 +150,12 @@ def _lower(
         share = height - len(figures) if height - len(figures) >= 7 else height
         below = [[Segment(" ", look.text), *line] for line in figures[: height - share]]
         lines = [*_touches(patches, scale, look, left - 2, share), *below]
-        blocks = [(lines, left), (_log(log, look, width - left, height), width - left)]
+        blocks = [(lines, left), (_log(log, _quiet(view), look, width - left, height), width - left)]
         return beside(blocks, height, look)
     share = min(4, max(2, height // 2))
     lines = [
         *_touches(patches, scale, look, width, share),
-        *_log(log, look, width, height - share),
+        *_log(log, _quiet(view), look, width, height - share),
     ]
     return [pad(line, width, look) for line in lines]
 
@@ -182,7 +200,17 @@ def _touch_line(patch: PatchView, touch: Touch, look: Look, name: int) -> Line:
     ]
 
 
-def _log(log: Sequence[LogLine], look: Look, width: int, height: int) -> list[Line]:
+def _quiet(view: View) -> str:
+    """Return the text of an empty event log; a fault may be older than the log."""
+    wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
+    wrong += [bus.name for bus in view.buses if bus.level == "bad"]
+    if wrong:
+        return f" no event yet; faults from before: {', '.join(wrong)}"
+    lost = any(_losses(view, bus) for bus in view.buses)
+    return " no event" if lost else " nothing happened"
+
+
+def _log(log: Sequence[LogLine], quiet: str, look: Look, width: int, height: int) -> list[Line]:
     lines = [_rule("events", [], look, width)]
     shown = log[-(height - 1) :] if height > 1 else []
     for line in shown:
@@ -195,5 +223,5 @@ def _log(log: Sequence[LogLine], look: Look, width: int, height: int) -> list[Li
             ]
         )
     if not shown:
-        lines.append([Segment(" nothing happened", look.dim)])
+        lines.append([Segment(quiet, look.dim)])
     return [*lines, *([[]] * (height - len(lines)))]

@@ -18,6 +18,8 @@ GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting"
 """Conditions in which the newest field is an old one."""
 _AROUND: Final = 3
 """Lines of a tile beside its map."""
+_LEAST_OUTLINED: Final = (8, 5)
+"""Minimum size of a box, in characters and lines, for a map with an outline."""
 _LABEL: Final = 10
 """Width of the names of figures beside a patch alone."""
 
@@ -32,7 +34,8 @@ def tiles(
     def high_of(columns: int) -> int:
         """Lines of a map in one of so many columns."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
-        return maps.fit(*box, aspect)[1] if min(box) > 0 else 0
+        across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
+        return down + frame if across else 0
 
     columns = max(range(1, count + 1), key=high_of)
     wide, high = width // columns, max(1, high_of(columns)) + _AROUND
@@ -61,13 +64,14 @@ def _tile(
 def _map(
     patch: PatchView, ui: Ui, full_m: float, look: Look, width: int, height: int, *, arrows: bool
 ) -> list[Line]:
-    """The height map in the middle of its box. Of a patch that is gone the last one is shown without
-    colours, crossed by how it is: nobody shall take it for what is felt now."""
+    """Draw the height map centred in its box. It has an outline because untouched skin is as dark as the
+    screen. The last map of a patch that is gone has no colours and shows the condition across it, so that
+    nobody takes it for live data."""
     if patch.surface is None:
         blank = [pad([], width, look) for _ in range(height)]
         blank[height // 2] = centred([Segment("no field", look.dim)], width, look)
         return blank
-    across, down = maps.fit(width, height, patch.surface.aspect)
+    across, down, frame = _fit(width, height, patch.surface.aspect)
     gone = patch.condition in GONE
     lines = maps.paint_map(
         patch.surface,
@@ -84,8 +88,27 @@ def _map(
         for row, text in enumerate(told, max(0, down // 2 - 1)):
             if row < down:
                 lines[row] = centred([Segment(text[:across], look.alarm)], across, look)
+    if frame:
+        lines = outlined(lines, across, look)
     lines = [centred(line, width, look) for line in lines]
     return lines + [pad([], width, look) for _ in range(height - len(lines))]
+
+
+def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
+    """Return the size of the largest map of this shape in a box, and the characters that the outline takes on
+    each side: none in a small box."""
+    frame = 2 if width >= _LEAST_OUTLINED[0] and height >= _LEAST_OUTLINED[1] else 0
+    return (*maps.fit(width - frame, height - frame, aspect), frame)
+
+
+def outlined(lines: Sequence[Line], across: int, look: Look) -> list[Line]:
+    """Draw an outline around the lines of a map that is ``across`` characters wide."""
+    side = Segment("│", look.dim)
+    return [
+        [Segment(f"┌{'─' * across}┐", look.dim)],
+        *([side, *line, side] for line in lines),
+        [Segment(f"└{'─' * across}┘", look.dim)],
+    ]
 
 
 def _figures(patch: PatchView, look: Look, width: int) -> Line:
@@ -123,8 +146,9 @@ def alone(patch: PatchView, ui: Ui, full_m: float, look: Look, width: int, heigh
     """One patch: depth, shear, and everything that is known of it."""
     high = height - 2
     aspect = 1.0 if patch.surface is None else patch.surface.aspect
-    across, down = maps.fit(max(8, (width - 36) // 2), high, aspect)
-    depth = _map(patch, ui, full_m, look, across, down, arrows=False)
+    wide = max(8, (width - 36) // 2)
+    across, down, frame = _fit(wide, high, aspect)
+    depth = _map(patch, ui, full_m, look, across + frame, down + frame, arrows=False)
     blocks = [
         (
             [
@@ -132,15 +156,17 @@ def alone(patch: PatchView, ui: Ui, full_m: float, look: Look, width: int, heigh
                 *depth,
                 maps.legend(full_m, max(2, min(12, across - 8)), look.colours, look.text),
             ],
-            across + 2,
+            across + frame + 2,
         )
     ]
     if patch.surface is not None and patch.condition not in GONE:
         shear = maps.paint_shear(patch.surface, across, down, full_m, look.colours)
+        if frame:
+            shear = outlined(shear, across, look)
         said = f"→ brightest {1e6 * maps.shear_scale_m(full_m):.0f} µm"
-        blocks.append(([_caption("shear", look), *shear, [Segment(said, look.dim)]], across + 2))
+        blocks.append(([_caption("shear", look), *shear, [Segment(said, look.dim)]], across + frame + 2))
     else:
-        blocks.append(([_caption("shear", look)], across + 2))
+        blocks.append(([_caption("shear", look)], across + frame + 2))
     rest = width - sum(wide for _, wide in blocks) - 1
     margin: tuple[list[Line], int] = ([], 1)
     return [
@@ -187,6 +213,7 @@ def facts(patch: PatchView, look: Look, width: int) -> list[Line]:
         fact("latency", f"{1e3 * patch.latency_s:.1f} ms, worst {1e3 * patch.latency_max_s:.1f}")
     lost = {
         "scans torn": counts.scans_torn,
+        "scans corrupt": counts.scans_corrupt,
         "scans missed": counts.scans_missed,
         "scans skipped": lane.skipped,
         "scans withheld": lane.withheld + lane.partial,

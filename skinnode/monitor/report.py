@@ -131,6 +131,7 @@ def _patch_json(patch: PatchView) -> dict[str, Any]:
         "scan": patch.scan,
         "trusted": patch.trusted,
         "torn": counts.scans_torn,
+        "corrupt": counts.scans_corrupt,
         "missed": counts.scans_missed,
         "skipped": patch.lane.skipped,
         "chunks_lost": counts.chunks_lost,

@@ -37,8 +37,6 @@ class Snapshot:
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
     lanes: Mapping[str, LaneStats]
-    baselines: Mapping[str, int]
-    """Times that a new baseline was read."""
     fields: Mapping[str, FieldFrame | None]
 
 
@@ -112,7 +110,6 @@ class HostSource:
             bus_health={name: host.bus_health(name) for name in stats.buses},
             buses=stats.buses,
             lanes=stats.patches,
-            baselines={name: node.baselines for name, node in stats.nodes.items()},
             fields={name: host.latest(name) for name in stats.patches},
         )
 
@@ -192,7 +189,6 @@ class ReplaySource:
             bus_health=self._bus_health(),
             buses=self._run.bus_stats(),
             lanes=self._run.patch_stats(),
-            baselines={},
             fields={patch.name: self._run.publisher.latest(patch.name) for patch in self.hand.patches},
         )
 

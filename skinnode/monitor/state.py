@@ -219,6 +219,8 @@ def judge_patch(
         return "starting", "note", ()
     if health.refusal:
         words.append(health.refusal)
+    if health.defect:
+        words.append(health.defect)
     if health.duplicate_id:
         words.append(f"two nodes have node-ID {health.node_id}")
     if health.restarts_in_a_loop:
@@ -286,7 +288,7 @@ def _bus_view(
 def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
     """An event as a line of the log."""
     level: Level = "bad"
-    if event.what in ("operational", "well", "back", "rejoins"):
+    if event.what in ("operational", "well", "back", "rejoins", "baselines"):
         level = "good"
     elif event.what in ("booting", "boot_ups", "foreign", "noisy", "drifting"):
         level = "note"

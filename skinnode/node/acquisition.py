@@ -107,6 +107,11 @@ class Acquisition:
         self.tared = True
         self.forget_sent()
 
+    @property
+    def sent(self) -> Codes:
+        """(U, K) codes: the last codes sent of every chunk, if :meth:`changed_chunks` selects the chunks."""
+        return self.codes if self._sent is None else self._sent
+
     def forget_sent(self) -> None:
         """Make the next scan a full one: nobody is known to have what was sent before."""
         self._sent = None

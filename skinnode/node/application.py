@@ -26,8 +26,17 @@ from skinnode.node.self_test import self_test
 from skinnode.node.source import SourceFailed, SourceFault
 from skinnode.node.stream import OutgoingScan, ScanStream
 from skinnode.wire import indices as od
-from skinnode.wire.codec import SELF_TEST_NEVER_RUN, SendMode, SummaryFlag, pack_scan, pack_self_test
+from skinnode.wire.codec import (
+    SELF_TEST_NEVER_RUN,
+    Codes,
+    SendMode,
+    SummaryFlag,
+    check_of_codes,
+    pack_scan,
+    pack_self_test,
+)
 from skinnode.wire.coordinates import pack_coordinates
+from skinnode.wire.emergency import TOO_SLOW
 from skinnode.wire.profile import PatchProfile
 
 
@@ -65,6 +74,8 @@ class PatchApplication:
         """What it failed of last."""
         self.overruns = 0
         """Scans skipped because two others were still to be sent."""
+        self.slow_overruns = 0
+        """Overruns because the computer or the bus was too slow, not because the scan period is too short."""
         self._scan_ns = NO_DEADLINE_NS  # when the node's own timer has a scan to take
         self._describe(layout, serial)
         self._connect()
@@ -152,15 +163,20 @@ class PatchApplication:
         self._counter = counter
         if self.stream.full:
             self.overruns += 1
+            held_up = self.stream.is_held_up(t_ns)
+            self.slow_overruns += held_up
             if not self._late:
                 self._late = True
-                self._emcy.present(EmcyCode.CAN_OVERRUN, struct.pack("<H", self.overruns & 0xFFFF), t_ns)
+                detail = struct.pack("<HB", self.overruns & 0xFFFF, TOO_SLOW if held_up else 0)
+                self._emcy.present(EmcyCode.CAN_OVERRUN, detail, t_ns)
             return
+        profile, time_us = self._profile, t_ns // 1000 & 0xFFFF_FFFF
         try:
-            chunks, flags = self._sample(counter, t_ns)
+            chunks, flags, codes = self._sample(counter, t_ns)
         except SourceFailed:
-            chunks, flags = [], SummaryFlag.SOURCE_FAILED
-        self.stream.offer(OutgoingScan(counter, chunks, flags, t_ns // 1000 & 0xFFFF_FFFF, turns), t_ns)
+            chunks, flags, codes = [], SummaryFlag.SOURCE_FAILED, self._acquisition.codes
+        check = check_of_codes(codes, profile) if profile.checked else None
+        self.stream.offer(OutgoingScan(counter, chunks, flags, time_us, check, turns), t_ns)
         if not self.stream.full:
             self._catch_up(t_ns)
 
@@ -169,8 +185,9 @@ class PatchApplication:
         self._late = False
         self._emcy.over(EmcyCode.CAN_OVERRUN, t_ns)
 
-    def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag]:
-        """Chunks to be sent of a scan taken now, and its flags. Raises SourceFailed."""
+    def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag, Codes]:
+        """Take a scan. Returns its chunks to be sent, its flags, and the codes (U, K) that a receiver of all
+        chunks then holds. Raises SourceFailed if the source raises."""
         store, acquisition = self._store, self._acquisition
         if not acquisition.tared:  # the source failed when it was to be done
             self._tare(t_ns)
@@ -182,7 +199,8 @@ class PatchApplication:
         if self._baseline_changed:
             flags |= SummaryFlag.BASELINE_CHANGED
             self._baseline_changed = False
-        chunks = pack_scan(acquisition.codes, counter, self._profile)
+        codes = acquisition.codes
+        chunks = pack_scan(codes, counter, self._profile)
         if store.integer(od.SEND_POLICY, od.SEND_MODE) == SendMode.CHANGED:
             changed = acquisition.changed_chunks(
                 store.integer(od.SEND_POLICY, od.SEND_THRESHOLD),
@@ -190,8 +208,8 @@ class PatchApplication:
             )
             if changed is not None:
                 flags |= SummaryFlag.CHANGED_ONLY
-                chunks = [chunks[index] for index in changed]
-        return chunks, flags
+                chunks, codes = [chunks[index] for index in changed], acquisition.sent
+        return chunks, flags, codes
 
     def _tare(self, t_ns: int) -> None:
         with self._source_watched(t_ns):

@@ -125,7 +125,7 @@ class CanopenDevice:
         self._sdo = SdoServer(self._store, self._send_sdo)
         self._rejected = RejectedFrames(self._store)
         self._emcy = EmcyProducer(self._store, send)
-        self._storage = Storage(self._store, self._emcy, memory, kind)
+        self._storage = Storage(self._store, self._emcy, memory, kind, self._now)
         self._set_bit_rate = set_bit_rate
         self._bit_rate_change = BitRateChange(set_bit_rate)
         self._error_control = ErrorControl(
@@ -140,9 +140,9 @@ class CanopenDevice:
         self._time = TimeConsumer(self._store, self._now)
         store, emcy, now, rejected = self._store, self._emcy, self._now, self._rejected
         tpdos, rpdos = (_count(objects, first) for first in (od.TPDO1_PARAMETER, od.RPDO1_PARAMETER))
-        self._tpdos = TpdoEngine(store, tpdos, send, now)
-        self._rpdos = RpdoEngine(store, rpdos, emcy, rejected, now)
         self._sync = Sync(store, emcy, rejected, send, now)
+        self._tpdos = TpdoEngine(store, tpdos, send, now, self._sync.window)
+        self._rpdos = RpdoEngine(store, rpdos, emcy, rejected, now, self._sync.window)
         self._bus_state = BusState.ACTIVE
         self._handlers: dict[int, Handler] = {}
         self._application = application(Services(store, self._storage, self._tpdos, emcy, now))
@@ -253,6 +253,7 @@ class CanopenDevice:
             case None:
                 return
             case NmtCommand.RESET_NODE:
+                self._lss.reset_node()
                 self._reset(EVERYTHING, t_ns)
             case NmtCommand.RESET_COMMUNICATION:
                 self._reset(COMMUNICATION, t_ns)
@@ -295,6 +296,7 @@ class CanopenDevice:
             self._tpdos.start(t_ns)
         elif was is NmtState.OPERATIONAL:
             self._tpdos.stop()
+        self._sync.window.forget(t_ns)
         self._rpdos.enter(operational=state is NmtState.OPERATIONAL)
         self._sync.enter(communicates=state.communicates)
         self._application.enter(operational=state is NmtState.OPERATIONAL)
@@ -337,6 +339,7 @@ class CanopenDevice:
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
+        self._sync.window.start(t_ns)
         turns = self._tpdos.count_sync(counter)
         self._rpdos.on_sync()
         self._application.on_sync(counter, turns, t_ns)

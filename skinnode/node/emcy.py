@@ -33,6 +33,9 @@ class EmcyCode(IntEnum):
     HEARTBEAT = 0x8130
     BUS_OFF_RECOVERED = 0x8140
     CAN_ID_COLLISION = 0x8150
+    SYNC_WINDOW = 0x8200
+    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
+    301 has no code for it, so this is the generic code of protocol errors."""
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240

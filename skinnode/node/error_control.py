@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable
+from typing import Final
 
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
@@ -20,6 +21,12 @@ from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.wire import indices as od
 
 Handler = Callable[[bytes, int], None]
+
+_RIVAL_BEATS: Final = 3
+"""Number of own heartbeat periods without a frame after which another node with this node-ID counts as gone.
+As a rule the same master configured it, and one of its heartbeats may be lost."""
+_RIVAL_NS: Final = 750_000_000
+"""The same time in ns for a node that sends no heartbeats itself: three default periods."""
 
 
 class ErrorControl:
@@ -40,6 +47,7 @@ class ErrorControl:
         self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
         self._listen = listen
         self._booted_ns: int | None = None  # when there is a boot-up message that nobody has got yet
+        self._rival_until_ns = NO_DEADLINE_NS  # when another node with this node-ID counts as gone
         self._producer = HeartbeatProducer()
         self._guarding = Guarding(store, emcy, failed)
         self._consumer = HeartbeatConsumer(store, emcy, failed)
@@ -52,7 +60,7 @@ class ErrorControl:
     def deadline_ns(self) -> int:
         """When :meth:`on_timer` has something to do."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
-        return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns)
+        return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
     @property
     def silent_from_ns(self) -> int:
@@ -71,6 +79,7 @@ class ErrorControl:
     def reset(self, node_id: int) -> None:
         """The node is being reset: nobody guards it, and nobody has been heard."""
         self._cob_id = od.heartbeat_cob_id(node_id)
+        self._rival_until_ns = NO_DEADLINE_NS
         self._guarding.reset()
         self._consumer.reset()
 
@@ -93,6 +102,9 @@ class ErrorControl:
             self._send(self._cob_id, bytes((state,)))
         self._guarding.on_timer(t_ns)
         self._consumer.on_timer(t_ns)
+        if t_ns >= self._rival_until_ns:
+            self._rival_until_ns = NO_DEADLINE_NS
+            self._emcy.over(EmcyCode.CAN_ID_COLLISION, t_ns)
 
     def _tell_boot_up(self) -> None:
         if self._booted_ns is not None:
@@ -100,8 +112,9 @@ class ErrorControl:
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Somebody else has this node-ID. Told once until a reset, and counted: what to do about it is for
-        people to decide."""
+        """Report another node with this node-ID: once, and as cleared after it has been silent for three
+        heartbeat periods. Every frame is counted. The node takes no other action; that is up to people."""
+        self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)
         self._emcy.present(EmcyCode.CAN_ID_COLLISION, self._cob_id.to_bytes(2, "little"), t_ns)
 

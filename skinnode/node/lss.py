@@ -50,7 +50,7 @@ class LssSlave:
 
     Args:
         address: its identity.
-        node_id: 1 to 127, or :data:`NOT_CONFIGURED`.
+        node_id: the persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
         bit_rates_bps: those it can be set to; none where the bit rate is not its own to change.
         bit_rate_bps: the one configured before; None if none was.
         store: keeps the pending node-ID and bit rate over a power cycle and raises OSError if that fails;
@@ -77,6 +77,7 @@ class LssSlave:
         """The active node-ID."""
         self.pending_node_id = node_id
         """The one from the next reset of communication on."""
+        self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
         self._next_question = 0
         self._scan_part = 0
@@ -93,8 +94,19 @@ class LssSlave:
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
 
+    def reset_node(self) -> None:
+        """Copy the persistent node-ID to the pending node-ID, as at NMT *reset node*: a pending node-ID that
+        was never stored is lost. Call :meth:`reset_communication` afterwards.
+
+        Two public stacks that follow CiA 305 agree: c-open copies the persistent to the pending node-ID in
+        the NMT sub-state *reset application* and the pending to the active node-ID in *reset communication*
+        (src/co_nmt.c); CANopenNode initialises the pending node-ID from non-volatile memory after reset node
+        and does not change it at reset communication (305/CO_LSSslave.h).
+        """
+        self.pending_node_id = self._persistent_node_id
+
     def reset_communication(self) -> None:
-        """NMT reset: the pending node-ID becomes the active one."""
+        """Copy the pending node-ID to the active node-ID, as at NMT *reset communication*."""
         self.node_id = self.pending_node_id
         self._enter(LssState.WAITING)
         self._scan_part = 0
@@ -194,6 +206,7 @@ class LssSlave:
             self._store(self.pending_node_id, self.pending_bit_rate_bps)
         except OSError:
             return _STORE_FAILED
+        self._persistent_node_id = self.pending_node_id
         return LSS_DONE
 
 

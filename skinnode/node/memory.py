@@ -7,17 +7,21 @@ that, never a mixture.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
 import stat
-from collections.abc import Collection, Mapping
+import weakref
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, Self
 
 from skinnode.errors import SkinError
+from skinnode.file_lock import lock_file
+from skinnode.whole_file import create_beside, discard, discard_leftovers, flush_folder
 from skinnode.wire.lss import BIT_RATES_BPS, NOT_CONFIGURED
 
 _FORMAT: Final = "skinnode node memory 1"
@@ -101,17 +105,45 @@ class VolatileMemory:
 
 
 class FileMemory:
-    """A file that people can read: JSON with a checksum. One node has it for itself. Saving waits for the
-    medium, some milliseconds in which the node, and others driven by its thread, do nothing else.
+    """A human-readable file: JSON with a checksum. Saving waits for the medium, some milliseconds in which
+    the node, and any other node driven by its thread, does nothing else.
 
-    It is replaced as a whole (written beside itself, flushed to the medium, renamed), so that a process that
-    is killed and a power supply that fails at any moment leave the old content or the new. A file that is
+    A memory owns the file exclusively, from :meth:`claim` or the first :meth:`save` to :meth:`close`, the end
+    of a ``with`` block or the end of the object. The claim is a kernel lock on a file beside it, which is
+    released when the process ends, even if it is killed.
+
+    The file is replaced atomically (written under a temporary name, flushed to the medium, renamed), so that
+    a killed process or a power failure at any moment leaves the old content or the new. It is created
+    for its owner alone (mode 0600), and a symbolic link in its place is refused. A file that is
     damaged or belongs to another patch is not overwritten but put aside, under a name that ends in
     ``.unused-`` and a digest of its bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path).resolve()
+        path = Path(path)
+        self.path = Path(os.path.realpath(path.parent)) / path.name
+        self._release: Callable[[], object] | None = None
+
+    def claim(self) -> None:
+        """Claim the file exclusively. Raises FileInUse if another memory owns it, in this or another process,
+        and OSError if it cannot be locked."""
+        if self._release is None:
+            lock = lock_file(self.path.with_name(f".{self.path.name[:200]}.lock"))
+            self._release = weakref.finalize(self, lock.release)
+            discard_leftovers(self.path)
+
+    def close(self) -> None:
+        """Release the file. A closed memory can be claimed again."""
+        release, self._release = self._release, None
+        if release is not None:
+            release()
+
+    def __enter__(self) -> Self:
+        self.claim()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def load(self) -> Kept | None:
         """See :class:`Memory`."""
@@ -125,24 +157,28 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """See :class:`Memory`."""
-        beside = self.path.with_name(f".{self.path.name}.new")
+        """See :class:`Memory`. Raises FileInUse, an OSError, if another memory owns the file."""
+        self.claim()
+        beside = create_beside(self.path, pack(kept), durable=True)
         try:
-            with open(beside, "wb") as file:
-                file.write(pack(kept))
-                file.flush()
-                os.fsync(file.fileno())
             self._put_aside(kept.patch)
             os.replace(beside, self.path)
-        except OSError:
-            beside.unlink(missing_ok=True)
+        except BaseException:
+            discard(beside)
             raise
-        self._flush_folder()
+        flush_folder(self.path.parent)
 
     def _read(self) -> bytes:
-        if not stat.S_ISREG(self.path.stat().st_mode):  # reading a pipe would wait for whoever writes to it
-            raise MemoryFault(Fault.UNREADABLE, "not a file")
-        with open(self.path, "rb") as file:
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # opening a pipe must not block
+        try:
+            descriptor = os.open(self.path, flags)
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise MemoryFault(Fault.UNREADABLE, "a symbolic link, which is not followed") from error
+            raise
+        with open(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise MemoryFault(Fault.UNREADABLE, "not a file")
             return file.read(_MOST_BYTES)
 
     def _put_aside(self, patch: str) -> None:
@@ -157,14 +193,6 @@ class FileMemory:
                 return
         digest = hashlib.sha256(data).hexdigest()[:8]
         os.replace(self.path, self.path.with_name(f"{self.path.name}.unused-{digest}"))
-
-    def _flush_folder(self) -> None:
-        """A rename is safe when the folder is."""
-        descriptor = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def pack(kept: Kept) -> bytes:

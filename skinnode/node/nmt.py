@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+from skinnode.words import counted
+
 
 class NmtState(IntEnum):
     """States; the value is what the heartbeat carries. A node without power is INITIALISING too: it is
@@ -54,5 +56,5 @@ def parse(data: bytes, node_id: int) -> NmtCommand | None:
     """The command a frame on COB-ID 0 holds for ``node_id``; None for another node's. Raises ValueError for
     what is no command: not two bytes, or an unknown specifier."""
     if len(data) != 2:
-        raise ValueError(f"NMT: got {len(data)} bytes, must be 2")
+        raise ValueError(f"NMT: got {counted(len(data), 'byte')}, must be 2")
     return NmtCommand(data[0]) if data[1] in (0, node_id) else None

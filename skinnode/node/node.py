@@ -101,3 +101,8 @@ class PatchNode(CanopenDevice):
     def overruns(self) -> int:
         """Scans skipped because two others were still to be sent."""
         return self._patch.overruns
+
+    @property
+    def slow_overruns(self) -> int:
+        """Number of overruns because this computer, or the bus, was too slow."""
+        return self._patch.slow_overruns

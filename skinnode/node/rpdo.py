@@ -1,6 +1,7 @@
 """RPDOs: takes what others send and writes it into the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
-Types 0 to 240 act at the next SYNC with what came last, 254 and 255 at once. Bytes beyond the mapping are
+Types 0 to 240 act at the next SYNC on the last PDO received within the synchronous window (0x1007), 254 and
+255 at once. Bytes beyond the mapping are
 left alone, a PDO that is too short is not taken at all; both are told by EMCY once, until the length is right
 again. An event timer watches over its RPDO from the first one on that comes, in OPERATIONAL.
 """
@@ -17,6 +18,7 @@ from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import PdoRecords
 from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.node.sync import SyncWindow
 from skinnode.wire import indices as od
 from skinnode.wire.timing import fd_length
 
@@ -56,8 +58,10 @@ class RpdoEngine:
         emcy: EmcyProducer,
         rejected: RejectedFrames,
         now: Clock,
+        window: SyncWindow,
     ) -> None:
         self._store, self._emcy, self._rejected, self._now = store, emcy, rejected, now
+        self._window = window
         self._operational = False
         self._alarms = Alarms()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
@@ -153,7 +157,7 @@ class RpdoEngine:
             self._alarms.set(rpdo.number, t_ns + parameters.event_timer_ns)
         if parameters.event_driven:
             self._execute(rpdo, data)
-        else:
+        elif self._window.is_open(t_ns):
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 from skinnode.node.abort import AbortCode, Refused
+from skinnode.node.clock import Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.memory import Fault, Kept, Memory, MemoryFault, Parameters
 from skinnode.node.od import ObjectStore
@@ -40,11 +41,15 @@ class Storage:
             :class:`~skinnode.node.memory.Fault`).
         memory: None for a node that forgets: 0x1010 and 0x1011 read 0 and refuse, as the standard wants it.
         patch: see :class:`~skinnode.node.memory.Kept`.
+        now: time of the event being handled.
     """
 
-    def __init__(self, store: ObjectStore, emcy: EmcyProducer, memory: Memory | None, patch: str) -> None:
-        self._store, self._emcy, self._memory = store, emcy, memory
+    def __init__(
+        self, store: ObjectStore, emcy: EmcyProducer, memory: Memory | None, patch: str, now: Clock
+    ) -> None:
+        self._store, self._emcy, self._memory, self._now = store, emcy, memory, now
         self._untold: list[bytes] = []
+        self._lasting: dict[Fault, bytes] = {}
         self._kept = Kept(patch)
         self.problem = ""
         """What went wrong with the memory last, in one line; empty if nothing did."""
@@ -72,7 +77,7 @@ class Storage:
     def load(self) -> None:
         """Power came. A memory whose content is of no use counts as empty."""
         patch = self._kept.patch
-        self._kept, self._untold, self.problem = Kept(patch), [], ""
+        self._kept, self._untold, self._lasting, self.problem = Kept(patch), [], {}, ""
         try:
             kept = self._memory.load() if self._memory is not None else None
         except MemoryFault as error:
@@ -86,10 +91,17 @@ class Storage:
     def note(self, fault: Fault, index: int = 0, subindex: int = 0, why: str = "") -> None:
         """Something that :meth:`tell` is to tell."""
         self.problem = why or f"0x{index:04X}:{subindex} as it was kept is not allowed"
-        self._untold.append(struct.pack("<BHB", fault, index, subindex))
+        detail = struct.pack("<BHB", fault, index, subindex)
+        if fault is Fault.REFUSED:
+            self._untold.append(detail)
+        else:
+            self._lasting[fault] = detail
 
     def tell(self, t_ns: int) -> None:
-        """Tell what went wrong since the last time, as emergencies."""
+        """Report the failures since the last call as emergencies. A fault of the whole memory stays in the
+        error register, even across resets, until :meth:`_settle`."""
+        for fault, detail in self._lasting.items():
+            self._emcy.present(EmcyCode.DATA_SET, detail, t_ns, fault)
         untold, self._untold = self._untold, []
         for detail in untold:
             self._emcy.happened(EmcyCode.DATA_SET, detail, t_ns)
@@ -127,6 +139,13 @@ class Storage:
         assert self._memory is not None
         self._memory.save(kept)
         self._kept = kept
+        self._settle(Fault.NOT_SAVED)
+
+    def _settle(self, *faults: Fault) -> None:
+        """Clear the faults: the memory is reliable again."""
+        for fault in faults:
+            if self._lasting.pop(fault, None) is not None:
+                self._emcy.over(EmcyCode.DATA_SET, self._now(), fault)
 
     # --- objects
 
@@ -138,6 +157,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
+            # Stored on command, not a baseline stored automatically: the user knows the present parameters.
+            self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
 

@@ -14,6 +14,9 @@ Whoever drives the node hands it the time of a SYNC, and sampling takes a while 
 for a turn of the timer right after the first chunk of a scan, which says what time it is by then; the second
 one keeps its distance from that.
 
+Synchronous TPDOs keep to the synchronous window (0x1007): chunks and a summary not yet sent when it closes
+are discarded. The window does not apply to event-driven TPDOs.
+
 A scan that is offered while one is being sent waits for it to end, and there is room for one to wait. Chunks
 of two scans are never sent in turns, and a scan once begun is sent whole unless the node leaves OPERATIONAL
 or its chunk TPDO is disabled; then its summary says so, or there is none.
@@ -24,12 +27,16 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Final
 
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
 from skinnode.node.tpdo import Tpdo, TpdoEngine
 from skinnode.wire import indices as od
-from skinnode.wire.codec import SummaryFlag, pack_summary
+from skinnode.wire.codec import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
+
+_HELD_UP: Final = 0.1
+"""Share of the sending time that may be lost before chunks count as held up; thread jitter stays below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +48,8 @@ class OutgoingScan:
     """Payloads of the chunk record, in order; only those to be sent."""
     flags: int
     device_time_us: int
+    check_of_codes: int | None = None
+    """CRC over the codes that a receiver holds after this scan; None for a summary without a check."""
     turns: frozenset[int] = frozenset()
     """Numbers of the synchronous TPDOs whose turn it was at the SYNC that started the scan."""
 
@@ -59,9 +68,11 @@ class ScanStream:
         self._verbatim = False  # whether it carries nothing but the record as it is
         self._chunks_sent = 0
         self._just_begun = False
+        self._busy_ns = 0  # start of the present run of scans without a pause
+        self._paced_ns = 0  # sum of the inhibit times since then
         self.chunk = chunk
         """The chunk record as last sent."""
-        self.summary = bytes(8)
+        self.summary = bytes(12)
         """The summary record (0x2011) of the last scan."""
         self.scans_sent = 0
         tpdos.claim(od.CHUNK, self)
@@ -71,6 +82,13 @@ class ScanStream:
     def full(self) -> bool:
         """Whether a scan is being sent and another one waits already."""
         return self._next_scan is not None
+
+    def is_held_up(self, t_ns: int) -> bool:
+        """Return whether chunks leave late, so that scans take longer than their inhibit times require: the
+        node's thread gets too little processor time, or the bus refuses frames."""
+        busy_ns = t_ns - self._busy_ns
+        lost_ns = busy_ns - self._paced_ns
+        return self._scan is not None and lost_ns > max(self._catch_up_ns, _HELD_UP * busy_ns)
 
     @property
     def deadline_ns(self) -> int:
@@ -111,6 +129,7 @@ class ScanStream:
     def offer(self, scan: OutgoingScan, t_ns: int) -> None:
         """Send ``scan``, at once or after the one being sent. Must not be called while :attr:`full`."""
         if self._scan is None:
+            self._busy_ns, self._paced_ns = t_ns, 0
             self._begin(scan, t_ns)
             self._send_due(t_ns)
             self._just_begun = True
@@ -157,15 +176,25 @@ class ScanStream:
         tpdos, inhibit_ns = self._tpdos, carrier.parameters.inhibit_ns
         earliest_ns = t_ns - self._catch_up_ns
         while unsent and carrier.ready_ns <= t_ns:
+            if carrier.parameters.synchronous and not tpdos.window.lets_out(carrier.number, t_ns):
+                unsent.clear()
+                break
             self.chunk = unsent.popleft()
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
+            self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
             self._chunks_sent += 1  # after it has been sent: a bus may refuse it
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:
         flags = scan.flags if self._chunks_sent == len(scan.chunks) else scan.flags | SummaryFlag.OVERRUN
-        self.summary = pack_summary(scan.counter, flags, self._chunks_sent, scan.device_time_us)
+        said = scan.counter, flags, self._chunks_sent, scan.device_time_us
+        payload = (
+            pack_summary(*said)
+            if scan.check_of_codes is None
+            else pack_checked_summary(*said, scan.check_of_codes)
+        )
+        self.summary = pack_summary_record(payload, scan.device_time_us)
         self.scans_sent += 1
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.parameters.event_driven:

@@ -1,5 +1,5 @@
-"""SYNC, consumed and produced: objects 0x1005, 0x1006 and 0x1019 (CiA 301 v4.2, 7.2.5, 7.5.2.5, 7.5.2.6 and
-7.5.2.22)."""
+"""SYNC consumer and producer: objects 0x1005, 0x1006, 0x1007 and 0x1019 (CiA 301 v4.2, 7.2.5, 7.5.2.5 to
+7.5.2.7 and 7.5.2.22)."""
 
 from __future__ import annotations
 
@@ -21,6 +21,49 @@ SHORTEST_PERIOD_US: Final = 100
 """Of 0x1006: a SYNC takes half of it at 1 Mbit/s."""
 
 
+_DO_NOT_CARE_BIT: Final = 1 << 31
+"""Bit of 0x1005 that may be written and has no meaning (CiA 301 v4.2, table 44)."""
+
+
+class SyncWindow:
+    """Time after a SYNC within which synchronous PDOs are valid (0x1007, µs; 0: no limit)."""
+
+    def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
+        self._store, self._emcy = store, emcy
+        self._sync_ns: int | None = None
+        self._missed: set[int] = set()
+
+    def start(self, t_ns: int) -> None:
+        """Open the window: a SYNC was received at ``t_ns``."""
+        self._sync_ns = t_ns
+
+    def forget(self, t_ns: int) -> None:
+        """Forget the last SYNC and any missed TPDO, because the node entered another NMT state."""
+        self._sync_ns = None
+        for number in tuple(self._missed):
+            self._over(number, t_ns)
+
+    def is_open(self, t_ns: int) -> bool:
+        """Return whether synchronous PDOs are valid at ``t_ns``. Before the first SYNC they are."""
+        length_us = self._store.integer(od.SYNC_WINDOW)
+        return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
+
+    def lets_out(self, number: int, t_ns: int) -> bool:
+        """Return whether the synchronous TPDO ``number``, counted from 0, may be sent at ``t_ns``. If not,
+        the caller discards it; an emergency reports this once until the TPDO is in time again."""
+        if self.is_open(t_ns):
+            self._over(number, t_ns)
+            return True
+        self._missed.add(number)
+        self._emcy.present(EmcyCode.SYNC_WINDOW, (number + 1).to_bytes(2, "little"), t_ns, number)
+        return False
+
+    def _over(self, number: int, t_ns: int) -> None:
+        if number in self._missed:
+            self._missed.discard(number)
+            self._emcy.over(EmcyCode.SYNC_WINDOW, t_ns, number)
+
+
 class Sync:
     """Takes SYNC messages, checks their counter, and makes them where 0x1005 says so.
 
@@ -37,6 +80,7 @@ class Sync:
         now: Clock,
     ) -> None:
         self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
+        self.window = SyncWindow(store, emcy)
         self._communicates = False
         self._period_ns = 0
         self._counter = 0  # of the last SYNC produced
@@ -103,9 +147,9 @@ class Sync:
     # --- guards
 
     def _guard_cob_id(self, _: int, value: int) -> None:
-        check_cob_id(value & ~PRODUCER_BIT, INVALID_BIT)
+        check_cob_id(value & ~(PRODUCER_BIT | _DO_NOT_CARE_BIT), INVALID_BIT)
         moved = (value ^ self._store.integer(od.COB_ID_SYNC)) & COB_ID_MASK
-        if value & INVALID_BIT or (moved and value & PRODUCER_BIT and self._produces):
+        if moved and value & PRODUCER_BIT and self._produces:
             raise Refused(AbortCode.INVALID_VALUE)
 
     def _guard_overflow(self, _: int, value: int) -> None:

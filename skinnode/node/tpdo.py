@@ -30,6 +30,7 @@ from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
+from skinnode.node.sync import SyncWindow
 from skinnode.wire import indices as od
 
 Send = Callable[[int, bytes], None]
@@ -121,8 +122,11 @@ class Owner(Protocol):
 class TpdoEngine:
     """The TPDOs of a node. ``now`` is the time of the event being handled."""
 
-    def __init__(self, store: ObjectStore, count: int, send: Send, now: Clock) -> None:
+    def __init__(self, store: ObjectStore, count: int, send: Send, now: Clock, window: SyncWindow) -> None:
         self._store, self._send, self._now = store, send, now
+        self.window = window
+        """Window in which synchronous TPDOs may be sent. TPDOs without an owner are sent right after the
+        SYNC."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._alarms = Alarms()
@@ -273,8 +277,11 @@ class TpdoEngine:
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
-        """Send now, because of a SYNC."""
-        self._transmit(tpdo, self.payload(tpdo), t_ns)
+        """Send a synchronous TPDO now, or discard it if the synchronous window (0x1007) has closed."""
+        if self.window.lets_out(tpdo.number, t_ns):
+            self._transmit(tpdo, self.payload(tpdo), t_ns)
+        else:
+            tpdo.waiting = False
 
     def _let_out(self, tpdo: Tpdo, t_ns: int, *, timer: bool = True) -> None:
         if tpdo.waiting and t_ns >= tpdo.ready_ns:

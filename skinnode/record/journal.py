@@ -25,7 +25,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
@@ -43,6 +43,8 @@ COMPLAINTS_KEPT: Final = 100
 """Lines that cannot be read and are named; more are only counted."""
 
 _MOST: Final = 2**63 - 1
+_LONGEST_LINE: Final = 2 << 20
+"""Maximum bytes of a line: the facts of the largest patch take one. A longer line is read as several."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -81,6 +83,7 @@ def facts_table(facts: NodeFacts) -> dict[str, Any]:
     return {
         "serial": facts.serial,
         "heartbeat_s": facts.heartbeat_s,
+        "checked": facts.checked,
         "lo": facts.scale.lo,
         "hi": facts.scale.hi,
         "baseline_ohm": facts.baseline_ohm.tolist(),
@@ -110,19 +113,29 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    return NodeFacts(patch, layout, profile, scale, baseline, table["serial"], table["heartbeat_s"])
+    checked = table.get("checked", False)  # missing in the first versions, whose nodes sent no checks
+    if not isinstance(checked, bool):
+        raise TypeError(f"checked: got {checked!r}, must be true or false")
+    return NodeFacts(
+        patch, layout, profile, scale, baseline, table["serial"], table["heartbeat_s"], checked=checked
+    )
 
 
 def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
     """Header, events, and a complaint for each line that cannot be read. Raises ConfigError where there is no
     journal, or its first line is not that of one."""
     try:
-        lines = path.read_bytes().split(b"\n")
+        with path.open("rb") as file:
+            return _read_lines(path, file)
     except OSError as error:
         allowed = f"a journal beside the log that can be read ({error.strerror})"
         raise ConfigError("recording", str(path), allowed) from None
+
+
+def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]], list[str]]:
+    line = file.readline(_LONGEST_LINE)
     try:
-        first = json.loads(lines[0])
+        first = json.loads(line)
         if first["format"] != FORMAT:
             raise ConfigError("format", first["format"], repr(FORMAT), where=str(path))
         header = Header(
@@ -133,12 +146,12 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
     except ConfigError:
         raise
     except (ValueError, KeyError, TypeError, RecursionError):
-        shown = lines[0][:40].decode("ascii", "replace")
+        shown = line.rstrip(b"\n")[:40].decode("ascii", "replace")
         raise ConfigError("line 1", shown, "the header of a recording's journal", where=str(path)) from None
     events: list[dict[str, Any]] = []
     complaints: list[str] = []
     bad = 0
-    for number, line in enumerate(lines[1:], 2):
+    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), 2):
         if not line.strip():
             continue
         try:
@@ -146,7 +159,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         except (ValueError, KeyError, TypeError, RecursionError):
             bad += 1
             if bad <= COMPLAINTS_KEPT:
-                what = "cut off" if number == len(lines) else "no event"
+                what = "no event" if line.endswith(b"\n") else "cut off"
                 complaints.append(f"{path.name} line {number}: {what}")
     if bad > COMPLAINTS_KEPT:
         complaints.append(f"{bad - COMPLAINTS_KEPT} more lines like these")

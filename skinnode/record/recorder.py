@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from skinnode.errors import ConfigError
+from skinnode.host.containment import Defects, keep_on
 from skinnode.host.pipeline import Solver
 from skinnode.model.config import HandConfig
 from skinnode.record.journal import SUFFIX, Header, facts_table
@@ -33,6 +34,8 @@ SYNC_S: Final = 1.0
 
 CAPACITY: Final = 50_000
 """Batches that wait for the disk, at most: some seconds of four full buses."""
+
+_ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
 _Entry = Callable[[], None]
 
@@ -55,16 +58,46 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
 
+def make_folder(path: Path) -> Path | None:
+    """Create the folder ``path`` with its parents, and return it; None if it existed already.
+
+    A name with a suffix is taken for a misspelt recording. Raises ConfigError for such a name, or if the
+    folder cannot be created.
+    """
+    if path.is_dir():
+        return None
+    if path.suffix or path.exists():
+        raise ConfigError("recording", str(path), _ALLOWED)
+    try:
+        path.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigError(
+            "recording", str(path), f"a folder that can be created ({error.strerror})"
+        ) from error
+    return path
+
+
+def _is_folder(path: Path) -> bool:
+    """Return whether ``path`` is a folder. Raises ConfigError if it cannot be a file or a folder, such as a
+    name that is too long."""
+    try:
+        return path.is_dir()
+    except OSError as error:
+        raise ConfigError("recording", str(path), f"{_ALLOWED} ({error.strerror})") from error
+
+
 class Recorder:
     """A recording under way, from construction to :meth:`close`; the host's ``tap``::
 
         with Recorder(hand, "runs/") as recorder, Host.from_config(hand, tap=recorder) as host:
             ...
 
-    ``path`` is a file ending in .log or .blf, or a folder that is there, where it is named after the hand,
-    date and time; the journal lies beside it. Raises ConfigError where one of them exists or cannot be made.
+    ``path`` is a file ending in .log or .blf, or a folder, created if needed, in which the file is named
+    after the hand, date and time; the journal is written beside it. Raises ConfigError if one of the files
+    exists, or if one of them or the folder cannot be created.
     A ``with`` block that fails before the first frame leaves neither behind.
-    When the disk fails the recording ends, one line in the log says so, and the host goes on.
+    If the disk fails, the recording ends, one log line says so, and the host continues. An entry that raises
+    any other exception is lost, and counted in ``dropped``.
 
     A recording that begins before the host does replays bit by bit; one that is begun while the host runs
     (:meth:`Host.tap`) lacks what the solvers had in memory.
@@ -72,10 +105,13 @@ class Recorder:
 
     def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
         now, asked, path = datetime.datetime.now().astimezone(), str(path), Path(path)
-        if asked and path.is_dir():
+        self._made: Path | None = None
+        """Folder that this recorder created; None if it existed."""
+        if asked and (_is_folder(path) or path.suffix not in SUFFIXES):
+            self._made = make_folder(path)
             path = name_in(path, hand, kind, now)
         elif path.suffix not in SUFFIXES:
-            raise ConfigError("recording", asked, "an existing folder, or a file ending in .log or .blf")
+            raise ConfigError("recording", asked, _ALLOWED)
         self._channels = channels(hand)
         offset_ns = time.time_ns() - time.monotonic_ns()
         self._log = FrameLog(path, tuple(self._channels.values()))
@@ -91,6 +127,9 @@ class Recorder:
         self._bus_of = {patch.name: patch.bus for patch in hand.patches}
         self._solvers: dict[str, Solver] = {}
         self._lost = self._lost_told = 0
+        self._defects = Defects(str(path))
+        self._flush_s = self._sync_s = time.monotonic()
+        self._ended = False
         self._failure: str | None = None
         self._queue: queue.SimpleQueue[_Entry | None] = queue.SimpleQueue()
         self._try(lambda: self._begin(Header(hand, now.isoformat(timespec="seconds"), offset_ns)))
@@ -139,6 +178,9 @@ class Recorder:
         if error is not None and not self._log.frames:  # nothing worth keeping, and in the way of a retry
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
+            if self._made is not None:
+                with suppress(OSError):  # another process may use it by now
+                    self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> None:
         if self._failure is not None or self._queue.qsize() >= CAPACITY:
@@ -153,23 +195,27 @@ class Recorder:
     # --- of its own thread
 
     def _run(self) -> None:
-        flush_s = sync_s = time.monotonic()
-        go_on = True
-        while go_on:
-            with suppress(queue.Empty):
-                entry = self._queue.get(timeout=FLUSH_S)
-                go_on = entry is not None
-                if entry is not None:
-                    self._try(entry)
-            now_s = time.monotonic()
-            if now_s >= flush_s + FLUSH_S or not go_on:
-                to_disk = now_s >= sync_s + SYNC_S
-                self._try(lambda to_disk=to_disk: self._flush(to_disk=to_disk))  # type: ignore[misc]
-                flush_s, sync_s = now_s, now_s if to_disk else sync_s
+        keep_on(self._turn, self._defects, "recording")
         self._try(lambda: self._write_event("", time.monotonic_ns(), "ended", frames=self._log.frames))
         with suppress(OSError):
             self._journal.close()
         self._log.close()
+
+    def _turn(self) -> bool:
+        """Wait briefly for the next entry and write it. Returns whether there may be more."""
+        if self._ended:
+            return False
+        with suppress(queue.Empty):
+            entry = self._queue.get(timeout=FLUSH_S)
+            self._ended = entry is None
+            if entry is not None:
+                self._try(entry)
+        now_s = time.monotonic()
+        if now_s >= self._flush_s + FLUSH_S or self._ended:
+            to_disk = now_s >= self._sync_s + SYNC_S
+            self._try(lambda: self._flush(to_disk=to_disk))
+            self._flush_s, self._sync_s = now_s, now_s if to_disk else self._sync_s
+        return True
 
     def _try(self, job: _Entry) -> None:
         if self._failure is not None:
@@ -179,6 +225,9 @@ class Recorder:
         except OSError as error:
             self._failure = f"{self.path}: recording ended, the disk does not take it ({error.strerror})"
             _log.warning("%s", self._failure)
+        except Exception as error:
+            self._lost += 1
+            self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
         """The journal first: it must not know less than the log."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from skinnode.errors import ConfigError
+from skinnode.host.containment import Defects
 from skinnode.host.dealer import BusStats, Dealer
 from skinnode.host.health import PatchHealth
 from skinnode.host.pipeline import LaneStats, Solver
@@ -219,7 +220,7 @@ class _Pace:
 class _PollerlessDealer(Dealer):
     """Lanes are polled where the journal says so, not after each batch: there are no batches any more."""
 
-    def poll_with(self, poller: Callable[[int], None]) -> None:
+    def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass
 
 

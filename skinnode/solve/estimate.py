@@ -396,7 +396,7 @@ class Estimator:
         if scale2 != self.scale2 or not np.array_equal(members, self.members):
             return False
         new, old = data.weight[members], weight[members]
-        return bool(np.array_equal(new > 0, old > 0) and (np.abs(new - old) <= 0.1 * old).all())
+        return bool((np.abs(new - old) <= 0.1 * old).all())  # which a resistance lost or found is not
 
     def _linearise(self, data: Data, moved: Float, members: Index | None = None) -> None:
         if self.until < math.inf and perf_counter() > self.until:

@@ -128,13 +128,13 @@ def deviations(inverse: Float, variance: Float, std: Float) -> None:
 def follow(
     x: Float, lower: Float, a: Float, inverse: Float, moved: float, tol_f: float, tol_x: float,
     rho: Float, step: Float,
-) -> tuple[int, float]:  # fmt: skip
+) -> tuple[int, int, float]:  # fmt: skip
     """Simplified Newton steps of a square system whose unknowns are all coordinates ``x`` (3N,), which the
     prediction has ``moved`` so far.
 
-    Returns how many evaluations of F there were, negative where they did not bring it to a root, and the
-    first step as a share of the prediction. A root is ``x`` + ``step``, and ``rho`` (K,) that of ``x``; else
-    ``x`` is the best there is.
+    Returns the number of evaluations of F, negative if they led to no root, the number of steps that ``x``
+    took, and the first step as a share of the prediction. A root is ``x`` + ``step``, and ``rho`` (K,) that
+    of ``x``; else ``x`` is the best there is.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):
@@ -143,12 +143,12 @@ def follow(
             rho[k] = a[k] * rho[k] - 1.0
         size = step_back(inverse, rho, step)
         if not size <= CONTRACTION * before:
-            return -evaluations, first
+            return -evaluations, evaluations - 1, first
         if evaluations == 1:
             first = size / before
         if size <= tol_x * max(1.0, largest(x)) and largest(rho) <= tol_f:
-            return evaluations, first
+            return evaluations, evaluations - 1, first
         for j in range(x.size):
             x[j] += step[j]
         before = size
-    return -FOLLOW_STEPS, first
+    return -FOLLOW_STEPS, FOLLOW_STEPS, first

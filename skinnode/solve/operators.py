@@ -299,11 +299,10 @@ def _marquardt_step(w: Work) -> None:
         if bound < math.inf:
             low = bound
     lam = min(max(s[LAM], low), high)
-    if lam == 0.0:
-        lam = gradient / s[NEWTON_LENGTH] if w.flag[SINGULAR] == 0 else 1e-3 * high
     before = 0.0
     for _ in range(10):
-        lam = max(lam, 1e-3 * high if lam == 0.0 else lam)
+        if lam == 0.0:
+            lam = 1e-3 * high
         damped_solve(w.bd, w.bu, w.e, lam, w.inverse, w.ru, t)
         length = math.sqrt(dot(t, t))
         excess = length - radius

@@ -277,15 +277,15 @@ def solve_wires(
                 for j in range(unknowns):
                     w.x[j] += w.newton[j]
                 if tasks & REUSE and not tall and unknowns == point.size == x_u.size:
-                    evaluations, first = follow(
+                    evaluations, steps, first = follow(
                         w.x, lower, a_u, inverse_u, moved, tol_f, tol_x, w.e, w.newton
                     )
                     followed = evaluations > 0 and first <= FRESH and (turn + u) % REFRESH != 0
                     if evaluations > 0 and not followed:
                         for j in range(unknowns):
                             w.x[j] += w.newton[j]
+                        steps += 1
                     evaluations = abs(evaluations)
-                    steps = evaluations - 1
             if followed:
                 status = CONVERGED
                 for j in range(unknowns):

@@ -44,10 +44,10 @@ def only_unconfigured(line: Line) -> LssAddress:
     found, more = find_unconfigured(line)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
-        got = f"{len(found)}{' and more' if more else ''} nodes without a node-ID" + (
-            f" (serials {serials})" if found else ""
-        )
-        raise ConfigError("--serial", None, f"needed, for there are {got}")
+        if not found:
+            raise ConfigError("--serial", None, "a serial number, because no node without a node-ID answers")
+        there = f"{len(found)}{' and more' if more else ''} nodes have no node-ID (serials {serials})"
+        raise ConfigError("--serial", None, f"a serial number, because {there}")
     return found[0]
 
 

@@ -3,8 +3,6 @@ to a DCF, compared with an EDS or a DCF."""
 
 from __future__ import annotations
 
-import configparser
-import io
 import re
 import struct
 from collections.abc import Callable, Iterator
@@ -12,9 +10,16 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from skinnode.conformance.eds import SIGNED, UNSIGNED, Eds, EdsEntry, number
-from skinnode.errors import ConfigError, NodeError, SdoAbort
-from skinnode.host.network import RemoteOd
-from skinnode.technician.sheet import Sheet
+from skinnode.errors import ConfigError, SdoAbort
+from skinnode.host.network import MOST_BYTES, RemoteOd
+from skinnode.printable import printable
+from skinnode.technician.standard import (
+    SERIES,
+    SINGLE,
+    has_subindices,
+    standard_entries,
+    standard_entry,
+)
 from skinnode.wire import indices as od
 
 Value = int | float | str
@@ -29,8 +34,10 @@ _TYPES: Final = {
 }  # fmt: skip
 _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
-_NO_DATA: Final = 0x0800_0024
-_NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
+_STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
+_NO_OBJECT, _NO_SUBINDEX, _NO_DATA = 0x0602_0000, 0x0609_0011, 0x0800_0024
+"""SDO abort codes: object does not exist, sub-index does not exist, no data available."""
+NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
 """What a node says of itself, whatever its EDS has for a default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
@@ -51,6 +58,16 @@ class Reading:
     """As it travelled; None where the node refused."""
     refused: str
     """Why; empty where it did not."""
+    refused_code: int = 0
+    """SDO abort code of the refusal, 0 if the read succeeded."""
+
+    @property
+    def content(self) -> bytes | None:
+        """Value as bytes, None if the node refused. Many nodes refuse to read an empty string for lack of
+        data: its content is empty."""
+        if self.refused_code == _NO_DATA and self.data_type in _STRINGS:
+            return b""
+        return self.data
 
     @property
     def text(self) -> str:
@@ -58,13 +75,13 @@ class Reading:
         if self.data is None:
             return self.refused
         if isinstance(self.value, str):
-            return repr(self.value)
+            return f"'{self.value}'"
         if isinstance(self.value, int):
             wide = self.value > 255 and len(self.data) >= 2
             return f"{self.value} (0x{self.value:X})" if wide else str(self.value)
         if self.value is not None:
             return f"{self.value:.7g}"
-        return hex_text(self.data)
+        return hex_text(self.data) or "empty"
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +115,7 @@ def hex_text(data: bytes) -> str:
 def decode(entry: EdsEntry, data: bytes) -> Value | None:
     """The value in ``data``; None where it is no number and no text, or not of the length of its type."""
     if entry.data_type == _TEXT:
-        text = data.rstrip(b"\0").decode("latin-1")
-        return "".join(letter if letter.isprintable() else "�" for letter in text)
+        return printable(data)
     if entry.size != len(data):
         return None
     if entry.data_type in _REALS:
@@ -124,17 +140,18 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
             return value.to_bytes(entry.size, "little", signed=entry.data_type in SIGNED)
     except (ValueError, OverflowError, struct.error):
         raise ConfigError("--write", text, f"a value of {entry}: {kind}") from None
-    raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {entry} is {kind}")
+    where = f"{entry} is {kind}" if entry.data_type else f"only the EDS (--eds FILE) has the type of {entry}"
+    raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {where}")
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
     """A value of a node; an abort is a reading too. Raises NodeError where the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
-        data = remote.read_bytes(entry.index, entry.subindex)
+        data = remote.read_bytes(entry.index, entry.subindex, MOST_BYTES)
     except SdoAbort as abort:
         why = "no data" if abort.code == _NO_DATA else f"refused: {abort_text(abort)}"
-        return Reading(*named, None, None, why)
+        return Reading(*named, None, None, why, abort.code)
     return Reading(*named, decode(entry, data), data, "")
 
 
@@ -148,18 +165,49 @@ def abort_text(abort: SdoAbort) -> str:
     return f"0x{abort.code:08X} {str(abort).rpartition(': ')[2]}"
 
 
-def unnamed(index: int, subindex: int) -> EdsEntry:
-    """An object that no sheet describes."""
-    return EdsEntry(index, subindex, "not in the EDS", 0, "", "", None, None, False, 0)
+def unnamed(sheet: Eds, index: int, subindex: int) -> EdsEntry:
+    """Return the entry of an object that neither the EDS nor CiA 301 describes."""
+    why = "not in the EDS" if sheet.entries else "named only in its EDS"
+    return EdsEntry(index, subindex, why, 0, "", "", None, None, False, 0)
 
 
-def entries_at(sheet: Eds, index: int, subindex: int | None) -> list[EdsEntry]:
-    """What an address means: a value, or all of an object. One that the sheet does not have is tried as it
-    is."""
+def entries_at(sheet: Eds, index: int, subindex: int | None, count: Callable[[], int]) -> list[EdsEntry]:
+    """Return the entries at an address: one value, or all of an object. An object that the EDS lacks is named
+    by CiA 301; an object that CiA 301 lacks too is accessed as given. ``count`` reads its sub-index 0."""
     if subindex is None:
         listed = list(sheet.between(index, index))
-        return listed or [unnamed(index, 0)]
-    return [sheet.find(index, subindex) or unnamed(index, subindex)]
+        if not listed:
+            listed = list(standard_entries(index, count() if has_subindices(index) else 0))
+        return listed or [unnamed(sheet, index, 0)]
+    found = sheet.find(index, subindex) or standard_entry(index, subindex)
+    return [found or unnamed(sheet, index, subindex)]
+
+
+def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
+    """Read every object of CiA 301 that the node has: the dump that needs no EDS."""
+    progress("objects of CiA 301")
+    for index in SINGLE:
+        yield from _standard(remote, index)
+    for indices in SERIES:
+        for index in indices:
+            readings = list(_standard(remote, index))
+            if not readings:
+                break
+            yield from readings
+
+
+def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
+    """Read the values of an object; yields nothing if the node does not have it."""
+    try:
+        count = remote.read_bytes(index, 0)
+    except SdoAbort as abort:
+        if abort.code == _NO_OBJECT:
+            return
+        count = b""
+    for entry in standard_entries(index, count[0] if count and has_subindices(index) else 0):
+        reading = read_entry(remote, entry)
+        if reading.refused_code != _NO_SUBINDEX:  # an object may leave some out
+            yield reading
 
 
 def dump(remote: RemoteOd, sheet: Eds, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
@@ -177,11 +225,15 @@ def compare(
     """Where the node is not as the file has it: every value that is given there and can be read, but for what
     a node says of its own state."""
     found: list[Difference] = []
-    given = [entry for entry in sheet.entries.values() if entry.readable and entry.default]
+    given = [
+        entry
+        for entry in sheet.entries.values()
+        if entry.readable and (entry.default or entry.given is not None)
+    ]
     for done, entry in enumerate(given):
         if done % 20 == 0:
             progress(f"0x{entry.index:04X}: {done} of {len(given)} values")
-        if entry.index in _NOT_CONFIGURATION or (entry.index, entry.subindex) in od.COMMANDS:
+        if entry.index in NOT_CONFIGURATION or (entry.index, entry.subindex) in od.COMMANDS:
             continue
         try:
             wanted = entry.default_bytes(node_id)
@@ -190,82 +242,25 @@ def compare(
         if wanted is None:
             continue
         got = read_entry(remote, entry)
-        if got.data is None or (got.data.rstrip(b"\0") if entry.data_type == _TEXT else got.data) != wanted:
-            shown = replace(got, value=decode(entry, wanted), data=wanted).text
-            found.append(Difference(entry.index, entry.subindex, entry.name, got.text, shown))
+        if got.content is None or not _same(entry, got.content, wanted):
+            expected = replace(got, value=decode(entry, wanted), data=wanted)
+            found.append(Difference(entry.index, entry.subindex, entry.name, *_distinct(got, expected)))
     return found
 
 
-def expected(sheet: Sheet) -> Eds:
-    """The EDS with the values of a DCF (ParameterValue) in place of its defaults; as it is where there are
-    none."""
-    parser = _parser()
-    parser.read_string(sheet.text)
-    entries = dict(sheet.eds.entries)
-    for section in parser.sections():
-        match = re.fullmatch(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?", section, re.IGNORECASE)
-        key = None if match is None else (int(match[1], 16), int(match[2] or "0", 16))
-        value = next((v for k, v in parser.items(section) if k.lower() == "parametervalue"), None)
-        if key in entries and value:
-            entries[key] = replace(entries[key], default=value.strip())
-    return replace(sheet.eds, entries=entries)
+def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
+    """Return whether the node's value is that of the file; a string may have trailing zeros that the default
+    of an EDS cannot express."""
+    spelt_out = entry.data_type != _TEXT or entry.given is not None
+    return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)
 
 
-def as_dcf(sheet: Sheet, readings: list[Reading], node_id: int, bitrate_bps: int, name: str) -> str:
-    """The EDS with the value of each object that can be written, and what makes it the DCF of a device."""
-    parser = _parser()
-    parser.read_string(sheet.text)
-    sections = {title.lower(): title for title in parser.sections()}
-    for reading in readings:
-        writable = reading.access in ("rw", "rww", "rwr")
-        if reading.data is None or not writable or reading.index in (*_NOT_CONFIGURATION, od.BASELINE_DOMAIN):
-            continue
-        if (reading.index, reading.subindex) in od.COMMANDS:
-            continue
-        title = sections.get(f"{reading.index:04x}sub{reading.subindex:x}") or (
-            sections.get(f"{reading.index:04x}") if reading.subindex == 0 else None
-        )
-        value = _dcf_value(reading)
-        if title is not None and value is not None:
-            parser.set(title, "ParameterValue", value)
-    commissioning = "DeviceComissioning"  # spelt like this in CiA 306
-    if commissioning.lower() not in sections:
-        parser.add_section(commissioning)
-    for key, value in (
-        ("NodeID", str(node_id)),
-        ("NodeName", name),
-        ("Baudrate", str(bitrate_bps // 1000)),
-        ("NetNumber", "0"),
-        ("NetworkName", ""),
-        ("CANopenManager", "0"),
-    ):
-        parser.set(commissioning, key, value)
-    text = io.StringIO()
-    parser.write(text, space_around_delimiters=False)
-    return text.getvalue()
-
-
-def _dcf_value(reading: Reading) -> str | None:
-    """Numbers in hexadecimal, reals by their pattern, as conforming tools expect them."""
-    assert reading.data is not None
-    if isinstance(reading.value, str):
-        return reading.value
-    if isinstance(reading.value, float):
-        return f"0x{int.from_bytes(reading.data, 'little'):0{2 * len(reading.data)}X}"
-    if isinstance(reading.value, int):
-        return str(reading.value) if reading.value < 10 else f"0x{reading.value:X}"
-    return None
-
-
-def _parser() -> configparser.ConfigParser:
-    parser = configparser.ConfigParser(
-        interpolation=None, strict=False, comment_prefixes=(";",), delimiters=("=",), allow_no_value=True
-    )
-    parser.optionxform = str  # type: ignore[assignment,method-assign]
-    return parser
-
-
-def require_answer(remote: RemoteOd) -> None:
-    """Raises NodeError where nobody answers, before anything is read at length."""
-    if not remote.answers() and not remote.answers():
-        raise NodeError(remote.node_id, "does not answer by SDO")
+def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
+    """Return the texts of two different values; their bytes from the first difference on if the texts are
+    equal, as those of strings that differ in trailing zeros."""
+    if got.data is None or expected.data is None or got.text != expected.text:
+        return got.text, expected.text
+    pairs = enumerate(zip(got.data, expected.data, strict=False))
+    at = next((at for at, (one, other) in pairs if one != other), min(len(got.data), len(expected.data)))
+    node, file = (hex_text(data[at:]) or "no more" for data in (got.data, expected.data))
+    return f"{got.text}, byte {at}: {node}", f"{expected.text}, byte {at}: {file}"

@@ -45,6 +45,8 @@ class NodeHeard:
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
     """When, and the eight bytes."""
+    newest_sdo: tuple[int, bytes] | None = None
+    """When the newest frame on the COB-ID of SDO answers was received, and its data, of any length."""
 
 
 class Heard:
@@ -54,6 +56,9 @@ class Heard:
         self._nodes: dict[int, NodeHeard] = {}
         self.cob_ids: Counter[int] = Counter()
         """Data frames with 11-bit identifiers."""
+        self.nmt: Counter[bytes] = Counter()
+        """Count of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
+    another length."""
         self.extended = self.remote = self.errors = 0
         """Frames with 29-bit identifiers, remote frames, error frames."""
 
@@ -87,6 +92,8 @@ class Heard:
 
     def _note(self, frame: Frame) -> None:
         kind, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
+        if frame.can_id == od.NMT_COB_ID:
+            self.nmt[frame.data if len(frame.data) == 2 else b""] += 1
         if node_id == 0:
             return
         data, t_ns = frame.data, frame.t_ns
@@ -98,5 +105,8 @@ class Heard:
             code = int.from_bytes(data[:2], "little")
             node = self._nodes.setdefault(node_id, NodeHeard())
             node.emergencies.append(Emergency(t_ns, code, data[2], data[3:]))
-        elif kind == od.sdo_response_cob_id(0) and len(data) == 8:
-            self._nodes.setdefault(node_id, NodeHeard()).sdo_answers.append((t_ns, data))
+        elif kind == od.sdo_response_cob_id(0):
+            node = self._nodes.setdefault(node_id, NodeHeard())
+            node.newest_sdo = t_ns, data
+            if len(data) == 8:
+                node.sdo_answers.append((t_ns, data))

@@ -12,6 +12,7 @@ from skinnode.conformance.eds import Eds, parse_eds
 from skinnode.errors import NodeError, SdoAbort
 from skinnode.host.network import RemoteOd
 from skinnode.model.layout import PRESET_IDS, Float
+from skinnode.printable import printable
 from skinnode.technician.line import Line
 from skinnode.technician.pdo import Pdo, pdo_text, read_pdos
 from skinnode.technician.sheet import read_profile
@@ -19,6 +20,7 @@ from skinnode.wire import indices as od
 from skinnode.wire.codec import SelfTestFault, SelfTestStatus
 from skinnode.wire.emergency import history_text, register_text
 from skinnode.wire.profile import PatchProfile, eds_text
+from skinnode.words import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +92,7 @@ class NodeInfo:
         found = [f"error register: {register_text(self.error_register)}"] if self.error_register else []
         if self.patch is not None:
             if self.patch.baseline_missing:
-                found.append(f"{self.patch.baseline_missing} crossings have no baseline: tare")
+                found.append(f"{self.patch.baseline_missing} crossings have no baseline: skinnode tare")
             for text, wires in (
                 ("upper wires open", self.patch.open_upper),
                 ("upper wires shorted", self.patch.shorted_upper),
@@ -118,7 +120,7 @@ class _Reader:
 
     def text(self, index: int) -> str | None:
         data = self.data(index)
-        return None if data is None else data.rstrip(b"\0").decode("latin-1")
+        return None if data is None else printable(data)
 
     def data(self, index: int, subindex: int = 0) -> bytes | None:
         try:
@@ -128,14 +130,19 @@ class _Reader:
 
 
 def read_info(line: Line, node_id: int, sheet: Eds | None = None) -> NodeInfo:
-    """Ask the node everything. ``sheet`` names the objects of a device that is no patch of ours. Raises
+    """Ask the node everything. ``sheet`` names the objects of a device other than a patch. Raises
     NodeError where it does not answer."""
     remote = line.od(node_id)
-    if not remote.answers() and not remote.answers():
-        state = line.state(node_id, None, guarding=False)
-        raise NodeError(node_id, f"does not answer by SDO (NMT state by its heartbeat: {state})")
+
+    def its_state() -> str:
+        return f" (NMT state by its heartbeat: {line.state(node_id, None, guarding=False)})"
+
+    line.require_answer(node_id, its_state)
     read = _Reader(remote)
-    profile = read_profile(remote)
+    try:
+        profile = read_profile(remote)
+    except SdoAbort:  # a node without an identity, or of ours without a descriptor
+        profile = None
     if profile is not None and sheet is None:
         sheet = parse_eds(eds_text(profile), "profile")
 
@@ -200,10 +207,10 @@ def _sync(read: _Reader) -> str:
     if cob_id is None:
         return "none"
     overflow = read.number(od.SYNC_COUNTER_OVERFLOW) or 0
-    parts = ["produces" if cob_id >> 30 & 1 else "consumes", f"0x{cob_id & 0x7FF:03X}"]
+    parts = [f"{'produces' if cob_id >> 30 & 1 else 'consumes'} 0x{cob_id & 0x7FF:03X}"]
     parts.append(f"every {period_us / 1000:g} ms" if period_us else "at any period")
     parts.append(f"counted to {overflow}" if overflow else "not counted")
-    return " ".join(parts)
+    return ", ".join(parts)
 
 
 def _storing(read: _Reader) -> str:
@@ -261,7 +268,8 @@ def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
     data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
         raise NodeError(
-            remote.node_id, f"baseline (0x2301): got {len(data)} bytes, allowed: {4 * profile.n_codes}"
+            remote.node_id,
+            f"baseline (0x2301): got {counted(len(data), 'byte')}, allowed: {4 * profile.n_codes}",
         )
     return np.frombuffer(data, "<f4").astype(np.float64).reshape(profile.rows, profile.columns)
 

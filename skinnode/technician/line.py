@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
@@ -45,6 +46,13 @@ def state_name(state: int) -> str:
     return STATES.get(state, f"state {state}")
 
 
+def no_answer(wrong: str) -> str:
+    """Return what is wrong with a node without a valid SDO answer, whose newest answer is ``wrong``."""
+    if not wrong:
+        return "does not answer SDO requests"
+    return f"answers SDO requests with data that is no answer of CiA 301 (newest: {wrong})"
+
+
 class Line:
     """An open bus. Raises BusError where it does not open. Closed by :meth:`close` or a ``with`` block."""
 
@@ -54,6 +62,7 @@ class Line:
         self.defect: SkinError | None = None
         """A failure of this program on the mainline."""
         self._remotes: dict[int, RemoteOd] = {}
+        self._abandoned = threading.Event()
         self.link = BusLink(bus, {}, self._on_defect)
         self.link.listen(self.heard.on_frames)
         self.lss = LssMaster(self.link.send)
@@ -63,8 +72,13 @@ class Line:
     def od(self, node_id: int) -> RemoteOd:
         """The object dictionary of a node."""
         if node_id not in self._remotes:
-            self._remotes[node_id] = self.link.remote_od(node_id)
+            remote = self._remotes[node_id] = self.link.remote_od(node_id)
+            remote.abandoned = self._abandoned.is_set
         return self._remotes[node_id]
+
+    def abandon(self) -> None:
+        """Abort the transfers of all threads, which raise Abandoned."""
+        self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
         """Whether ``condition`` comes true in that time. Raises BusError if the bus fails meanwhile."""
@@ -86,6 +100,21 @@ class Line:
         self.wait_until(lambda: False, within_s)
         answers = list(self.heard.node(node_id).sdo_answers)
         return [data for t_ns, data in answers if t_ns >= since_ns]
+
+    def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
+        """Ask the node for its device type, twice if need be. Raises NodeError, whose message ends with
+        ``more``, if there is no valid answer."""
+        remote, since_ns = self.od(node_id), time.monotonic_ns()
+        if not remote.answers() and not remote.answers():
+            raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
+
+    def wrong_answer(self, node_id: int, since_ns: int) -> str:
+        """Return the newest frame received after ``since_ns`` in place of an SDO answer, as hexadecimal text;
+        empty if there was none. For a node without a valid answer."""
+        newest = self.heard.node(node_id).newest_sdo
+        if newest is None or newest[0] < since_ns:
+            return ""
+        return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
         """How often the node beats by its 0x1017; 0 for never, None where it does not say."""

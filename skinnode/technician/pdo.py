@@ -9,6 +9,7 @@ from typing import Final, Literal
 from skinnode.errors import SdoAbort
 from skinnode.host.network import RemoteOd
 from skinnode.wire import indices as od
+from skinnode.words import counted
 
 Direction = Literal["TPDO", "RPDO"]
 
@@ -113,7 +114,7 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
     if pdo.sync_start:
         parts.append(f"from SYNC {pdo.sync_start} on")
     names = [name_of(entry >> 16, entry >> 8 & 0xFF) for entry in pdo.mapped]
-    parts.append(f"{pdo.bits // 8} bytes: {_shortened(names)}" if names else "nothing mapped")
+    parts.append(f"{counted(pdo.bits // 8, 'byte')}: {_shortened(names)}" if names else "nothing mapped")
     return ", ".join(parts)
 
 

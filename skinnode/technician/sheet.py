@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from skinnode.conformance.eds import Eds, parse_eds
-from skinnode.errors import ConfigError, NodeError, ProfileError
+from skinnode.conformance.eds import Eds, parse_eds, parse_eds_file
+from skinnode.errors import ConfigError, NodeError, ProfileError, Shown
 from skinnode.host.network import RemoteOd
 from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile, eds_name, eds_text
+from skinnode.wire.profile import BusType, PatchProfile, eds_name, eds_text
 
 
 class Sheet(NamedTuple):
@@ -17,6 +17,11 @@ class Sheet(NamedTuple):
 
     eds: Eds
     text: str
+    """See :class:`~skinnode.wire.eds_encoding.EdsText`."""
+    codec: str = "utf-8"
+    """Codec of its non-ASCII characters."""
+    note: str = ""
+    """Encoding that was assumed, in one line; empty for an ASCII file."""
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
@@ -27,18 +32,17 @@ def read_profile(remote: RemoteOd) -> PatchProfile | None:
             return None
         subs = od.ROWS, od.COLUMNS, od.UPPER_ELECTRODES, od.LOWER_ELECTRODES, od.CODE_BITS, od.PDO_BYTES
         rows, columns, upper, lower, bits, pdo_bytes = (remote.read(od.DESCRIPTOR, sub, "u8") for sub in subs)
-        return PatchProfile(rows, columns, upper, lower, bits, bus="classic" if pdo_bytes == 8 else "fd")
+        checked = remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32") > od.UNCHECKED_REVISION_NUMBER
+        bus: BusType = "classic" if pdo_bytes == 8 else "fd"
+        return PatchProfile(rows, columns, upper, lower, bits, bus=bus, checked=checked)
     except ConfigError as error:
         raise NodeError(remote.node_id, f"its descriptor (0x2000) is of no patch: {error}") from None
 
 
 def load_sheet(path: Path) -> Sheet:
     """An EDS or DCF. Raises ConfigError for a file that cannot be read, ProfileError for one that is none."""
-    try:
-        text = path.read_text(encoding="latin-1")
-    except OSError as error:
-        raise ConfigError("EDS", str(path), f"a file that can be read ({error.strerror})") from None
-    return Sheet(parse_eds(text, str(path)), text)
+    eds, read = parse_eds_file(path)
+    return Sheet(eds, read.text, read.codec, f"{path} {read.note}" if read.note else "")
 
 
 def sheet_of(remote: RemoteOd, path: Path | None) -> Sheet:
@@ -47,6 +51,7 @@ def sheet_of(remote: RemoteOd, path: Path | None) -> Sheet:
         return load_sheet(path)
     profile = read_profile(remote)
     if profile is None:
-        raise ProfileError("--eds", None, f"the EDS of node {remote.node_id}, which is no patch of ours")
+        allowed = f"the EDS of node {remote.node_id}, which is not a skinnode patch"
+        raise ProfileError("--eds", Shown("no file"), allowed)
     text = eds_text(profile)
     return Sheet(parse_eds(text, eds_name(profile)), text)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.errors import NodeError
+from skinnode.printable import printable
 from skinnode.technician.line import Line
 from skinnode.wire import indices as od
 from skinnode.wire.lss import LssAddress
@@ -52,6 +53,10 @@ class FoundNode:
     """Or why it is not known."""
     name: str | None
     """0x1008."""
+    device_type: int | None
+    """0x1000: the number of the device profile in the lower half."""
+    error_register: int | None
+    """0x1001."""
     vendor_id: int | None
     product_code: int | None
     revision: int | None
@@ -61,6 +66,25 @@ class FoundNode:
     """Heard during the survey."""
     duplicate: str
     """What speaks for two nodes with this node-ID; empty for nothing."""
+    wrong_answer: str = ""
+    """Newest frame in place of an SDO answer, as hexadecimal text, if none of its answers was valid."""
+
+    @property
+    def profile(self) -> str:
+        """Device profile in words; empty if the node does not report it."""
+        if self.device_type is None:
+            return ""
+        number = self.device_type & 0xFFFF
+        return f"device profile {number}" if number else "no device profile"
+
+    @property
+    def identity(self) -> list[str]:
+        """Profile, vendor and product in words, as far as the node reports them."""
+        known = [self.profile] if self.profile else []
+        for what, number in (("vendor", self.vendor_id), ("product", self.product_code)):
+            if number is not None:
+                known.append(f"{what} 0x{number:08X}")
+        return known
 
     @property
     def is_patch(self) -> bool:
@@ -85,16 +109,21 @@ def survey(line: Line, progress: Callable[[str], None] = lambda _: None) -> Surv
     """Find everybody. ``progress`` is told what is being done. Raises BusError."""
     begun_s = time.monotonic()
     _let_others_finish(line)
+    asked_ns = time.monotonic_ns()
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="survey") as pool:
-        lss = pool.submit(find_unconfigured, line)
-        progress("asking node-IDs 1 to 127")
-        answered = _sweep(line)
-        progress(f"{len(answered)} answer; who are they?")
-        jobs = [pool.submit(_examine, line, node_id, count) for node_id, count in answered.items()]
-        nodes = [job.result() for job in jobs]
-        line.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
-        unconfigured, more = lss.result()
-    silent = [_only_heard(line, node_id) for node_id in line.heard.nodes if node_id not in answered]
+        try:
+            lss = pool.submit(find_unconfigured, line)
+            progress("asking node-IDs 1 to 127")
+            answered = _sweep(line)
+            progress(f"{len(answered)} answer; who are they?")
+            jobs = [pool.submit(_examine, line, node_id, count) for node_id, count in answered.items()]
+            nodes = [job.result() for job in jobs]
+            line.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
+            unconfigured, more = lss.result()
+        except BaseException:  # Ctrl-C too: the threads of the pool would go on
+            line.abandon()
+            raise
+    silent = [_only_heard(line, node_id, asked_ns) for node_id in line.heard.nodes if node_id not in answered]
     found = sorted((*nodes, *filter(None, silent)), key=lambda node: node.node_id)
     return Survey(tuple(found), unconfigured, more, time.monotonic() - begun_s)
 
@@ -168,6 +197,8 @@ def _examine(line: Line, node_id: int, answers: int) -> FoundNode:
         state=str(state),
         state_known_by=state.how,
         name=_text(line, node_id, od.DEVICE_NAME_INDEX),
+        device_type=_number(line, node_id, od.DEVICE_TYPE, 0),
+        error_register=_number(line, node_id, od.ERROR_REGISTER, 0),
         vendor_id=identity[0],
         product_code=identity[1],
         revision=identity[2],
@@ -178,16 +209,25 @@ def _examine(line: Line, node_id: int, answers: int) -> FoundNode:
     )
 
 
-def _only_heard(line: Line, node_id: int) -> FoundNode | None:
-    """A node-ID that beats and does not answer."""
+def _only_heard(line: Line, node_id: int, asked_ns: int) -> FoundNode | None:
+    """A node-ID that sends heartbeats and no valid SDO answer, asked from ``asked_ns`` on."""
     beat = line.heard.newest_beat(node_id)
     if beat is None:
         return None
     state = line.state(node_id, None, guarding=False)
     boot_ups = line.heard.node(node_id).boot_ups
-    nothing = dict.fromkeys(("vendor_id", "product_code", "revision", "serial", "heartbeat_ms"))
+    identity = ("vendor_id", "product_code", "revision", "serial")
+    nothing = dict.fromkeys(("device_type", "error_register", *identity, "heartbeat_ms"))
     return FoundNode(
-        node_id, False, str(state), state.how, name=None, boot_ups=boot_ups, duplicate="", **nothing
+        node_id,
+        False,
+        str(state),
+        state.how,
+        name=None,
+        boot_ups=boot_ups,
+        duplicate="",
+        wrong_answer=line.wrong_answer(node_id, asked_ns),
+        **nothing,
     )
 
 
@@ -211,7 +251,6 @@ def _number(line: Line, node_id: int, index: int, subindex: int) -> int | None:
 
 def _text(line: Line, node_id: int, index: int) -> str | None:
     try:
-        text = line.od(node_id).read_bytes(index, 0).rstrip(b"\0").decode("latin-1")
+        return printable(line.od(node_id).read_bytes(index, 0))
     except NodeError:
         return None
-    return "".join(letter if letter.isprintable() else "�" for letter in text)

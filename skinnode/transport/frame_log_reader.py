@@ -22,6 +22,7 @@ import can
 from skinnode.errors import ConfigError
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
+from skinnode.words import counted
 
 DAMAGES_KEPT: Final = 100
 """Damages that are described; more are only counted."""
@@ -101,7 +102,9 @@ class FrameLogReader:
                 header = _BLANK_HEADER
             tail, at = b"", _find_container(data, 0)
             if header is not _BLANK_HEADER and at not in (_FILE_HEADER_BYTES, size):
-                self._complain(None, _FILE_HEADER_BYTES, f"no container for {at - _FILE_HEADER_BYTES} bytes")
+                self._complain(
+                    None, _FILE_HEADER_BYTES, f"no container for {counted(at - _FILE_HEADER_BYTES, 'byte')}"
+                )
             while at < size:
                 end, objects = self._container(data, at)
                 if objects is None:
@@ -111,11 +114,11 @@ class FrameLogReader:
                     yield from self._frames(header, whole, at)
                 following = _find_container(data, end)
                 if following > end + _PADDING_BYTES and not (following == size and objects is None):
-                    self._complain(None, end, f"no container for {following - end} bytes")
+                    self._complain(None, end, f"no container for {counted(following - end, 'byte')}")
                     tail = b""
                 at = following
             if tail:
-                self._complain(None, size, f"cut off: a frame of which {len(tail)} bytes are there")
+                self._complain(None, size, f"cut off: a frame that ends after {counted(len(tail), 'byte')}")
 
     def _container(self, data: mmap.mmap, at: int) -> tuple[int, bytes | None]:
         """Where the container at ``at`` ends, and what is in it, as far as it is there; None if it is

@@ -9,6 +9,7 @@ late.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
 import logging
 import os
@@ -25,6 +26,7 @@ from skinnode.errors import BusError
 from skinnode.transport.frame import Frame
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
 from skinnode.wire.timing import fd_length
+from skinnode.words import counted
 
 if TYPE_CHECKING:
     from skinnode.model.config import BusConfig
@@ -56,6 +58,18 @@ _VIRTUAL: Final = "virtual"
 # python-can's loggers warn on stderr where a program has set up no logging, also of what BusError says
 # already.
 logging.getLogger("can").addHandler(logging.NullHandler())
+
+
+def is_interface(config: BusConfig) -> bool:
+    """Return whether python-can, or one of its plugins, has the interface of this bus."""
+    return config.interface in can.VALID_INTERFACES
+
+
+def allowed_interfaces(config: BusConfig) -> str:
+    """Return a phrase with the interface names that python-can knows, suggesting the closest match."""
+    known = ", ".join(sorted(can.VALID_INTERFACES))
+    near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
+    return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"
 
 
 class _Message(can.Message):
@@ -117,9 +131,7 @@ class CanPort:
         if config.fd:
             options["data_bitrate"] = config.data_bitrate_bps
         if config.interface not in can.VALID_INTERFACES:
-            raise BusError(
-                f"{self._where}: no such interface, allowed: {', '.join(sorted(can.VALID_INTERFACES))}"
-            )
+            raise BusError(f"{self._where}: no such interface, allowed: {allowed_interfaces(config)}")
         try:
             bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
         except (
@@ -190,7 +202,7 @@ class CanPort:
         fd = len(data) > 8
         if fd:
             if len(data) > self._longest:
-                raise ValueError(f"data: got {len(data)} bytes, must be at most {self._longest}")
+                raise ValueError(f"data: got {counted(len(data), 'byte')}, must be at most {self._longest}")
             data = data.ljust(fd_length(len(data)), b"\0")
         message = _Message(
             arbitration_id=can_id,

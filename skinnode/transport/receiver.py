@@ -9,7 +9,8 @@ import select
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
@@ -162,14 +163,27 @@ class Intake:
         return True
 
 
+@dataclass(slots=True)
+class _Shared:
+    """Intakes and poller of the shared thread."""
+
+    intakes: dict[Intake, None]
+    """Intakes in order, each once."""
+    poll: select.poll
+
+
 class Receiver:
     """Receives on the ports of ``intakes`` from construction until :meth:`close`.
 
     Ports that read batches share one thread, which wakes for several buses at once where it can. Any other
-    may block in python-can, and has a thread of its own. What goes wrong on a port ends its receiving alone.
+    may block in python-can, and has a thread of its own. A failure of a port stops only its own reception.
+    Any other exception is passed to ``on_defect``, on the thread that raised it, and reception continues.
     """
 
-    def __init__(self, intakes: Sequence[Intake]) -> None:
+    def __init__(
+        self, intakes: Sequence[Intake], on_defect: Callable[[Exception], object] = lambda error: None
+    ) -> None:
+        self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._joining: deque[Intake] = deque()  # to those of the shared thread
         self._stop = threading.Event()
@@ -188,16 +202,17 @@ class Receiver:
 
     def resume(self, intake: Intake) -> None:
         """Receive again on a port that failed and was opened again. From any thread."""
-        intake.resume()
         if intake.port.reads_batches:
+            intake.resume()
             self._joining.append(intake)
             return
         if intake in self._alone:
-            self._alone[intake].join()  # it ended with the failure
+            self._alone[intake].join()  # it ends after the failure, which must not be forgotten before
+        intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = threading.Thread(target=self._receive_alone, args=(intake,), name=name, daemon=True)
-        self._alone[intake] = thread
         thread.start()
+        self._alone[intake] = thread  # set after start(): a thread that did not start cannot be joined
 
     def close(self) -> None:
         """End and join the threads. The ports stay open: they belong to whoever opened them."""
@@ -216,37 +231,56 @@ class Receiver:
         self.close()
 
     def _receive_batches(self) -> None:
-        intakes: dict[Intake, None] = {}  # in order, each once
-        poll = select.poll()
-        while not self._stop.is_set():
-            if self._joining:
-                while self._joining:
-                    intakes[self._joining.popleft()] = None
-                poll = _poll_of(intakes)
-            now_ns = time.monotonic_ns()
-            fetched = [intake for intake in intakes if intake.due_ns <= now_ns + _SHORT_NS]
+        shared = _Shared({}, select.poll())
+        while True:
+            try:
+                if self._stop.is_set():
+                    return
+                self._receive_batch(shared)
+            except Exception as error:
+                self._on_defect(error)
+                time.sleep(_POLL_S)
+
+    def _receive_batch(self, shared: _Shared) -> None:
+        """Run one turn of the shared thread."""
+        intakes = shared.intakes
+        if self._joining:
+            while self._joining:
+                intakes[self._joining[0]] = None
+                self._joining.popleft()
+            shared.poll = _poll_of(intakes)
+        now_ns = time.monotonic_ns()
+        fetched = [intake for intake in intakes if intake.due_ns <= now_ns + _SHORT_NS]
+        if not _fetch(fetched):
+            fetched = list(intakes)
             if not _fetch(fetched):
-                fetched = list(intakes)
-                if not _fetch(fetched):
-                    poll.poll(_POLL_S * 1e3)
-                    for intake in intakes:
-                        intake.due_ns = 0
-                    continue
-            if any(intake.failed for intake in fetched):
-                intakes = {intake: None for intake in intakes if not intake.failed}
-                poll = _poll_of(intakes)
-            self._tell()
-            now_ns = time.monotonic_ns()
-            for intake in fetched:
-                intake.gather(now_ns)
-            due_ns = min([intake.due_ns for intake in intakes], default=now_ns + GATHER_NS)
-            time.sleep(max(0, due_ns - now_ns) * 1e-9)
+                shared.poll.poll(_POLL_S * 1e3)
+                for intake in intakes:
+                    intake.due_ns = 0
+                return
+        failed = [intake for intake in intakes if intake.failed]
+        if failed:
+            for intake in failed:
+                del intakes[intake]
+            shared.poll = _poll_of(intakes)
+        self._tell()
+        now_ns = time.monotonic_ns()
+        for intake in fetched:
+            intake.gather(now_ns)
+        due_ns = min([intake.due_ns for intake in intakes], default=now_ns + GATHER_NS)
+        time.sleep(max(0, due_ns - now_ns) * 1e-9)
 
     def _receive_alone(self, intake: Intake) -> None:
-        while not (self._stop.is_set() or intake.failed):
-            # Asked twice: this thread may have been away since it was told that there is none.
-            if intake.fetch(_POLL_S) or intake.fetch(0.0):
-                self._tell()
+        while True:
+            try:
+                if self._stop.is_set() or intake.failed:
+                    return
+                # Polled twice: this thread may have been suspended since the first poll found nothing.
+                if intake.fetch(_POLL_S) or intake.fetch(0.0):
+                    self._tell()
+            except Exception as error:
+                self._on_defect(error)
+                time.sleep(_POLL_S)
 
     def _tell(self) -> None:
         if self._news.empty():  # once is enough

@@ -11,7 +11,16 @@ sooner), so with the usual range of 240 scans a frame may be 237 periods old.
 in a frame that comes twice with other content. Nobody can tell then whose the rest is: such a scan is thrown
 away whole. So is a scan with frames missing whose chunks lie more than two periods apart: it began with one
 that had the counter of a scan to come, and that scan's own chunk of that place comes after the timeout.
-Two halves of which no frame overlaps cannot be told from one scan.
+Two halves without overlapping frames can be distinguished from one scan only by the check.
+
+**The check.** A summary with :attr:`~skinnode.wire.codec.SummaryFlag.CHECKED` carries a CRC over all codes
+that the receiver must hold (:func:`~skinnode.wire.codec.scan_check`). If it fails, the wrong chunk cannot be
+identified: the whole scan is discarded, with the codes held for chunks that are not sent. A stream is
+*checked* from the first check that passes, or if its owner knows that the node sends checks
+(:meth:`ScanAssembler.reset`). In a checked stream no scan is complete without its check: a scan whose summary
+was lost, or that lacks codes of chunks not sent again, is published as *unchecked*, and a summary without a
+check is rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks have been
+received.
 
 **Order of counters.** Up to half the counter range ahead is newer, the rest is late and dropped. After a
 timeout without an accepted frame whatever comes is believed to be a new stream: a node or the SYNC producer
@@ -35,22 +44,32 @@ from skinnode.errors import CodecError, ConfigError
 from skinnode.wire.codec import (
     MISSING,
     PDO_BYTES,
+    TIME_WRAP_US,
     Codes,
     Summary,
     SummaryFlag,
     chunk_indexer,
     chunk_of_code,
+    restore_time_us,
+    scan_check,
     unpack_scan,
+    unpack_scan_with_check,
     unpack_summary,
 )
 from skinnode.wire.indices import chunk_cob_id, summary_cob_id
 from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
+from skinnode.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
 """Stands at the chunk numbers a patch does not have, so that the hot path needs no bounds check."""
 _NONE_OPEN: Final = -1  # no counter on the wire is negative
 _NEVER: Final = -1
+_HEAD_BYTES: Final = 6
+"""Number of bytes of a summary that its check covers."""
+# Testing a flag in a flag takes as long as a whole chunk; testing an int in an int, a tenth of that.
+_CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
+_BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,16 +85,23 @@ class Scan:
     scan: int
     """The counter unwrapped: it starts at the first counter seen and only grows."""
     complete: bool
-    """All chunks the node sent in this scan arrived, and it sent all it had to."""
+    """All chunks the node sent in this scan arrived, it sent all it had to and, in a checked stream, the
+    check passed: the codes are those that the node packed."""
     chunks_expected: int
     """As the summary says; without a summary, those of a full scan."""
     chunks_received: int
     device_time_us: int | None
-    """Clock of the node at the scan; None where the summary was lost."""
+    """Clock of the node at the scan, µs, 0 to 2³² − 1, wraps; None if the summary was lost. From a checked
+    summary it is in steps of 64 µs, and the host derives the upper 10 bits, at first from its own clock."""
     flags: int
     """As in the summary (:class:`~skinnode.wire.codec.SummaryFlag`); 0 where it was lost."""
     t_first_ns: int
     t_last_ns: int
+
+    @property
+    def empty(self) -> bool:
+        """Whether none of the chunks that the node sent arrived."""
+        return self.chunks_received == 0 < self.chunks_expected
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +111,17 @@ class AssemblerStats:
     scans_complete: int
     scans_torn: int
     """Published with chunks missing."""
+    scans_unchecked: int
+    """Scans published with all chunks that were sent, but not complete: in a checked stream, the summary was
+    lost, or codes of chunks not sent again are unknown."""
     scans_missed: int
     """Numbers between two scans of which no frame was seen."""
     scans_discarded: int
     """Open at a reset, never published."""
     scans_mixed: int
     """Thrown away, because frames of two scans had their counter, by all that can be seen."""
+    scans_corrupt: int
+    """Scans discarded because their check failed: codes differ from those that the node packed."""
     scans_joined: int
     """Under way when the stream was taken up, so only partly heard, and never published."""
     chunks_accepted: int
@@ -114,6 +145,8 @@ class AssemblerStats:
     """* A chunk, or a number of chunks, that the patch does not have."""
     bad_counter: int
     """* A scan counter out of the range of the SYNC counter."""
+    bad_form: int
+    """* Summaries without a check, in a checked stream."""
     resyncs: int
     """Times the stream was taken up anew after a silence, with a counter that does not follow."""
 
@@ -131,7 +164,7 @@ class ScanAssembler:
         period_ns: time between two scans; sets the timeout.
         grace_ns: how long frames may be late on a scan whose summary, or all chunks, are there.
         node_id: named in the errors given to ``on_reject``.
-        on_reject: called with each CodecError of a frame of the wrong length.
+        on_reject: called with each CodecError of a frame of the wrong length or form.
         under_way: the node may be sending already; see :meth:`reset`.
 
     Raises ConfigError for a counter overflow that is not 0 or 2 to 240, or times that are not positive.
@@ -165,6 +198,8 @@ class ScanAssembler:
         self._grace_ns = grace_ns
         self._node_id = node_id
         self._on_reject = on_reject
+        self.on_thrown: Callable[[], None] | None = None
+        """Called when a scan is discarded that may have been the first of a new baseline."""
 
         # the open scan, or the last one while none is open
         self._counter = _NONE_OPEN
@@ -176,6 +211,9 @@ class ScanAssembler:
         self._received = 0
         self._sent = _NEVER
         self._summary: Summary | None = None
+        self._head = b""  # bytes of that summary that its check covers
+        self._checked = False
+        self._time_us = self._t_time_ns = 0  # the newest device time, not wrapped, and when it came; 0: none
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
         self._t_chunk_ns = self._t_summary_ns = 0  # of the frame before the summary, and of the summary
 
@@ -185,10 +223,10 @@ class ScanAssembler:
         self._changed_only = False
 
         self._complete = self._torn = self._missed = self._discarded = self._thrown = self._resyncs = 0
-        self._joined = 0
+        self._joined = self._unchecked = self._corrupt = 0
         self._chunks = self._summaries = self._chunks_lost = self._summaries_lost = 0
         self._duplicates = self._conflicts = self._late = 0
-        self._bad_length = self._bad_index = self._bad_counter = 0
+        self._bad_length = self._bad_index = self._bad_counter = self._bad_form = 0
 
     # --- frames in
 
@@ -216,6 +254,10 @@ class ScanAssembler:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
             return None
         summary = unpack_summary(data)
+        if summary.check is None and self._checked:
+            self._bad_form += 1
+            self._reject(summary_cob_id(self._node_id), data, "a scan summary with a check (flag 0x20)")
+            return None
         if summary.chunks > self._n:
             self._bad_index += 1
             return None
@@ -229,7 +271,7 @@ class ScanAssembler:
         else:
             closed = self._close() if self._counter != _NONE_OPEN else None
             self._open(summary.scan, t_ns, from_its_begin=False)
-        self._summary = summary
+        self._summary, self._head = summary, data[:_HEAD_BYTES]
         self._sent = summary.chunks
         self._t_chunk_ns, self._t_summary_ns, self._t_last_ns = self._t_last_ns, t_ns, t_ns
         if closed is None and self._received >= self._sent:
@@ -251,16 +293,23 @@ class ScanAssembler:
             return min(self._t_last_ns + self._grace_ns, self._expires_ns)
         return self._expires_ns
 
-    def reset(self, *, under_way: bool = False) -> None:
+    def reset(self, *, under_way: bool = False, checked: bool = False) -> None:
         """Forget the open scan, the last codes and the counter, as after a boot-up. The statistics stay.
         ``under_way``: the node may be sending already, so that a first scan which is not heard from its first
-        chunk on lacks nothing that was lost."""
+        chunk on lacks nothing that was lost. ``checked``: the node is known to send a check with every
+        summary; otherwise that is learned from the first check that passes."""
         if self._counter != _NONE_OPEN:
             self._discarded += 1
             self._book()
         self._counter, self._last_counter = _NONE_OPEN, _NEVER
         self._changed_only = False
         self._may_join = under_way
+        self._checked = checked
+        self._time_us = self._t_time_ns = 0
+
+    def expect_check(self) -> None:
+        """Require a check with every summary from now on."""
+        self._checked = True
 
     @property
     def stats(self) -> AssemblerStats:
@@ -269,9 +318,11 @@ class ScanAssembler:
         return AssemblerStats(
             scans_complete=self._complete,
             scans_torn=self._torn,
+            scans_unchecked=self._unchecked,
             scans_missed=self._missed,
             scans_discarded=self._discarded,
             scans_mixed=self._thrown,
+            scans_corrupt=self._corrupt,
             scans_joined=self._joined,
             chunks_accepted=self._chunks + is_open * self._received,
             summaries_accepted=self._summaries + (is_open and self._summary is not None),
@@ -283,6 +334,7 @@ class ScanAssembler:
             bad_length=self._bad_length,
             bad_index=self._bad_index,
             bad_counter=self._bad_counter,
+            bad_form=self._bad_form,
             resyncs=self._resyncs,
         )
 
@@ -316,8 +368,11 @@ class ScanAssembler:
 
     def _reject_length(self, cob_id: int, data: bytes, length: int, what: str) -> None:
         self._bad_length += 1
+        self._reject(cob_id, data, f"{counted(length, 'byte')} ({what})")
+
+    def _reject(self, cob_id: int, data: bytes, allowed: str) -> None:
         if self._on_reject is not None:
-            self._on_reject(CodecError(cob_id, data, f"{length} bytes ({what})"))
+            self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
         """Whether a frame with this counter, not one of the open scan, begins a new scan; if not, count it.
@@ -388,27 +443,39 @@ class ScanAssembler:
         t_chunk_ns = self._t_chunk_ns if summary_is_last else self._t_last_ns
         if self._mixed or (not whole and t_chunk_ns - self._t_first_ns > self._longest_ns):
             self._thrown += 1
-            self._held = [None] * self._n
+            self._throw_away()
             return None
-        expected, complete = self._n, self._received == self._n
+        expected, arrived, checked = self._n, self._received == self._n, self._checked
+        device_time_us, flags = None, 0
         if summary is not None:
-            flags = summary.flags  # mostly 0; to look for a flag in it takes as long as a chunk does
-            self._changed_only = flags != 0 and bool(flags & SummaryFlag.CHANGED_ONLY)
-            overrun = flags != 0 and bool(flags & SummaryFlag.OVERRUN)
-            expected = summary.chunks
-            complete |= self._received == expected and self._changed_only and not overrun
-        if self._joined_late and not complete:
+            expected, flags, checked = summary.chunks, summary.flags, summary.check is not None
+            if not arrived:
+                arrived = self._received == expected and flags & (_CHANGED_ONLY | _OVERRUN) == _CHANGED_ONLY
+        if self._joined_late and not arrived:
             self._joined += 1
-            self._held = [None] * self._n
+            self._throw_away(doubt=summary is None or flags & _BASELINE_CHANGED != 0)
             return None
-        self._summaries_lost += summary is None
+        self._hold(carry=arrived and self._follows)
+        codes, valid, check = self._decode()
+        verified = False
+        if arrived and summary is not None and summary.check is not None and check is not None:
+            verified = scan_check(check, self._head) == summary.check
+            if not verified:
+                self._corrupt += 1
+                self._throw_away()
+                return None
+            self._checked = True
+        complete = arrived and (verified or not checked)
+        if summary is None:
+            self._summaries_lost += 1
+        else:
+            self._changed_only = flags & _CHANGED_ONLY != 0
+            device_time_us = self._device_time_us(summary)
         if summary is not None or not self._changed_only:
             self._chunks_lost += max(0, expected - self._received)
         self._complete += complete
-        self._torn += not complete
-
-        self._hold(carry=complete and self._follows)
-        codes, valid = self._decode()
+        self._unchecked += arrived and not complete
+        self._torn += not arrived
         return Scan(
             codes=codes,
             valid=valid,
@@ -417,11 +484,31 @@ class ScanAssembler:
             complete=complete,
             chunks_expected=expected,
             chunks_received=self._received,
-            device_time_us=None if summary is None else summary.device_time_us,
-            flags=0 if summary is None else summary.flags,
+            device_time_us=device_time_us,
+            flags=flags,
             t_first_ns=self._t_first_ns,
             t_last_ns=self._t_last_ns,
         )
+
+    def _throw_away(self, *, doubt: bool = True) -> None:
+        """Discard a scan and let no later scan inherit codes. ``doubt``: the scan may have been the first of
+        a new baseline."""
+        self._held = [None] * self._n
+        if doubt and self.on_thrown is not None:
+            self.on_thrown()
+
+    def _device_time_us(self, summary: Summary) -> int:
+        """Return the 32 bits of a device time of which a checked summary carries 16: the value nearest to the
+        last device time plus the time elapsed on the host's clock. The upper bits of the first are taken from
+        the host's clock, up to three seconds after the scan."""
+        if summary.check is None:
+            return summary.device_time_us
+        expected_us = self._time_us + (self._t_summary_ns - self._t_time_ns) // 1000
+        if not self._t_time_ns:
+            expected_us -= TIME_WRAP_US // 4
+        self._time_us = restore_time_us(summary.device_time_us, expected_us)
+        self._t_time_ns = self._t_summary_ns
+        return self._time_us & 0xFFFF_FFFF
 
     def _hold(self, *, carry: bool) -> None:
         """Bring what is known about the chunks up to the scan that ends; ``carry``: it changed no other."""
@@ -430,16 +517,19 @@ class ScanAssembler:
             frames = [old if new is None else new for new, old in zip(frames, self._held, strict=True)]
         self._held = frames
 
-    def _decode(self) -> tuple[Codes, NDArray[np.bool_]]:
+    def _decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
+        """Return the codes, a mask of those that are measurements, and the check over the codes; the check is
+        None if not all codes are known."""
         known = [frame for frame in self._held if frame is not None]
         blank = bytes(self._chunk_bytes)
-        whole = len(known) == self._n
-        payload = b"".join(known if whole else [frame or blank for frame in self._held])
-        codes = unpack_scan(payload, self._profile)
-        if not whole:
+        check: int | None = None
+        if len(known) == self._n:
+            codes, check = unpack_scan_with_check(b"".join(known), self._profile)
+        else:
+            codes = unpack_scan(b"".join([frame or blank for frame in self._held]), self._profile)
             unknown = np.array([frame is None for frame in self._held])
             codes[unknown[chunk_of_code(self._profile)]] = MISSING
         valid = codes <= self._steps
         codes.setflags(write=False)
         valid.setflags(write=False)
-        return codes, valid
+        return codes, valid, check

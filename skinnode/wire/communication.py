@@ -35,11 +35,15 @@ def spare_pdo(cob_id: int | None) -> PdoDefault:
 
 
 def communication_objects(
-    rpdos: Sequence[PdoDefault], tpdos: Sequence[PdoDefault], slots: int
+    rpdos: Sequence[PdoDefault],
+    tpdos: Sequence[PdoDefault],
+    slots: int,
+    revision: int = od.REVISION_NUMBER,
 ) -> tuple[Object, ...]:
-    """All of them, by ascending index. ``slots``: entries that a PDO can map."""
+    """Return all communication objects by ascending index. ``slots``: maximum mapped objects of a PDO.
+    ``revision``: value of 0x1018:3."""
     return (
-        *_device_objects(),
+        *_device_objects(revision),
         *(_rpdo_parameter(od.RPDO1_PARAMETER + i, i + 1, pdo) for i, pdo in enumerate(rpdos)),
         *(_mapping(od.RPDO1_MAPPING + i, f"RPDO{i + 1}", pdo, slots) for i, pdo in enumerate(rpdos)),
         *(_tpdo_parameter(od.TPDO1_PARAMETER + i, i + 1, pdo) for i, pdo in enumerate(tpdos)),
@@ -47,7 +51,7 @@ def communication_objects(
     )
 
 
-def _device_objects() -> tuple[Object, ...]:
+def _device_objects(revision: int) -> tuple[Object, ...]:
     no_errors = Entry(od.ERROR_FIELD, 0, "Number of errors", _U8, "rw", 0)
     error_fields = [f"Standard error field {i}" for i in range(1, od.ERROR_FIELD_LENGTH + 1)]
     consumers = [f"Consumer heartbeat time {i}" for i in range(1, od.HEARTBEAT_CONSUMERS + 1)]
@@ -59,6 +63,7 @@ def _device_objects() -> tuple[Object, ...]:
         array(od.ERROR_FIELD, "Pre-defined error field", error_fields, _U32, "ro", 0, first=no_errors),
         var(od.COB_ID_SYNC, "COB-ID SYNC message", _U32, "rw", od.SYNC_COB_ID),
         var(od.CYCLE_PERIOD, "Communication cycle period", _U32, "rw", 0),
+        var(od.SYNC_WINDOW, "Synchronous window length", _U32, "rw", 0),
         var(od.DEVICE_NAME_INDEX, "Manufacturer device name", _STRING, "const", od.DEVICE_NAME),
         var(od.HARDWARE_VERSION, "Manufacturer hardware version", _STRING, "const"),
         var(od.SOFTWARE_VERSION, "Manufacturer software version", _STRING, "const"),
@@ -77,7 +82,7 @@ def _device_objects() -> tuple[Object, ...]:
             (
                 Entry(od.IDENTITY, od.IDENTITY_VENDOR, "Vendor-ID", _U32, "ro", od.VENDOR_ID),
                 Entry(od.IDENTITY, od.IDENTITY_PRODUCT, "Product code", _U32, "ro", od.PRODUCT_CODE),
-                Entry(od.IDENTITY, od.IDENTITY_REVISION, "Revision number", _U32, "ro", od.REVISION_NUMBER),
+                Entry(od.IDENTITY, od.IDENTITY_REVISION, "Revision number", _U32, "ro", revision),
                 Entry(od.IDENTITY, od.IDENTITY_SERIAL, "Serial number", _U32, "ro"),
             ),
         ),

@@ -11,6 +11,7 @@ import numpy as np
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
 from skinnode.wire.profile import PatchProfile
+from skinnode.words import counted
 
 _NANOMETRE_M = 1e-9
 _BYTES = 12  # of an electrode
@@ -35,7 +36,7 @@ def unpack_coordinates(
     upper, lower = profile.rows * profile.upper_electrodes, profile.columns * profile.lower_electrodes
     if len(data) != (upper + lower) * _BYTES:
         raise ConfigError(
-            "electrode coordinates (0x2300)", f"{len(data)} bytes", f"{(upper + lower) * _BYTES} bytes"
+            "electrode coordinates (0x2300)", counted(len(data), "byte"), f"{(upper + lower) * _BYTES} bytes"
         )
     metres = np.frombuffer(data, dtype="<i4").reshape(-1, 3) * _NANOMETRE_M
     return PatchLayout(

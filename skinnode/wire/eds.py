@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skinnode.errors import ProfileError, Shown
 from skinnode.wire import indices as od
 from skinnode.wire.dictionary import DataType, Entry, Object, ObjectType
 
@@ -184,11 +183,3 @@ def _default(entry: Entry) -> str:
     if entry.data_type is DataType.UNSIGNED32 and value:
         return f"0x{value:08X}"
     return str(value)
-
-
-def no_eds(error: Exception, source: str) -> ProfileError:
-    """What a parser could not read, in our words."""
-    lines = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
-    line = next(filter(None, lines), None)
-    got = "something else" if line is None else f"something else in line {line}"
-    return ProfileError("EDS", Shown(got), "a file as in CiA 306", where=source)

@@ -1,25 +1,44 @@
 """Emergency messages, the error register and the error history in words (CiA 301 v4.2, 7.2.7, tables 26 and
-48; what follows a code is the patch's own)."""
+48). What a code means beyond that, and what follows it, is the maker's own: it is told of our patches alone.
+"""
 
 from __future__ import annotations
 
 from typing import Final
 
+from skinnode.words import counted
+
+OVERRUN: Final = 0x8110
+"""CAN overrun; of a skinnode patch also: scans skipped."""
+
+TOO_SLOW: Final = 1
+"""Third byte of the detail of 0x8110, after the u16 count of skipped scans. 1: chunks left later than the
+inhibit time requires, because the computer that runs the node, or its bus, was too slow. 0: a scan takes
+longer than the scan period."""
+
 _CODES: Final = {
     0x0000: "no error, or an error is over",
-    0x5000: "wire open or shorted",
-    0x6300: "stored data",
-    0x8110: "overrun: messages or scans lost",
+    0x8110: "CAN overrun: messages lost",
     0x8120: "CAN error passive",
     0x8130: "heartbeat or guarding lost",
     0x8140: "recovered from bus-off",
-    0x8150: "CAN-ID collision: another node has this node-ID",
-    0x8210: "PDO not processed: too short",
+    0x8150: "CAN-ID collision",
+    0x8210: "PDO not processed: wrong length",
     0x8220: "PDO too long",
+    0x8230: "multiplexed PDO not processed: no such object",
     0x8240: "SYNC of unexpected length",
     0x8250: "RPDO timed out",
+}
+_OWN_CODES: Final = {
+    0x5000: "wire open or shorted",
+    0x6300: "stored data",
+    0x8110: "overrun: messages or scans lost",
+    0x8150: "CAN-ID collision: another node has this node-ID",
+    0x8200: "synchronous PDO too late",
+    0x8210: "PDO not processed: too short",
     0xFF00: "no reading from the converter",
 }
+"""Meaning of the codes when a skinnode patch sends them."""
 _CLASSES: Final = {
     0x10: "generic error",
     0x20: "current",
@@ -67,18 +86,28 @@ _REGISTER: Final = (
 )
 
 
-def error_text(code: int, detail: bytes = b"") -> str:
-    """An emergency error code in words. ``detail``: what follows it, of a patch of ours; the first two bytes
-    are in the history as well."""
-    text = _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
-    more = _detail_text(code, detail)
+def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
+    """Return an emergency error code in words. ``ours``: vendor and product are those of a skinnode patch;
+    otherwise the words are those of CiA 301. ``detail``: the bytes after the code; the first two are also in
+    the history."""
+    own = _OWN_CODES.get(code) if ours else None
+    text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
+    more = _detail_text(code, detail) if ours else ""
     return f"{text}: {more}" if more else text
 
 
 def history_text(entry: int, *, ours: bool) -> str:
-    """An entry of 0x1003: the code, and above it two bytes of the maker, here known if it is ``ours``."""
-    code = entry & 0xFFFF
-    return f"0x{code:04X} {error_text(code, (entry >> 16).to_bytes(2, 'little') if ours else b'')}"
+    """Return an entry of 0x1003 in words: the code and, above it, two manufacturer-specific bytes, which are
+    decoded if it is ``ours``."""
+    code, more = entry & 0xFFFF, entry >> 16
+    text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
+    return text if ours or not more else f"{text} (manufacturer-specific: 0x{more:04X})"
+
+
+def says_too_slow(code: int, detail: bytes) -> bool:
+    """Return whether an emergency with ``detail`` says that scans were skipped because the computer that runs
+    the node, or its bus, was too slow, which is no fault of the skin."""
+    return code == OVERRUN and detail[:2] != b"\0\0" and detail[2:3] == bytes((TOO_SLOW,))
 
 
 def register_text(register: int) -> str:
@@ -98,17 +127,21 @@ def _detail_text(code: int, detail: bytes) -> str:
         case 0x6300:
             return _DATA_FAULTS.get(first, "")
         case 0x8110 if word:
-            return f"{word} scans skipped so far"
+            skipped = f"{counted(word, 'scan')} skipped so far"
+            slow = says_too_slow(code, detail)
+            return f"{skipped} because the computer that runs the node is too slow" if slow else skipped
         case 0x8130 if first:
             return f"node {first} restarted" if second else f"of node {first}"
         case 0x8130:
             return "of the master"
         case 0x8210 | 0x8220 if len(detail) >= 3:
-            return f"RPDO{first}, {second} bytes in place of {detail[2]}"
+            return f"RPDO{first}, {counted(second, 'byte')} in place of {detail[2]}"
         case 0x8210 | 0x8220:
-            return f"RPDO{first}, {second} bytes"
+            return f"RPDO{first}, {counted(second, 'byte')}"
         case 0x8240:
-            return f"{first} bytes in place of {second}"
+            return f"{counted(first, 'byte')} in place of {second}"
+        case 0x8200 if word:
+            return f"TPDO{word}"
         case 0x8250:
             return f"RPDO{word}"
         case 0x8150:

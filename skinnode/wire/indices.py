@@ -13,8 +13,10 @@ VENDOR_ID: Final = 0
 """No vendor-ID has been assigned by CiA to this project; 0 is never assigned to anybody."""
 PRODUCT_CODE: Final = 0x534B494E
 """'SKIN'."""
-REVISION_NUMBER: Final = 0x0001_0000
+REVISION_NUMBER: Final = 0x0001_0001
 """Major revision (CANopen behaviour) in the upper half, minor in the lower."""
+UNCHECKED_REVISION_NUMBER: Final = 0x0001_0000
+"""Revision of the patches whose scan summaries carry no check."""
 DEVICE_NAME: Final = "skinnode patch"
 
 # --- COB-IDs: the pre-defined connection set of CiA 301
@@ -81,6 +83,8 @@ ERROR_REGISTER: Final = 0x1001
 ERROR_FIELD: Final = 0x1003
 COB_ID_SYNC: Final = 0x1005
 CYCLE_PERIOD: Final = 0x1006
+SYNC_WINDOW: Final = 0x1007
+"""Synchronous window length, µs."""
 DEVICE_NAME_INDEX: Final = 0x1008
 HARDWARE_VERSION: Final = 0x1009
 SOFTWARE_VERSION: Final = 0x100A
@@ -117,7 +121,7 @@ DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0
 """Data types that an RPDO can map, at sub-index 0, where bytes of it are not for this node. Not BOOLEAN: PDOs
 are made of bytes."""
 ERROR_FIELD_LENGTH: Final = 8
-HEARTBEAT_CONSUMERS: Final = 4
+HEARTBEAT_CONSUMERS: Final = 8
 
 # --- manufacturer objects
 DESCRIPTOR: Final = 0x2000
@@ -131,6 +135,8 @@ CHUNK_INDEX, CHUNK_SCAN = 1, 2
 them."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
+SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
+"""From revision 1.1 on TPDO2 carries these two in place of the device time in µs."""
 SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021

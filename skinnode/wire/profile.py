@@ -1,7 +1,8 @@
 """The object dictionary of a patch, written once.
 
 A patch of U×K codes sends them in *chunks*: TPDO1 carries u8 chunk index, u8 scan counter and 3 codes of
-16 bits (or 2 of 24), codes in row-major order, upper wire first. TPDO2, the *summary*, ends each scan.
+16 bits (or 2 of 24), codes in row-major order, upper wire first. TPDO2, the *summary*, ends each scan and
+carries a check over all codes of the matrix (:func:`skinnode.wire.codec.scan_check`).
 
 PDO over CAN FD: a chunk is a part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30
 codes of 16 bits (or 20 of 24). All chunks of a patch are of one length, that of the mapping padded to the
@@ -68,6 +69,9 @@ class PatchProfile:
     tpdos: int = 4
     """TPDO1 carries chunks, TPDO2 summaries, the others are spare."""
     bus: BusType = "classic"
+    checked: bool = True
+    """Whether summaries carry a check over the scan. False: a patch of revision 1.0, whose summaries carry 32
+    bits of device time instead."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -151,6 +155,11 @@ class PatchProfile:
         return fd_length(self.chunk_head_bytes + self.codes_per_chunk * self.code_bits // 8)
 
     @property
+    def revision_number(self) -> int:
+        """Value of 0x1018:3."""
+        return od.REVISION_NUMBER if self.checked else od.UNCHECKED_REVISION_NUMBER
+
+    @property
     def code_type(self) -> DataType:
         """Type of a code in the object dictionary."""
         return DataType.UNSIGNED16 if self.code_bits == 16 else DataType.UNSIGNED24
@@ -162,7 +171,9 @@ class PatchProfile:
 
     def objects(self) -> tuple[Object, ...]:
         """The whole object dictionary, by ascending index."""
-        communication = communication_objects(_rpdos(self), _tpdos(self), self.pdo_bytes)
+        communication = communication_objects(
+            _rpdos(self), _tpdos(self), self.pdo_bytes, self.revision_number
+        )
         return (*communication, *_manufacturer_objects(self))
 
 
@@ -181,7 +192,11 @@ def _tpdos(profile: PatchProfile) -> list[PdoDefault]:
         mapped=_chunk_record(profile).entries[1:],
         inhibit_100us=profile.default_inhibit_100us,
     )
-    summary = PdoDefault("summary", od.summary_cob_id(0), kind=1, mapped=_summary_record().entries[1:])
+    fields = _summary_record(profile)
+    third = (od.SUMMARY_TIME_64US, od.SUMMARY_CHECK) if profile.checked else (od.SUMMARY_TIME,)
+    subs = od.SUMMARY_SCAN, od.SUMMARY_FLAGS, od.SUMMARY_CHUNKS, *third
+    mapped = tuple(fields[sub] for sub in subs)
+    summary = PdoDefault("summary", od.summary_cob_id(0), kind=1, mapped=mapped)
     numbers = range(2, profile.tpdos)
     return [chunk, summary, *(spare_pdo(od.tpdo_cob_id(n, 0) if n < 4 else None) for n in numbers)]
 
@@ -201,16 +216,19 @@ def _chunk_record(profile: PatchProfile) -> Object:
     )
 
 
-def _summary_record() -> Object:
+def _summary_record(profile: PatchProfile) -> Object:
+    fields = [
+        (od.SUMMARY_SCAN, "Summary scan counter", _U8),
+        (od.SUMMARY_FLAGS, "Flags", _U8),
+        (od.SUMMARY_CHUNKS, "Chunks sent", _U16),
+        (od.SUMMARY_TIME, "Device time us", _U32),
+    ]
+    if profile.checked:
+        fields += [(od.SUMMARY_TIME_64US, "Device time 64us", _U16), (od.SUMMARY_CHECK, "Scan check", _U16)]
     return record(
         od.SUMMARY,
         "Scan summary",
-        (
-            Entry(od.SUMMARY, od.SUMMARY_SCAN, "Summary scan counter", _U8, "ro", mappable=True),
-            Entry(od.SUMMARY, od.SUMMARY_FLAGS, "Flags", _U8, "ro", mappable=True),
-            Entry(od.SUMMARY, od.SUMMARY_CHUNKS, "Chunks sent", _U16, "ro", mappable=True),
-            Entry(od.SUMMARY, od.SUMMARY_TIME, "Device time us", _U32, "ro", mappable=True),
-        ),
+        [Entry(od.SUMMARY, sub, name, data_type, "ro", mappable=True) for sub, name, data_type in fields],
     )
 
 
@@ -315,7 +333,7 @@ def _manufacturer_objects(profile: PatchProfile) -> tuple[Object, ...]:
     return (
         _descriptor_record(profile),
         _chunk_record(profile),
-        _summary_record(),
+        _summary_record(profile),
         _send_policy_record(),
         _acquisition_record(),
         _time_record(),
@@ -372,7 +390,7 @@ def _device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
         vendor_number=od.VENDOR_ID,
         product_name=od.DEVICE_NAME,
         product_number=od.PRODUCT_CODE,
-        revision_number=od.REVISION_NUMBER,
+        revision_number=profile.revision_number,
         bit_rates_bps=od.BIT_RATES_BPS,
         rpdos=profile.rpdos,
         tpdos=profile.tpdos,

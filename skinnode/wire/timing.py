@@ -36,6 +36,7 @@ from skinnode.wire.stuffing import (
     TAIL_BITS,
     tables,
 )
+from skinnode.words import counted
 
 _EXTENDED_HEAD_BITS: Final = 39  # SOF, 11 bits, SRR, IDE, 18 bits, RTR, r1, r0, 4 bits DLC
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -70,7 +71,7 @@ def exact_bits(
     if not 0 <= can_id < 1 << (29 if extended else 11):
         raise ValueError(f"can_id: got 0x{can_id:X}, must fit {29 if extended else 11} bits")
     if len(data) > 8:
-        raise ValueError(f"data: got {len(data)} bytes, must be at most 8")
+        raise ValueError(f"data: got {counted(len(data), 'byte')}, must be at most 8")
     if remote:
         data, code = b"", dlc or 0
     else:
@@ -105,7 +106,7 @@ def fd_length(n_bytes: int) -> int:
     for length in FD_LENGTHS:
         if n_bytes <= length:
             return length
-    raise ValueError(f"data: got {n_bytes} bytes, must be at most {FD_LENGTHS[-1]}")
+    raise ValueError(f"data: got {counted(n_bytes, 'byte')}, must be at most {FD_LENGTHS[-1]}")
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
@@ -119,7 +120,9 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
         raise ValueError(f"can_id, data: got shapes {ids.shape}, {payload.shape}, must be (n,), (n, length)")
     length = payload.shape[1]
     if length not in FD_LENGTHS or np.any((ids < 0) | (ids > 0x7FF)):
-        raise ValueError(f"can_id, data: got {length} bytes, must be one of {FD_LENGTHS}, and 11-bit numbers")
+        raise ValueError(
+            f"can_id, data: got {counted(length, 'byte')}, must be one of {FD_LENGTHS}, and 11-bit numbers"
+        )
     nominal, fast = np.empty((2, len(ids)), np.int64)
     lengths = np.full(len(ids), length, np.uint8)
     stuffing.fd_bits(ids.astype(np.uint32), lengths, payload.flatten(), nominal, fast)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from skinnode.cli import _demo
-from skinnode.cli._view import BusView, PatchView, render
 from skinnode.cli.demo import demo_hand
+from skinnode.demo import run as _demo
+from skinnode.demo.view import BusView, PatchView, render
 from skinnode.model.config import HandConfig
 from skinnode.model.layout import Float
 from skinnode.transport import CanPort

@@ -32,8 +32,8 @@ def test_sizes_width_and_bus_are_those_asked_for(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--dcf"], "--node-id: got None"),
-        (["--node-id", "4"], "--node-id: got 4, allowed: nothing without --dcf"),
+        (["--dcf"], "--node-id: got nothing"),
+        (["--node-id", "4"], "--node-id: got 4, allowed: only with --dcf"),
         (["--dcf", "--node-id", "4", "--bitrate", "0"], "bitrate_bps: got 0"),
         (["--dcf", "--node-id", "4", "--bitrate", "300000"], "bitrate_bps: got 300000"),
         (["--layout", "staggered", "--lower-wires", "3"], "--lower-wires: got 3"),

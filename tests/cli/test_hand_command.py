@@ -122,7 +122,8 @@ def test_files_that_a_hand_names_are_read(key: str, tmp_path: Path) -> None:
     assert (
         str(found.exception)
         == {
-            "eds": f"{other}: EDS: got something else in line 1, allowed: a file as in CiA 306",
+            "eds": f"{other}:1: EDS: got 'root:x:0:0:root:/root:/bin/bash', "
+            "allowed: a file as in CiA 306: [section] once each, key=value once each, ;comment",
             "baseline": f"{other}: baseline, line 1: got 'root:x:0:0:root:/root:/bin/bash', "
             "allowed: 10 lines of 30 positive resistances in ohm",
         }[key]
@@ -137,6 +138,31 @@ def test_a_new_file_is_a_plan_that_fits(patches: int, tmp_path: Path) -> None:
     assert len(hand.patches) == patches
     (plan,) = check_plan(hand)
     assert patches < 4 or plan.load > 0.6  # no slower than it has to be
+
+
+@pytest.mark.parametrize(("buses", "patches"), [(2, 5), (3, 3), (16, 127)])
+def test_a_new_file_of_several_buses_is_a_plan_that_fits(buses: int, patches: int, tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(command("new", "--buses", str(buses), "--patches", str(patches)).stdout)
+    hand = load_hand(path)
+    counts = [len(hand.patches_on(bus.name)) for bus in hand.buses]
+    assert (len(counts), sum(counts)) == (buses, patches)
+    assert max(counts) - min(counts) <= 1
+    assert len({patch.node_id for patch in hand.patches}) == patches  # a node-ID alone names a patch
+    check_plan(hand)
+
+
+def test_more_buses_than_patches_are_refused() -> None:
+    found = command("new", "--buses", "3", "--patches", "2")
+    assert str(found.exception).startswith("--buses: got 3, allowed: at most 2")
+
+
+def test_a_misspelt_interface_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(command("new").stdout.replace('"udp_multicast"', '"udpmulticast"'))
+    said = str(command("check", str(path)).exception)
+    assert said.startswith(f"{path}:10:1: buses[0].interface: got 'udpmulticast', allowed: one of ")
+    assert said.endswith("did you mean 'udp_multicast'?")
 
 
 def test_comments_of_a_new_file_are_keys() -> None:

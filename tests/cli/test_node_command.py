@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from skinnode.cli.node import _memory
 from skinnode.errors import ConfigError
 from skinnode.model.config import BusConfig
 from skinnode.model.forward import resistance_ohm
@@ -133,10 +134,10 @@ def test_a_node_of_the_users_own_source(
         master.send(0x000, "01 04")
         for scan in range(2):
             master.send(0x080, "")
-            assert bytes(master.next(0x284).data)[:4] == bytes((scan, 0, 100, 0))
+            assert bytes(master.next(0x284).data)[:4] == bytes((scan, 0x20, 100, 0))  # with a check
         master.send(0x080, "")  # from here on the source fails
         assert bytes(master.next(0x084).data)[:2] == b"\x00\xff"
-        assert bytes(master.next(0x284).data)[:4] == b"\x02\x10\0\0"
+        assert bytes(master.next(0x284).data)[:4] == b"\x02\x30\0\0"
         master.send(0x604, "40 01 10 00 00 00 00 00")
         assert bytes(master.next(0x584).data)[4] == 0x81
         process.stdout.readline()  # what runs where
@@ -146,7 +147,7 @@ def test_a_node_of_the_users_own_source(
     assert (process.returncode, err) == (1, "")  # the source failed
     *seconds, fault = [json.loads(line) for line in out.splitlines()]
     assert fault == {
-        "note": "fault: 1 failures of the source, the last: source.read(): OSError: "
+        "note": "fault: 1 failure of the source, the last: source.read(): OSError: "
         "the converter does not answer"
     }
     for second in seconds:
@@ -197,7 +198,7 @@ def test_what_was_stored_is_there_at_the_next_start(
             process.send_signal(signal.SIGTERM)
             _, err = process.communicate(timeout=20)
             assert (process.returncode, err) == (0, "")
-    assert (sources / "patch.json").is_file()
+    assert [file.name for file in sources.iterdir() if "patch.json" in file.name] == ["patch.json"]
 
 
 @pytest.mark.parametrize(
@@ -229,14 +230,65 @@ def test_a_memory_that_is_of_no_use_is_a_fault(
 
 def test_two_processes_do_not_share_a_memory(sources: Path, multicast_group: str, master: Master) -> None:
     options = ["--source", "my_sources:Board", "--store", "patch.json"]
-    with running(multicast_group, *options, cwd=sources):
+    with running(multicast_group, *options, cwd=sources) as owner:
         assert bytes(master.next(0x704).data) == b"\0"
         command = arguments(multicast_group, *options, node_id=5)
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
         assert (done.returncode, done.stdout) == (2, "")
-        says = "error: --store: got 'patch.json', allowed: a file that no other process uses now\n"
-        assert done.stderr == says
+        says = "error: --store: got 'patch.json', allowed: a file that no other process is using"
+        assert done.stderr == f"{says} (in use by process {owner.pid})\n"
+
+
+def test_a_memory_is_not_looked_for_behind_a_symbolic_link(sources: Path, multicast_group: str) -> None:
+    (sources / "patch.json").symlink_to(sources / "elsewhere")
+    options = ["--source", "my_sources:Board", "--store", "patch.json", "--seconds", "0.1"]
+    done = subprocess.run(
+        arguments(multicast_group, *options, node_id=4),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: --store: got 'patch.json', allowed: a file, not a symbolic link\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "allowed"),
+    [
+        ("pipe", "a regular file, or a name that does not exist"),
+        ("device", "a regular file, or a name that does not exist"),
+        ("folder", "a regular file, or a name that does not exist"),
+        ("linked lock", "is a symbolic link, which is not followed"),
+        ("piped lock", "is not a regular file"),
+        ("lock that is a folder", "is not a regular file"),
+    ],
+)
+def test_a_memory_is_a_regular_file_and_so_is_its_lock(sources: Path, kind: str, allowed: str) -> None:
+    store, lock = sources / "patch.json", sources / ".patch.json.lock"
+    match kind:
+        case "pipe":
+            os.mkfifo(store)
+        case "device":
+            store = Path("/dev/null")
+        case "folder":
+            store.mkdir()
+        case "linked lock":
+            lock.symlink_to(sources / "elsewhere")
+        case "piped lock":
+            os.mkfifo(lock)
+        case _:
+            lock.mkdir()
+    with pytest.raises(ConfigError) as caught, _memory(store):
+        pass
+    if kind in ("pipe", "device", "folder"):
+        says = f"--store: got '{store}', allowed: {allowed}"
+    else:
+        lock_allowed = "allowed: a regular file, or a name that does not exist"
+        why = f"its lock file .patch.json.lock {allowed}; {lock_allowed}"
+        says = f"--store: got '{store}', allowed: a file that can be locked ({why})"
+    assert str(caught.value) == says
 
 
 def test_another_node_with_the_same_node_id_is_a_fault(
@@ -249,7 +301,7 @@ def test_another_node_with_the_same_node_id_is_a_fault(
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=20)
         assert (process.returncode, err) == (1, "")
-        assert "fault: 1 boot-ups or heartbeats of another node with this node-ID" in out
+        assert "fault: 1 boot-up or heartbeat of another node with this node-ID" in out
 
 
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:
@@ -273,7 +325,10 @@ def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ([], "error: --node-id: got None, allowed: 1 to 127, or --store FILE and a node-ID by LSS"),
+        (
+            [],
+            "error: --node-id: got nothing, allowed: 1 to 127, or --store FILE and a node-ID",
+        ),
         (["--store", "/no/such/folder/x"], "error: --store: got '/no/such/folder/x', allowed: a file in an"),
         (["--node-id", "4", "--layout", "wavy"], "error: --layout: got 'wavy', allowed: aligned"),
         (["--node-id", "4", "--code-bits", "12"], "error: code_bits: got 12, allowed: 16 or 24"),

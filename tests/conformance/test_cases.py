@@ -61,14 +61,16 @@ def test_at_least_105_apply_to_a_patch() -> None:
     assert len(CASES) - len(NOT_APPLICABLE) >= 105
 
 
-def test_a_patch_without_memory_fails_only_where_its_sheet_promises_one() -> None:
+def test_a_patch_without_memory_fails_nothing() -> None:
+    """What asks it to store does not apply; that its sheet says that it stores is a warning."""
     channel = f"no-memory-{uuid.uuid4().hex[:8]}"
     with patch_on(channel, stores=False), bench_on(channel) as dut:
         report = run_cases(dut, [case for case in CASES if case.area in ("OD", "SYNC", "SDO", "OTHER")])
     verdicts = {result.case.id: result for result in report.results}
     failed = [name for name, result in verdicts.items() if result.verdict is Verdict.FAILED]
-    assert failed == ["OD-02"]
+    assert failed == []
+    assert [name for name, result in verdicts.items() if result.verdict is Verdict.WARNING] == ["OD-02"]
     assert "0x1010:01" in verdicts["OD-02"].why
-    for name in ("SYNC-08", "SYNC-10"):
+    for name in ("SYNC-08", "SYNC-10", *(f"OTHER-{number:02}" for number in range(1, 10))):
         assert verdicts[name].verdict is Verdict.NOT_APPLICABLE
         assert "bit 0" in verdicts[name].why

@@ -59,7 +59,32 @@ def test_a_line_a_case_and_a_summary(patch: list[str], capsys: pytest.CaptureFix
     assert two.split()[:2] == ["SDO-02", "passed"]
     assert four.split()[:3] == ["SDO-04", "not", "applicable"]
     assert "no object with access wo" in four
-    assert summary.startswith("3 cases, 2 applicable: 2 passed, 0 failed, 1 not applicable")
+    assert summary.startswith("3 cases, 2 applicable: 2 passed, 0 warnings, 0 failed, 1 not applicable")
+
+
+def test_a_warning_is_status_0_and_in_every_report(
+    patch: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sheet = tmp_path / "a.eds"
+    sheet.write_text(eds_text(PatchProfile(2, 6, 2, 6)).replace("NrOfTXPDO=4", "NrOfTXPDO=5"))
+    files = {kind: tmp_path / f"report.{kind}" for kind in ("junit", "html", "json")}
+    options = [part for kind, file in files.items() for part in (f"--{kind}", str(file))]
+    assert conformance(*patch, "--eds", str(sheet), "--only", "EDS,SDO-05", *options) == 0
+    first, _, summary = capsys.readouterr().out.strip().splitlines()
+    assert first.split()[:2] == ["EDS-01", "warning"]
+    assert summary.startswith("2 cases, 2 applicable: 1 passed, 1 warning, 0 failed, 0 not applicable")
+    suite, _ = ElementTree.parse(files["junit"]).getroot()
+    assert (suite.get("failures"), suite.get("errors"), suite.get("skipped")) == ("0", "0", "0")
+    (case,) = suite.iter("testcase")
+    assert [(child.tag, child.text) for child in case] == [
+        ("system-out", "warning: NrOfTXPDO=5, but 4 are described")
+    ]
+    page = Balance()
+    page.feed(files["html"].read_text())
+    assert "NrOfTXPDO=5, but 4 are described" in page.text
+    assert 'class="verdict warned"' in files["html"].read_text()
+    report = json.loads(files["json"].read_text())
+    assert (report["passed"], report["warnings"], report["failed"]) == (1, 1, 0)
 
 
 def test_an_eds_that_the_node_does_not_keep_is_status_1_and_in_every_report(
@@ -95,6 +120,17 @@ def test_an_eds_that_the_node_does_not_keep_is_status_1_and_in_every_report(
     report = json.loads(files["json"].read_text())
     assert [case["verdict"] for case in report["cases"]] == ["failed", "not applicable", "passed"]
     assert report["failed"] == 1
+
+
+def test_the_encoding_of_the_sheet_is_told(
+    patch: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sheet = tmp_path / "a.eds"
+    text = eds_text(PatchProfile(2, 6, 2, 6)).replace("ParameterName=Device type", "ParameterName=Gerätetyp")
+    sheet.write_text(text, encoding="cp1252")
+    assert conformance(*patch, "--eds", str(sheet), "--only", "EDS,SDO-01") == 0
+    summary = capsys.readouterr().out.strip().splitlines()[-1]
+    assert summary.endswith(f"EDS: {sheet}, read as Windows-1252: an EDS should be ASCII")
 
 
 def test_the_list_names_every_case_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from skinnode.conformance import Verdict
+
 from .faulty import ANSWER, CHUNK, EMCY, ERROR_CONTROL, SUMMARY, SYNC, Alter, expected, faulty, found
 
 pytestmark = pytest.mark.usefixtures("impatient")
@@ -100,3 +102,55 @@ def pdos_a_byte_short(can_id: int, data: bytes) -> bytes:
 def test_what_is_sent(alter: Alter, fail: str, pass_: str) -> None:
     with faulty(alter) as dut:
         assert found(dut, *fail.split(), *pass_.split()) == expected(fail, pass_)
+
+
+def test_the_phase_of_a_cyclic_tpdo_is_the_devices_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Type 3 is every third SYNC, from whichever on: a device may send at the first, or count from an earlier
+    one. What it may not do is to change its step."""
+    from skinnode.node.tpdo import Tpdo
+
+    counted = Tpdo.turn
+    monkeypatch.setattr(Tpdo, "phase", 2, raising=False)
+    monkeypatch.setattr(Tpdo, "first", True, raising=False)
+
+    def turn(tpdo: Tpdo, counter: int | None) -> bool:
+        if tpdo.first:
+            tpdo.first = False
+            tpdo._syncs = min(Tpdo.phase, tpdo.parameters.kind - 1)
+        return counted(tpdo, counter)
+
+    def start(tpdo: Tpdo, t_ns: int) -> None:
+        started(tpdo, t_ns)
+        tpdo.first = True
+
+    started = Tpdo.start
+    monkeypatch.setattr(Tpdo, "turn", turn)
+    monkeypatch.setattr(Tpdo, "start", start)
+    for phase in (1, 2):
+        monkeypatch.setattr(Tpdo, "phase", phase)
+        with faulty() as dut:
+            assert found(dut, "PDO-06") == expected("", "PDO-06")
+    monkeypatch.setattr(Tpdo, "turn", lambda tpdo, counter: counted(tpdo, None) or tpdo.parameters.kind == 3)
+    with faulty() as dut:
+        assert found(dut, "PDO-06") == expected("PDO-06", "")
+
+
+def test_a_node_that_starts_by_itself_fails_where_that_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nowhere else: the other cases put it into PRE-OPERATIONAL first."""
+    from skinnode.node.device import CanopenDevice
+    from skinnode.node.nmt import NmtState
+
+    reset = CanopenDevice._reset
+
+    def reset_and_start(device: CanopenDevice, objects: tuple[int, int], t_ns: int) -> None:
+        reset(device, objects, t_ns)
+        device._enter(NmtState.OPERATIONAL, t_ns)
+        for can_id in (CHUNK, SUMMARY):  # as an event-driven TPDO that tells of the start
+            device._send(can_id, bytes(8))
+
+    monkeypatch.setattr(CanopenDevice, "_reset", reset_and_start)
+    with faulty() as dut:
+        verdicts = found(dut, "HB-02", "STATE-01", "STATE-02", "TRANS-01", "PDO-06", "PDO-07", "PDO-15")
+    assert verdicts["PDO-15"] is not Verdict.FAILED
+    del verdicts["PDO-15"]
+    assert verdicts == expected("STATE-01 TRANS-01", "HB-02 STATE-02 PDO-06 PDO-07")

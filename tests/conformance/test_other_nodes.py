@@ -147,7 +147,6 @@ def test_a_sheet_is_read() -> None:
         (("SupportedObjects=3", "SupportedObjects=4"), "SupportedObjects=4, but 3"),
         (("2=0x1017", "2=0x1016"), "0x1016 is listed only"),
         (("SubNumber=2", "SubNumber=3"), "SubNumber=3, but 2"),
-        (("NrOfTXPDO=0", "NrOfTXPDO=4"), "nroftxpdo=4, but 0"),
         (("VendorNumber=0x42", "VendorNumber=0x43"), "vendornumber=0x43, the device says 0x00000042"),
         (("DefaultValue=0\n[1018]", "DefaultValue=300\n[1018]"), "default 300 exceeds its type"),
         (("AccessType=wo", "AccessType=write"), "access type 'write'"),
@@ -162,6 +161,36 @@ def test_a_sheet_that_contradicts_itself_or_the_device(
     (result,) = run_cases(dut, select(("EDS",))).results
     assert result.verdict is Verdict.FAILED
     assert told in result.why
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (("NrOfTXPDO=0", "NrOfTXPDO=4"), "NrOfTXPDO=4, but 0 are described"),
+        (("NrOfRXPDO=0", "NrOfRXPDO=many"), "NrOfRXPDO=many, but 0 are described"),
+        (
+            (
+                "AccessType=const\nDefaultValue=somebody",
+                "AccessType=const\nPDOMapping=1\nDefaultValue=somebody",
+            ),
+            "0x1008:00 (Name): mappable, but of variable length",
+        ),
+        (
+            ("DataType=0x9\nAccessType=const", "DataType=0xA\nAccessType=const\nPDOMapping=1"),
+            "0x1008:00 (Name): mappable, but of variable length",
+        ),
+        (("CompactSubObj=3", "CompactSubObj=3\nLowLimit=9\nHighLimit=8"), "low limit 9 above high limit 8"),
+        (("CompactSubObj=3", "CompactSubObj=3\nHighLimit=6"), "default 7 outside its limits"),
+    ],
+)
+def test_what_is_doubtful_in_a_sheet_is_a_warning(foreign: Dut, wrong: tuple[str, str], told: str) -> None:
+    assert wrong[0] in SHEET
+    dut = Dut(foreign.bus, NODE_ID, parse_eds(SHEET.replace(*wrong), "device.eds"))
+    report = run_cases(dut, select(("EDS",)))
+    (result,) = report.results
+    assert result.verdict is Verdict.WARNING
+    assert told in result.why
+    assert report.failed == 0
 
 
 @pytest.mark.parametrize("text", ["", "no sections", "[DeviceInfo]\n", "\0", "[a]\n[1000"])

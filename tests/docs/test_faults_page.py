@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import skinnode.doctor
+from skinnode.doctor.causes import RULES
 from skinnode.host import events
 from skinnode.host.code_watch import WireState
 from skinnode.host.health import BusHealth, Condition, PatchHealth
@@ -111,3 +112,14 @@ def test_every_event_is_on_the_page() -> None:
     assert counters <= {field.name for kind in (PatchHealth, BusHealth) for field in fields(kind)}
     for name in [*told, *counters, *(state.value for state in WireState)]:
         assert f"`{name}`" in PAGE, name
+
+
+def test_every_rule_speaks_of_findings_that_there_are() -> None:
+    known = findings()
+    for rule in RULES:
+        for pattern in (rule.cause, *rule.follow):
+            words = ("chunk PDO (TPDO1)", "upper wires open", "out of range", "x")
+            texts = [name.replace("…", word) for name in known for word in words]
+            fits = any(re.match(pattern, text) for text in [*texts, *known])
+            assert fits, pattern
+        assert set(rule.evidence) <= set(rule.follow)

@@ -6,6 +6,7 @@ import struct
 import time
 import uuid
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
 from skinnode.host import BringUpCancelled, Host
+from skinnode.host.hand_files import check_eds
 from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
@@ -115,6 +117,35 @@ def test_configuration_is_in_the_node(hand: HandConfig, fleet: Fleet) -> None:
         assert (od.read(0x1800, 1, "u32"), od.read(0x1800, 2, "u8")) == (0x185, 254)
         assert od.read(0x1800, 3, "u16") == 11  # 0.8 · 25 ms over 16 chunks and a summary, in 100 µs
         assert (od.read(0x1801, 1, "u32"), od.read(0x1801, 2, "u8")) == (0x285, 1)
+
+
+def test_what_an_integrator_has_set_does_not_stand_in_the_way(
+    make_hand: Callable[..., HandConfig],
+) -> None:
+    """A stored synchronous window would discard the summaries of scans, and an entry of 0x1016 that watches
+    this host already would have entry 1 refused. Other entries stay."""
+    from skinnode.host.link import BusLink
+    from skinnode.host.mainline import Mainline
+
+    table = {
+        "name": "can0",
+        "interface": "virtual",
+        "channel": uuid.uuid4().hex[:8],
+        "heartbeat_node_id": 100,
+    }
+    hand = make_hand(1, buses=[table])
+    with Fleet(hand):
+        with BusLink(hand.buses[0], {}, lambda error: None) as link, Mainline([link]):
+            od = link.remote_od(5)
+            od.write(0x1007, 0, "u32", 100)
+            od.write(0x1016, 7, "u32", 100 << 16 | 9000)
+            od.write(0x1016, 8, "u32", 101 << 16 | 9000)
+        with Host.from_config(hand) as host:
+            assert host.fields(timeout_s=10).get(10) is not None
+        with BusLink(hand.buses[0], {}, lambda error: None) as link, Mainline([link]):
+            od = link.remote_od(5)
+            assert od.read(0x1007, 0, "u32") == 0
+            assert [od.read(0x1016, sub, "u32") >> 16 for sub in (1, 7, 8)] == [100, 0, 101]
 
 
 def test_a_host_that_was_killed_is_followed_by_another(
@@ -252,6 +283,33 @@ def test_other_mapping(make_hand: Callable[..., HandConfig]) -> None:
     )
 
 
+OLD = replace(PatchProfile.from_layout(LAYOUT), checked=False)
+
+
+def test_mapping_of_the_other_revision(make_hand: Callable[..., HandConfig]) -> None:
+    """A node says that it is of 1.1 and maps as 1.0 does, and the other way round."""
+    new = answer_instead(0x1018, 3, bytes.fromhex("01 00 01 00"))
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=new, profile=OLD))) == (
+        "node 5: patch 'p0' on can0: entries mapped in 0x1A01: got 4, allowed: 5"
+    )
+    old = answer_instead(0x1018, 3, bytes.fromhex("00 00 01 00"))
+    assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=old))) == (
+        "node 5: patch 'p0' on can0: entries mapped in 0x1A01: got 5, allowed: 4"
+    )
+
+
+@pytest.mark.parametrize("checked", [False, True])
+def test_bring_up_knows_whether_a_node_sends_checks(hand: HandConfig, checked: bool) -> None:
+    """p1 is of revision 1.0 in one case."""
+    with Fleet(hand, unchecked=() if checked else ("p1",)), Host.from_config(hand) as host:
+        assert eventually(lambda: all(p.solved > 3 for p in host.stats().patches.values()))
+        facts = {name: host._stations[name].facts for name in ("p0", "p1")}
+    assert {name: each is not None and each.checked for name, each in facts.items()} == {
+        "p0": True,
+        "p1": checked,
+    }
+
+
 def test_the_other_nodes_are_pre_operational_when_one_fails(hand: HandConfig) -> None:
     other = PatchLayout.preset("staggered", height_m=3e-3, **SMALL)
     with CanPort(hand.buses[0]) as port, CanPort(hand.buses[0]) as listener:
@@ -294,6 +352,17 @@ def test_interface_that_is_not_known(hand: HandConfig) -> None:
     assert "no such interface, allowed: " in str(caught.value)
 
 
+def test_two_nodes_with_one_node_id_are_named_as_the_cause(hand: HandConfig) -> None:
+    """Whatever transfer fails: both answer each request."""
+    second = hand.model_copy(update={"patches": hand.patches[:1]})
+    with Fleet(hand), Fleet(second), pytest.raises(NodeError) as caught, Host.from_config(hand):
+        pass
+    assert str(caught.value).startswith("node 5: ")
+    assert str(caught.value).endswith(
+        "; one question got 2 answers: two nodes have node-ID 5 (see skinnode scan)"
+    )
+
+
 def test_cancelled(hand: HandConfig) -> None:
     with pytest.raises(BringUpCancelled), Host.from_config(hand, cancelled=lambda: True):
         pass
@@ -309,6 +378,14 @@ def test_eds_of_the_profile_is_accepted(hand: HandConfig, fleet: Fleet, tmp_path
     path.write_text(eds_text(PatchProfile.from_layout(LAYOUT)))
     with Host.from_config(with_eds(hand, path)):
         pass
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
+def test_eds_in_another_encoding(tmp_path: Path, encoding: str) -> None:
+    profile = PatchProfile.from_layout(LAYOUT)
+    text = eds_text(profile).replace("VendorName=", "VendorName=Müller, once ")
+    (tmp_path / "patch.eds").write_text(text, encoding=encoding)
+    check_eds(tmp_path / "patch.eds", profile)
 
 
 @pytest.mark.parametrize(
@@ -344,6 +421,6 @@ def test_eds_that_is_none(hand: HandConfig, tmp_path: Path) -> None:
     path.write_text("once upon a time\n")
     with pytest.raises(ProfileError) as caught, Host.from_config(with_eds(hand, path)):
         pass
-    assert str(caught.value).startswith(f"{path}: EDS: got ")
+    assert str(caught.value).startswith(f"{path}:1: EDS: got 'once upon a time', ")
     assert "allowed: a file as in CiA 306" in str(caught.value)
     assert "\n" not in str(caught.value)

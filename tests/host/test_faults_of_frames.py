@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from skinnode.host import Condition, Host
-from skinnode.host.accounting import discrepancies
+from skinnode.host.accounting import discrepancies, losses_of_lane
 from skinnode.host.facade import HostStats
 from skinnode.host.pipeline import LaneStats
 from skinnode.model.config import HandConfig
@@ -167,7 +167,7 @@ def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Ha
 
 
 def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
-    injected = running.suffer(Faults(torn=0.2))
+    injected = running.suffer(Faults(torn=0.4))
     counted = running.lane().assembler
     assert injected.torn > 2
     assert counted.scans_mixed == injected.torn
@@ -177,15 +177,16 @@ def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
 
 
 def test_lost_summaries(running: Hand) -> None:
-    injected = running.suffer(Faults(summary_lost=0.2))
+    injected = running.suffer(Faults(summary_lost=0.4))
     counted = running.lane().assembler
     assert injected.summary_lost > 2
     assert counted.summaries_lost == injected.summary_lost
+    assert counted.scans_unchecked == injected.summary_lost
     assert counted.scans_torn == counted.chunks_lost == 0
 
 
 def test_lost_syncs(running: Hand) -> None:
-    injected = running.suffer(Faults(sync_lost=0.2))
+    injected = running.suffer(Faults(sync_lost=0.4))
     counted = running.lane().assembler
     assert injected.sync_lost > 2
     assert counted.scans_missed == injected.sync_lost + overruns(running.fleet, "p0")
@@ -210,6 +211,74 @@ def test_everything_at_once(running: Hand) -> None:
     assert counted.conflicts == injected.torn_chunks
     assert counted.summaries_lost == injected.summary_lost
     assert counted.scans_missed == injected.torn + injected.sync_lost + overruns(running.fleet, "p0")
+
+
+# --- what neither counters nor numbers show
+
+
+def test_codes_changed_after_they_were_packed(running: Hand) -> None:
+    injected = running.suffer(Faults(corrupted=0.02))
+    counted = running.lane().assembler
+    assert injected.corrupted > 5
+    assert counted.scans_corrupt == injected.scans_spoilt
+    assert counted.scans_torn == counted.chunks_lost == counted.conflicts == counted.scans_unchecked == 0
+    assert losses_of_lane(running.lane())["scans_corrupt"].endswith("discarded by their check")
+
+
+def test_chunks_with_the_counter_of_the_next_scan_that_loses_its_own(running: Hand) -> None:
+    injected = running.suffer(Faults(displaced=0.4))
+    counted = running.lane().assembler
+    assert injected.displaced > 2
+    assert counted.scans_corrupt == injected.displaced
+    assert counted.scans_mixed == counted.conflicts == 0
+
+
+def test_summaries_that_claim_that_the_rest_is_unchanged(running: Hand) -> None:
+    injected = running.suffer(Faults(understated=0.4))
+    counted = running.lane().assembler
+    assert injected.understated > 2
+    # After one that is thrown away nothing is known of chunks that are not sent: the next cannot be checked.
+    assert counted.scans_corrupt + counted.scans_unchecked == injected.understated
+    assert counted.scans_corrupt > 0
+    assert counted.scans_torn == counted.chunks_lost == 0
+
+
+def test_summaries_without_the_check_that_the_node_sends(running: Hand) -> None:
+    injected = running.suffer(Faults(unchecked=0.4))
+    counted, bus = running.lane().assembler, running.host.stats().buses["can0"]
+    assert injected.unchecked > 2
+    assert counted.bad_form == counted.scans_unchecked == counted.summaries_lost == injected.unchecked
+    assert bus.malformed == injected.unchecked
+    assert counted.scans_torn == counted.chunks_lost == 0
+
+
+def test_nodes_of_both_revisions_on_one_bus(
+    make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """p0 sends no checks, and its scans are complete without them; those of p1 are not."""
+    hand = make_hand()
+    tags = Tags(monkeypatch)
+    with Fleet(hand, wire_up=tags.wire_up, unchecked=("p0",)) as fleet:
+        with Host.from_config(hand) as host:
+            both = Hand(fleet, host, tags)
+            both.scans(3)
+            for name in ("p0", "p1"):
+                fleet.inject(Faults(summary_lost=0.2), name)
+            both.scans(SCANS)
+            fleet.inject(NO_FAULTS)
+            both.scans(8)
+            assert eventually(lambda: host.health("p1").condition is Condition.OPERATIONAL)
+        stats = host.stats()
+        assert discrepancies(stats) == []
+        old, new = (stats.patches[name].assembler for name in ("p0", "p1"))
+        lost = {name: fleet.injected(name).summary_lost for name in ("p0", "p1")}
+        assert min(lost.values()) > 2
+        assert (old.summaries_lost, old.scans_unchecked) == (lost["p0"], 0)
+        assert new.summaries_lost == new.scans_unchecked == lost["p1"]
+        assert old.scans_torn == new.scans_torn == old.scans_corrupt == new.scans_corrupt == 0
+        assert old.bad_form == new.bad_form == 0
+        assert tags.mixed == []
+        assert tags.seen > 2 * SCANS
 
 
 def test_threads_do_not_pile_up(running: Hand) -> None:

@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 
 from skinnode.host import Condition, HandFrame, Host
 from skinnode.host.hand_frame import LATE, OVERTAKEN, HandGatherer, HandSubscription
-from skinnode.model.config import HandConfig
+from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
+from skinnode.node import NmtState
+from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
 
 from .conftest import Rack, eventually
-from .test_roles import changed
+from .test_roles import changed, robot
 
 MS = 1_000_000
 PATIENCE = 50 * MS
@@ -173,6 +175,27 @@ def test_a_hand_without_one_counted_sync_has_none(
         pytest.raises(ValueError, match="SYNC producers: got none with a co"),
     ):
         host.hands()
+
+
+def test_a_hand_of_two_masters_has_none(
+    make_hand: Callable[..., HandConfig], rack_of: Callable[[HandConfig], Rack]
+) -> None:
+    """The host on one bus, the robot on the other: their SYNCs have nothing to do with each other."""
+    table = make_hand().model_dump(mode="json")
+    channel = table["buses"][0]["channel"]
+    table["buses"] = [{"name": f"can{i}", "channel": f"{channel}-{i}"} for i in range(2)]
+    table["buses"][1] |= {"role": "guest", "guest_sends": "sdo"}
+    table["patches"][1]["bus"] = "can1"
+    hand = parse_hand(table)
+    rack = rack_of(hand)
+    for name in ("p0", "p1"):
+        rack.plug(name)
+    with CanPort(hand.bus("can1")) as port, robot(port, hand):
+        assert eventually(lambda: rack.nodes["p1"].nmt_state == NmtState.OPERATIONAL)
+        with Host.from_config(hand) as host:
+            assert all(host.fields(timeout_s=10, patch=name).get(10) for name in ("p0", "p1"))
+            with pytest.raises(ValueError, match=r"^SYNC producers: got 2, must be one that all patches"):
+                host.hands()
 
 
 def test_the_frames_end_with_the_host_and_a_silence_is_a_timeout(hand: HandConfig, fleet: Fleet) -> None:

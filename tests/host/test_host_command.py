@@ -8,6 +8,9 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+import tomllib
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,14 +18,16 @@ from typing import Any
 
 import pytest
 
-from skinnode.cli.host import left, operational
+from skinnode.cli.host import left, operational, verdict
 from skinnode.cli.main import main
 from skinnode.host import Host
 from skinnode.model.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
-from vcan_sim.faults import Faults
+from vcan_sim.command import _too_slow
+from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet
+from vcan_sim.sensor import SimulatedPatch
 
 from .conftest import SMALL, eventually
 
@@ -189,7 +194,7 @@ def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfi
     with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path)]) as host:
         assert host.says("thumb operational")
         simulator.end(signal.SIGKILL)
-        assert host.says("thumb lost")
+        assert host.says("thumb lost (no heartbeat of node 11 for ")  # the reason, whatever the condition
         status, errors = host.end(signal.SIGINT)
     assert status == 1
     lost = {f"node {node} is lost: no heartbeat" for node in ("11 (thumb)", "12 (index)")}
@@ -222,9 +227,7 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Run ``skinnode host`` with these arguments, which it cannot: the one line that it says."""
 
     def error(*arguments: str) -> str:
-        handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
         assert run(*arguments) == 2
-        assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
         lines = capsys.readouterr().err.splitlines()
         assert len(lines) == 1
         return lines[0]
@@ -321,3 +324,65 @@ def test_who_is_awaited_is_not_called_operational(make_hand: Callable[..., HandC
     hand = make_hand(bring_up={"missing": "wait"})
     with Fleet(hand.model_copy(update={"patches": hand.patches[:1]})), Host.from_config(hand) as host:
         assert operational(host) == f"1 of 2 patches of {hand.name!r} operational (p1 never seen)"
+
+
+class Busy:
+    """A patch whose next reading keeps the computer of its node busy for ``busy_s``."""
+
+    def __init__(self, patch: SimulatedPatch) -> None:
+        self._patch, self.busy_s = patch, 0.0
+
+    def read(self, t_ns: int) -> Any:
+        busy_s, self.busy_s = self.busy_s, 0.0
+        time.sleep(busy_s)
+        return self._patch.read(t_ns)
+
+
+def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A computer that is too slow for its nodes is no fault of the skin."""
+    table = TABLE.format(interface="virtual", channel=uuid.uuid4().hex, layout=LAYOUT)
+    hand = parse_hand(tomllib.loads(table))
+    sources: list[Busy] = []
+
+    def wire_up(patch: SimulatedPatch) -> Busy:
+        sources.append(Busy(patch))
+        return sources[-1]
+
+    with Fleet(hand, wire_up=wire_up) as fleet, Host.from_config(hand) as host:
+        before = fleet.report()
+        assert eventually(lambda: host.stats().patches["thumb"].solved > 3)
+        sources[0].busy_s = 0.65  # three SYNCs wait meanwhile, and no heartbeat is missed
+        assert eventually(lambda: host.health("thumb").slow_overruns > 0)
+        assert "the computer that runs the node is too slow" in host.health("thumb").emergency_text
+        assert eventually(lambda: host.stats().patches["thumb"].assembler.scans_missed > 0)
+        faults, notes = verdict(host)
+        assert faults == []
+        assert any("while the computer that runs the node was too slow" in note for note in notes), notes
+        monkeypatch.setattr("skinnode.cli.host._OVERRUN_S", 0.0)  # it is not waited for
+        monkeypatch.setattr("skinnode.cli.host._OVERRUN_SYNCS", 0)
+        sources[0].busy_s = 0.65
+        assert eventually(lambda: any("faulty at the end: EMCY 0x8110" in note for note in verdict(host)[1]))
+        assert verdict(host)[0] == []
+        monkeypatch.undo()
+        fleet.inject(Faults(corrupted=0.5), "thumb")  # nothing that a slow computer would do
+        assert eventually(lambda: host.stats().patches["thumb"].assembler.scans_corrupt > 0)
+        fleet.inject(NO_FAULTS, "thumb")
+        faults, _ = verdict(host)
+        assert any(fault.startswith("thumb:") and "discarded by" in fault for fault in faults), faults
+        line = _too_slow(before, fleet.report())
+        assert re.match(r"vcan-sim: this machine is too busy: \d+ of \d+ scans of the last second", line)
+        assert _too_slow(fleet.report(), fleet.report()) == ""
+
+
+def test_the_emergency_of_a_faulty_patch_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, channel = tmp_path / "hand.toml", uuid.uuid4().hex
+    path.write_text(TABLE.format(interface="virtual", channel=channel, layout=LAYOUT))
+    with Fleet(load_hand(path)) as fleet:
+        fleet.inject(Faults(open_upper=2), "thumb")
+        with pytest.raises(SystemExit) as ended:
+            main(["host", str(path), "--seconds", "2"])
+    assert ended.value.code == 1
+    said = capsys.readouterr().out
+    emergency = "EMCY 0x5000 wire open or shorted: upper wire open 2"
+    assert f"fault: thumb: faulty at the end: {emergency}" in said
+    assert f"thumb faulty ({emergency})  " in said  # in the lines of each second, too

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import threading
 import time
@@ -10,6 +11,9 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from skinnode.errors import BusError, NodeError, NodeTimeout, SdoAbort, SkinError
+from skinnode.host import containment
+from skinnode.host.containment import Defects
+from skinnode.host.dealer import Dealer
 from skinnode.host.link import BusLink
 from skinnode.host.mainline import Mainline
 from skinnode.model.config import BusConfig, HandConfig
@@ -31,11 +35,12 @@ def test_frames_go_to_their_handlers_in_order(hand: HandConfig, listener: CanPor
         0x186: lambda data, t_ns: got.put(("b", data)),
     }
     with BusLink(hand.buses[0], handlers, fail) as link, Mainline([link]):
-        for can_id, data in ((0x186, b"1"), (0x185, b"2"), (0x3F0, b"x"), (0x186, b"3")):
+        for can_id, data in ((0x3F0, b"x"), (0x186, b"1"), (0x185, b"2"), (0x3F0, b"x"), (0x186, b"3")):
             listener.send(can_id, data)
         assert [got.get(timeout=10) for _ in range(3)] == [("b", b"1"), ("a", b"2"), ("b", b"3")]
         stats = link.stats()
-    assert (stats.received, stats.foreign, stats.dropped, stats.malformed) == (4, 1, 0, 0)
+    assert (stats.received, stats.foreign, stats.dropped, stats.malformed) == (5, 2, 0, 0)
+    assert stats.foreign_ids == {0x3F0: 2}
 
 
 def test_bits_are_those_of_every_frame_sent_and_received(hand: HandConfig, listener: CanPort) -> None:
@@ -52,17 +57,29 @@ def test_bits_are_those_of_every_frame_sent_and_received(hand: HandConfig, liste
         assert link.stats().load > 0
 
 
-def test_defect_of_a_handler_is_reported(hand: HandConfig, listener: CanPort) -> None:
+def test_defect_of_a_handler_costs_its_frame_and_is_reported_once(
+    hand: HandConfig, listener: CanPort
+) -> None:
+    """Whatever else is in the same batch goes to its handlers."""
     failures: queue.SimpleQueue[SkinError] = queue.SimpleQueue()
+    got: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def broken(data: bytes, t_ns: int) -> None:
         raise ZeroDivisionError("by zero")
 
-    with BusLink(hand.buses[0], {0x185: broken}, failures.put) as link, Mainline([link]):
-        listener.send(0x185, b"")
-        error = failures.get(timeout=10)
-    assert str(error) == "bus 'can0': ZeroDivisionError: by zero"
+    handlers = {0x185: broken, 0x186: lambda data, t_ns: got.put(data)}
+    with BusLink(hand.buses[0], handlers, failures.put) as link:
+        for number in range(10):
+            listener.send(0x185, b"")
+            listener.send(0x186, bytes([number]))
+        with Mainline([link]):
+            error = failures.get(timeout=10)
+            assert [got.get(timeout=10) for _ in range(10)] == [bytes([number]) for number in range(10)]
+            assert eventually(lambda: link.stats().received == 20)
+    assert str(error) == "can0: frame 0x185: ZeroDivisionError: by zero"
     assert isinstance(error.__cause__, ZeroDivisionError)
+    assert failures.empty()
+    assert link.defects.count == 10
 
 
 def numbered(send: Callable[[int, bytes], object], got: queue.SimpleQueue[bytes], first: int) -> None:
@@ -75,6 +92,83 @@ def numbered(send: Callable[[int, bytes], object], got: queue.SimpleQueue[bytes]
 
 def two_buses(hand: HandConfig) -> list[BusConfig]:
     return [hand.buses[0].model_copy(update={"name": name, "channel": f"{name}-{id(hand)}"}) for name in "ab"]
+
+
+def test_a_batch_and_the_pollers_go_on_after_a_defect() -> None:
+    """Each owner hears of its own defect; every other frame and poller of the turn is served."""
+    palm, thumb, contained, served = Defects("palm"), Defects("thumb"), [], []
+
+    class Containing(Dealer):
+        def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
+            contained.append((owner, doing, str(error)))
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("broken")
+
+    dealer = Containing(BusConfig(name="can0", channel="batch"), {}, 0)
+    dealer.handle(0x185, broken, palm)
+    dealer.handle(0x186, lambda data, t_ns: served.append(data), thumb)
+    dealer.poll_with(broken, palm)
+    dealer.poll_with(served.append, thumb)
+    dealer.deal([Frame(can_id, bytes([i]), i + 1) for i, can_id in enumerate((0x185, 0x186, 0x185, 0x186))])
+    dealer.poll(5_000_000)
+    assert served == [b"\x01", b"\x03", 5_000_000]
+    assert contained == [
+        (palm, "frame 0x185", "broken"),
+        (palm, "frame 0x185", "broken"),
+        (palm, "polling", "broken"),
+    ]
+    assert dealer.count().received == 4
+
+
+def test_a_listener_that_raises_costs_no_frame(hand: HandConfig, listener: CanPort) -> None:
+    got: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    batches: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def broken(frames: Sequence[Frame]) -> None:
+        raise ZeroDivisionError("of ours")
+
+    with BusLink(hand.buses[0], {0x185: lambda data, t_ns: got.put(data)}, lambda error: None) as link:
+        link.listen(broken)
+        link.listen(lambda frames: batches.put(len(frames)))
+        with Mainline([link]):
+            numbered(listener.send, got, 0)
+        assert sum(batches.get_nowait() for _ in range(batches.qsize())) == 10
+        assert link.stats().received == 10
+        assert link.defects.newest == "a listener: ZeroDivisionError: of ours"
+
+
+def test_pollers_are_told_the_time_every_two_milliseconds_at_most() -> None:
+    told: list[int] = []
+    dealer = Dealer(BusConfig(name="can0", channel="polls"), {}, 0)
+    dealer.poll_with(told.append)
+    for t_us in (5000, 5000, 5001, 6999, 7000, 8999, 12_000):
+        dealer.poll(1000 * t_us)
+    assert told == [5_000_000, 7_000_000, 12_000_000]
+    dealer.poll(11_999_000)  # time went back: nobody waits until it has caught up
+    assert told[3:] == [11_999_000]
+
+
+def test_a_load_that_cannot_be_measured_is_tried_again_ever_more_seldom(
+    hand: HandConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mainline would spend its time on it, for it turns with each batch of frames."""
+    now_s, due_s = [100.0], list[float]()
+    monkeypatch.setattr(containment.time, "monotonic", lambda: now_s[0])
+    with BusLink(hand.buses[0], {}, lambda error: None) as link:
+
+        def broken(now_ns: int) -> None:
+            due_s.append(now_ns * 1e-9)
+            raise ZeroDivisionError("of ours")
+
+        monkeypatch.setattr(link, "measure", broken)
+        for turn in range(4000):
+            now_s[0] = 100.0 + turn / 1000
+            link.t_dealt_ns = round(now_s[0] * 1e9)
+            link.measure_load()
+    assert link.defects.newest == "measuring the load: ZeroDivisionError: of ours"
+    pauses = [later - earlier for earlier, later in itertools.pairwise(due_s)]
+    assert pauses == pytest.approx([0.1, 0.2, 0.4, 0.8, 1.0, 1.0], abs=0.0015)
 
 
 def test_a_defect_on_one_bus_is_told_once_and_the_other_goes_on(hand: HandConfig) -> None:
@@ -93,7 +187,7 @@ def test_a_defect_on_one_bus_is_told_once_and_the_other_goes_on(hand: HandConfig
         Mainline([a, b]),
     ):
         to_one.send(0x185, b"")
-        assert str(failures.get(timeout=10)) == "bus 'a': ZeroDivisionError: by zero"
+        assert str(failures.get(timeout=10)) == "a: frame 0x185: ZeroDivisionError: by zero"
         to_one.send(0x185, b"")
         numbered(to_other.send, got, 0)
     assert failures.empty()
@@ -166,6 +260,16 @@ def test_time_goes_on_for_a_silent_bus_while_another_is_busy(hand: HandConfig) -
                 while not told.empty():
                     newest_ns = told.get()
     assert begin_ns < newest_ns <= time.monotonic_ns()
+
+
+def test_the_time_up_to_which_frames_were_dealt_out_never_goes_back(hand: HandConfig) -> None:
+    """It is that of the newest frame, and the receiver may have looked before that came."""
+    told: list[int] = []
+    with BusLink(hand.buses[0], {}, fail) as link:
+        link.poll_with(told.append)
+        link.t_dealt_ns = link.intake.seen_ns + 1_000_000_000
+        link.turn()
+        assert (link.t_dealt_ns, told) == (link.intake.seen_ns + 1_000_000_000, [])
 
 
 def test_whoever_asks_is_answered_as_soon_as_if_no_scan_were_expected(hand: HandConfig) -> None:

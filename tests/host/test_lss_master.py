@@ -10,7 +10,7 @@ import pytest
 from skinnode.host.lss import ANSWER_S, LssFailed, LssMaster
 from skinnode.node.lss import LssSlave
 from skinnode.wire import indices as od
-from skinnode.wire.lss import NOT_CONFIGURED, LssAddress
+from skinnode.wire.lss import NOT_CONFIGURED, LssAddress, LssCommand
 
 LATE_S = 1.5 * ANSWER_S
 
@@ -121,6 +121,16 @@ def test_node_id_for_a_serial_number(line_of: Callable[..., Line]) -> None:
     assert len(line.resets) == 1
 
 
+def test_patches_of_both_revisions_are_found(line_of: Callable[..., Line]) -> None:
+    old = LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, 0x0001_0000, 7)
+    line = line_of(LssSlave(old, NOT_CONFIGURED), slave(8, 5))
+    assert line.master.find_unconfigured() == old
+    assert line.master.select_patch(7) == old
+    assert line.master.select_patch(8) == address(8)
+    assert line.master.select_patch(9) is None
+    assert line.master.give_node_id(7, 6)
+
+
 def test_a_frame_that_is_not_of_8_bytes_is_none(line_of: Callable[..., Line]) -> None:
     line = line_of()
     line.master.on_response(bytes((0x50,)), 0)
@@ -130,3 +140,12 @@ def test_a_frame_that_is_not_of_8_bytes_is_none(line_of: Callable[..., Line]) ->
 def test_a_bit_rate_that_there_is_not(line_of: Callable[..., Line]) -> None:
     with pytest.raises(ValueError, match="bitrate: got 123, must be one of 1000000, 800000"):
         line_of().master.set_bit_rate(123)
+
+
+def test_a_node_may_take_longer_to_store_than_to_answer(line_of: Callable[..., Line]) -> None:
+    """Flash memory, or a file that is synchronised to disk, takes a while."""
+    line = line_of(LssSlave(address(7), NOT_CONFIGURED, store=lambda node_id, bit_rate_bps: None))
+    assert line.master.select(address(7))
+    line.master.set_node_id(5)
+    line.late = {LssCommand.STORE}
+    line.master.store()

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from skinnode.errors import SkinError
-from skinnode.host.pipeline import Lane
+from skinnode.host.bringup import NodeFacts
+from skinnode.host.containment import Defects
+from skinnode.host.pipeline import Lane, Solver
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Ticks
-from skinnode.host.workers import Workers
+from skinnode.host.workers import Inline, Job, OnError, Workers
+from skinnode.model.config import HandConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
+from skinnode.solve.tracker import Tracker
 from skinnode.wire.assembler import Scan, ScanAssembler
-from skinnode.wire.codec import CodeScale, SummaryFlag, encode, pack_scan, pack_summary
+from skinnode.wire.codec import (
+    CodeScale,
+    SummaryFlag,
+    check_of_codes,
+    encode,
+    pack_checked_summary,
+    pack_scan,
+    pack_summary,
+)
 from skinnode.wire.profile import PatchProfile
 
 from .conftest import SMALL, eventually
@@ -36,6 +50,7 @@ class Stub:
     def __init__(self) -> None:
         self.entered, self.go = threading.Event(), threading.Event()
         self.error: Exception | None = None
+        self.facts = SimpleNamespace(checked=False)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
         self.entered.set()
@@ -175,6 +190,33 @@ def test_scan_with_a_chunk_missing_goes_on_with_a_mask(lane: Lane, stub: Stub, p
     assert (stats.assembler.scans_torn, stats.assembler.chunks_lost, stats.invalid_codes) == (1, 1, 3)
 
 
+@pytest.mark.parametrize("anew", [False, True])
+def test_a_node_known_to_send_checks_is_taken_at_its_word(lane: Lane, stub: Stub, anew: bool) -> None:
+    """From the first scan on: a summary without a check counts for nothing."""
+    stub.go.set()
+    stub.facts.checked = True
+    lane.resume(stub, lane.withholdings, anew=anew)
+    feed(lane, 1, 0)
+    lane.poll(100 * MS)
+    assembler = lane.stats().assembler
+    assert (assembler.bad_form, assembler.scans_unchecked, assembler.scans_complete) == (1, 1, 0)
+
+
+def test_a_scan_thrown_away_may_have_told_of_a_new_baseline(lane: Lane, stub: Stub) -> None:
+    """Nobody will ever see its flags: so the baseline is read again."""
+    stub.go.set()
+    feed(lane, 1, 0)
+    assert not lane.doubtful
+    codes = encode(REST_OHM, REST_OHM, CodeScale())
+    chunks = pack_scan(codes, 2, PROFILE)
+    for chunk in chunks:
+        lane.on_chunk(chunk, MS)
+    wrong = check_of_codes(codes, PROFILE) ^ 1
+    lane.on_summary(pack_checked_summary(2, SummaryFlag.BASELINE_CHANGED, len(chunks), 0, wrong), MS)
+    assert lane.stats().assembler.scans_corrupt == 1
+    assert lane.doubtful
+
+
 @pytest.mark.parametrize("failing", [ZeroDivisionError("by zero"), MemoryError("no more")])
 def test_a_defect_reaches_the_subscriber(
     lane: Lane, stub: Stub, publisher: Publisher, failing: Exception
@@ -187,6 +229,98 @@ def test_a_defect_reaches_the_subscriber(
         fields.get(10)
     assert str(caught.value) == f"patch 'thumb', scan 1: {type(failing).__name__}: {failing}"
     assert caught.value.__cause__ is failing
+
+
+class Full(Inline):
+    """Takes no job while it is full."""
+
+    def __init__(self) -> None:
+        self.full = False
+
+    def submit(self, job: Job, on_error: OnError) -> None:
+        if self.full:
+            raise MemoryError("no more")
+        super().submit(job, on_error)
+
+
+def lane_of(
+    workers: Inline, publisher: Publisher, ticks: Ticks, solver: Any, defects: Defects | None = None
+) -> Lane:
+    assembler = ScanAssembler(PROFILE, counter_overflow=240)
+    lane = Lane("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, defects=defects)
+    lane.resume(solver, 0, anew=True)
+    return lane
+
+
+def test_a_scan_that_no_worker_takes_costs_itself(stub: Stub, publisher: Publisher, ticks: Ticks) -> None:
+    workers, fields = Full(), publisher.subscribe(10, 10.0, None)
+    stub.go.set()
+    lane = lane_of(workers, publisher, ticks, stub)
+    workers.full = True
+    with pytest.raises(MemoryError, match="no more"):  # whoever handles the frame reports it
+        feed(lane, 1, 0)
+    workers.full = False
+    feed(lane, 2, MS)
+    field = fields.get(0)
+    assert field is not None
+    assert field.stamp is not None
+    assert field.stamp.counter == 2
+
+
+def test_a_worker_that_finds_no_successor_leaves_the_lane_open(publisher: Publisher, ticks: Ticks) -> None:
+    """The scan that came while it solved waits, and is overtaken by the next."""
+    workers, defects = Full(), Defects("thumb")
+
+    class Slow(Stub):
+        def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+            if stamp.counter == 1:
+                feed(lane, 2, MS)
+                workers.full = True
+            return super().solve(scan, stamp)
+
+    slow = Slow()
+    slow.go.set()
+    lane = lane_of(workers, publisher, ticks, slow, defects)
+    feed(lane, 1, 0)
+    assert (defects.count, defects.newest) == (1, "solving: MemoryError: no more")
+    workers.full = False
+    feed(lane, 3, 2 * MS)
+    stats = lane.stats()
+    assert (stats.offered, stats.solved, stats.skipped) == (3, 2, 1)
+    assert defects.count == 1
+
+
+@pytest.mark.parametrize("method", ["exact", "posterior"])
+def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
+    make_hand: Callable[..., HandConfig], publisher: Publisher, ticks: Ticks, method: str
+) -> None:
+    """Against the tracker of that method, given the resistances that were encoded."""
+    hand = make_hand(1, solver={"method": method})
+    facts = NodeFacts(hand.patches[0], LAYOUT, PROFILE, CodeScale(), REST_OHM, None, 0.25)
+    solver = Solver(facts, hand.solver, lambda: 7 * MS)
+    pressed_m = LAYOUT.upper_m - [0.0, 0.0, 0.05e-3]
+    pressed_ohm = resistance_ohm(LAYOUT, pressed_m)
+    lane = Lane(
+        "thumb",
+        ScanAssembler(PROFILE, counter_overflow=240),
+        Inline(),
+        publisher,
+        ticks.find,
+        lambda t_ns: None,
+    )
+    lane.resume(solver, 0, anew=True)
+    fields = publisher.subscribe(10, 10.0, None)
+    chunks = pack_scan(encode(pressed_ohm, REST_OHM, CodeScale()), 1, PROFILE)
+    for chunk in chunks:
+        lane.on_chunk(chunk, MS)
+    lane.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 1000), MS)
+    field = fields.get(0)
+    assert field is not None
+    assert (field.method, field.trusted, lane.stats().invalid_codes) == (method, True, 0)
+    assert field.stamp is not None
+    assert (field.stamp.t_receive_ns, field.stamp.t_solved_ns) == (MS, 7 * MS)
+    expected = Tracker(LAYOUT, method=method, baseline_ohm=REST_OHM).update(pressed_ohm)
+    np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=1e-6)
 
 
 def test_scans_from_many_turns_are_all_accounted_for(lane: Lane, stub: Stub, publisher: Publisher) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import logging
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
 from skinnode.transport import CanPort
+from skinnode.wire.profile import PatchProfile
 
 from .conftest import SMALL, Rack, eventually, heard
 from .test_supervisor import scans, take
@@ -80,6 +83,39 @@ def test_a_guest_that_may_send_nothing_sends_nothing_and_hears_all(
             assert (host.stats().sync.sent, host.stats().buses["can0"].sent) == (0, 0)
         assert {frame.can_id for frame in heard(port)} <= of_nodes(port)
         assert {node.nmt_state for node in rack.nodes.values()} == {NmtState.OPERATIONAL}
+
+
+def test_a_guest_that_sends_nothing_learns_by_the_flag_who_sends_checks(
+    hand: HandConfig, rack_of: Callable[[HandConfig], Rack], tmp_path: Path, listener: CanPort
+) -> None:
+    """p1 is of revision 1.0. Summaries of both are lost from some time on."""
+    lost = threading.Event()
+
+    def lets_through(can_id: int, data: bytes) -> bool:
+        return not (lost.is_set() and can_id & 0x780 == 0x280)
+
+    rack = rack_of(hand)
+    file = str(baseline_file(rack, tmp_path))
+    hand = changed(hand, bus={"role": "guest"}, patch={"baseline": file})
+    old = replace(PatchProfile.from_layout(hand.patch("p1").layout.build()), checked=False)
+    rack.plug("p0", lets_through=lets_through)
+    rack.plug("p1", lets_through=lets_through, profile=old)
+
+    def published(host: Host) -> dict[str, tuple[int, int]]:
+        assemblers = {name: lane.assembler for name, lane in host.stats().patches.items()}
+        return {name: (each.scans_complete, each.scans_unchecked) for name, each in assemblers.items()}
+
+    with robot(listener, hand), Host.from_config(hand) as host:
+        assert eventually(lambda: all(complete > 5 for complete, _ in published(host).values()))
+        assert all(not unchecked for _, unchecked in published(host).values())
+        lost.set()
+        assert eventually(lambda: published(host)["p0"][1] > 5)
+        assert eventually(lambda: host.stats().patches["p1"].assembler.summaries_lost > 5)
+        assert published(host)["p1"][1] == 0
+        lost.clear()
+        complete = published(host)["p0"][0]
+        assert eventually(lambda: published(host)["p0"][0] > complete + 5)
+    assert discrepancies(host.stats()) == []
 
 
 def all_operational(host: Host) -> bool:
@@ -289,7 +325,7 @@ def test_a_patch_without_its_node_id_is_found_by_its_serial_number(
         (
             {"role": "guest", "guest_sends": "sdo", "heartbeat_node_id": 3},
             {},
-            "buses[0].heartbeat_node_id: got 3, allowed: none for a guest",
+            'buses[0].heartbeat_node_id: got 3, allowed: only with role = "master"',
         ),
         (
             {"heartbeat_node_id": 6},

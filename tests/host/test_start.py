@@ -7,8 +7,13 @@ from typing import Any
 
 import pytest
 
-from skinnode.errors import NodeTimeout
-from skinnode.host import start
+from skinnode.errors import NodeError, NodeTimeout
+from skinnode.host import Host, start
+from skinnode.host.pipeline import Solver
+from skinnode.host.station import Station
+from skinnode.model.config import BringUpConfig, HandConfig, Missing
+
+from .conftest import Rack, eventually
 
 
 class Node:
@@ -19,6 +24,8 @@ class Node:
         self.is_guest, self.patch = False, SimpleNamespace(name="thumb", bus="can0", node_id=5)
         self.lane, self.monitor = SimpleNamespace(withholdings=0), self
         self.nmt_state = 127
+        self.sent: list[tuple[int, bytes]] = []
+        self.link = SimpleNamespace(send=lambda can_id, data: self.sent.append((can_id, data)))
 
     def start(self, solver: Any, withholdings: int) -> None: ...
 
@@ -41,3 +48,32 @@ def test_a_node_is_not_late_while_the_machine_of_the_host_stands_still(
     node.naps = 10_000
     with pytest.raises(NodeTimeout, match="got NMT state 127 after the start command"):
         start.start_all({node: None})  # type: ignore[dict-item]
+    assert set(node.sent) == {(0x000, bytes([1, 5]))}  # one may have been lost
+    assert len(node.sent) >= 3
+
+
+@pytest.mark.parametrize("missing", ["refuse", "wait"])
+def test_a_defect_at_every_bring_up_of_a_node_ends_the_start_unless_nodes_may_be_missing(
+    hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch, missing: Missing
+) -> None:
+    """Nobody is handed a hand that lacks a patch without having said that it may."""
+    bring_up, tried = Station.bring_up, list[str]()
+
+    def broken(station: Station, *args: Any, **options: Any) -> Solver:
+        if station.patch.name == "p0" and len(tried) < 3:
+            tried.append(station.patch.name)
+            raise ZeroDivisionError("of ours")
+        return bring_up(station, *args, **options)
+
+    monkeypatch.setattr(Station, "bring_up", broken)
+    hand = hand.model_copy(update={"bring_up": BringUpConfig(missing=missing)})
+    if missing == "refuse":
+        complaint = "node 5: patch 'p0' on can0: bring-up: ZeroDivisionError: of ours"
+        with pytest.raises(NodeError, match=complaint), Host.from_config(hand):
+            pass
+        return
+    with Host.from_config(hand) as host:
+        assert len(tried) == 3
+        for patch in ("p1", "p0"):  # which is brought up as one that came later
+            assert host.fields(timeout_s=10, patch=patch).get(10) is not None
+        assert eventually(lambda: host.stats().nodes["p0"].rejoins == 1)

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import queue
 import threading
+from types import SimpleNamespace
+
+import pytest
 
 from skinnode.errors import BusError
+from skinnode.host import sync
 from skinnode.host.sync import SyncProducer, Ticks
+
+from .conftest import eventually
 
 
 def test_counter_runs_from_one_and_wraps() -> None:
@@ -42,9 +48,11 @@ def test_a_bus_that_refuses_does_not_silence_the_others() -> None:
     def broken(cob_id: int, data: bytes) -> None:
         raise BusError("can0: 0x080 not sent (no buffer space)")
 
-    with SyncProducer([(broken, Ticks(240)), (lambda _, data: sent.put(data[0]), Ticks(240))], 0.002) as sync:
+    with SyncProducer(
+        [(broken, Ticks(240)), (lambda _, data: sent.put(data[0]), Ticks(240))], 0.002
+    ) as running:
         assert [sent.get(timeout=10) for _ in range(3)] == [1, 2, 3]
-    stats = sync.stats()
+    stats = running.stats()
     assert stats.failed == stats.sent >= 3
 
 
@@ -59,15 +67,37 @@ def test_missed_periods_are_skipped_and_counted_not_sent_in_a_burst() -> None:
             hold.wait(5.5 * period_s)
 
     ticks = Ticks(240)
-    with SyncProducer([(send, ticks)], period_s) as sync:
+    with SyncProducer([(send, ticks)], period_s) as running:
         assert [sent.get(timeout=10) for _ in range(4)] == [1, 2, 3, 4]
-    assert sync.stats().missed >= 4
+    assert running.stats().missed >= 4
     second, third, fourth = (ticks.find(counter) for counter in (2, 3, 4))
     assert second is not None
     assert third is not None
     assert fourth is not None
     # No burst: what follows keeps to the raster of the periods. Lateness only makes the first gap shorter.
     assert fourth.t_ns - second.t_ns > period_s * 1e9
+
+
+@pytest.mark.parametrize("period_ms", [1, 25, 80, 1000, 60_000])
+def test_no_drift_builds_up(monkeypatch: pytest.MonkeyPatch, period_ms: int) -> None:
+    """SYNC number n is due n periods after the first, to the nanosecond, however many there were."""
+    now_ns, sent_ns = [10**9], list[int]()
+
+    class Event(threading.Event):
+        """Waits by the clock of this test."""
+
+        def wait(self, timeout: float | None = None) -> bool:
+            assert timeout is not None
+            now_ns[0] += round(timeout * 1e9)
+            return len(sent_ns) == 1000
+
+    clock = SimpleNamespace(monotonic_ns=lambda: now_ns[0])
+    monkeypatch.setattr(sync, "time", clock)
+    monkeypatch.setattr(sync, "threading", SimpleNamespace(Event=Event, Thread=threading.Thread))
+    with SyncProducer([(lambda _, data: sent_ns.append(now_ns[0]), Ticks(240))], period_ms * 1e-3) as running:
+        assert eventually(lambda: len(sent_ns) == 1000)
+    assert sent_ns == [10**9 + n * period_ms * 1_000_000 for n in range(1000)]
+    assert running.stats().missed == 0
 
 
 def test_nothing_is_sent_after_close() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from skinnode.errors import NodeError
+from skinnode.errors import NodeError, NodeTimeout
 from skinnode.host import Host
+from skinnode.host.bringup import Bringer
 from skinnode.model.config import HandConfig
 from skinnode.record import Recorder
 from skinnode.transport import CanPort
@@ -55,7 +57,7 @@ def test_a_baseline_of_a_file_is_not_tared_over(
     patch = own.patches[0].model_copy(update={"baseline": tmp_path / "p0.txt"})
     with (
         Host.from_config(own.model_copy(update={"patches": (patch,)})) as host,
-        pytest.raises(NodeError, match=r"its baseline is that of .*p0\.txt"),
+        pytest.raises(NodeError, match=r"its baseline is kept in .*p0\.txt"),
     ):
         host.tare("p0")
 
@@ -85,3 +87,56 @@ def test_a_tap_hears_nothing_after_its_end(hand: HandConfig, rack: Rack, tmp_pat
         frames = recorder.stats().frames
         assert eventually(lambda: host.stats().patches["p0"].solved > scans + 10)
         assert recorder.stats().frames == frames
+
+
+def test_a_tare_returns_when_the_new_baseline_is_in_use(hand: HandConfig, rack: Rack) -> None:
+    with Host.from_config(hand) as host:
+        events = host.events()
+        rest_ohm = rack.sources["p0"].ohm
+        rack.sources["p0"].ohm = 0.98 * rest_ohm
+        assert eventually(lambda: depth_m(host, "p0") > 1e-5)
+        host.tare("p0")
+        assert host.stats().nodes["p0"].baselines == 1
+        for field in host.fields(patch="p0", timeout_s=5.0):  # the first one solved after it
+            assert np.abs(field.displacement_m).max() < 1e-6
+            break
+        told: list[tuple[str, str]] = []
+
+        def confirmed() -> bool:
+            event = events.get(0.0)
+            if event is not None:
+                told.append((event.what, str(event)))
+            return ("baselines", "p0: 1 new baseline in use") in told
+
+        assert eventually(confirmed), told
+        assert host.health("p0").baselines == 1
+        assert host.health("p1").baselines == 0
+
+
+def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
+    hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, calls = Bringer._settle_baseline, []
+
+    def fails_once(*arguments: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise RuntimeError("first reading")
+        return read(*arguments)
+
+    with Host.from_config(hand) as host:
+        monkeypatch.setattr(Bringer, "_settle_baseline", fails_once)
+        host.tare("p0")  # the patch is faulty meanwhile, and brought up again
+        assert len(calls) == 2
+        assert host.health("p0").baselines == 1
+
+
+def test_a_tare_that_the_node_does_not_take_is_a_timeout(hand: HandConfig, rack: Rack) -> None:
+    with Host.from_config(hand) as host:
+        rack.pull("p0")  # its last heartbeat still counts
+        with pytest.raises(
+            NodeTimeout,
+            match=r"node 5: patch 'p0' on can0: tare commanded, but no new baseline came within 0.2 s",
+        ):
+            host.tare("p0", deadline_s=0.2)
+        host.tare("p1")

@@ -205,6 +205,5 @@ def test_keys_beside_a_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_hand(path)
     assert str(caught.value) == (
-        f"{path}:6:32: patches[0].layout.pitch_m: got 0.001, "
-        "allowed: nothing beside layout.file, which says it"
+        f"{path}:6:32: patches[0].layout.pitch_m: got 0.001, allowed: only without layout.file, which sets it"
     )

@@ -21,23 +21,26 @@ from vcan_sim.fleet import Fleet
 from .conftest import Pressed, a_hand, eventually, in_app, press, screen_of
 
 SIZES = [(80, 24), (120, 40)]
-HEAVIEST = "@"
-"""What the deepest skin is drawn with where there are no colours."""
+SIGNS = "@%#*+=-:"
+"""What skin is drawn with where there are no colours, the deepest first: a small map has no pixel in the very
+middle of an electrode."""
 
 
 def heaviest(text: str, width: int) -> list[tuple[float, float]]:
     """Where the heaviest signs of the maps are: column, and line from the top of the map, in cells of the
     4 × 4 electrodes of the left patch of two."""
     lines = text.split("\n")
-    first = next(row for row, line in enumerate(lines) if " 1 p0 " in line) + 1
-    last = next(row for row, line in enumerate(lines) if " ± " in line and row > first)
+    first = next(row for row, line in enumerate(lines) if "┌" in line) + 1
+    last = next(row for row, line in enumerate(lines) if "└" in line)
+    left = lines[first - 1].index("┌") + 1
     across = last - first
-    left = (width // 2 - 1 - 2 * across) // 2
+    inside = "".join(lines[first:last])
+    deepest = next((sign for sign in SIGNS if sign in inside), "")
     return [
         ((column - left + 0.5) / (2 * across) * 4, (row - first + 0.5) / across * 4)
         for row, line in enumerate(lines[first:last], first)
         for column, sign in enumerate(line[: width // 2])
-        if sign == HEAVIEST
+        if sign == deepest
     ]
 
 
@@ -50,8 +53,8 @@ def test_a_press_is_seen_where_it_is(size: tuple[int, int]) -> None:
             assert await eventually(pilot, lambda: "nothing touches" in screen_of(pilot))
             # the last wire is the uppermost line, the second electrode the second column
             skin.press("p0", 3, 1, (0.0, 0.0, -200e-6))
-            assert await eventually(pilot, lambda: heaviest(screen_of(pilot), size[0]))
             assert await eventually(pilot, lambda: "200 ± " in screen_of(pilot))
+            assert await eventually(pilot, lambda: heaviest(screen_of(pilot), size[0]))
             places = heaviest(screen_of(pilot), size[0])
             assert all(1 <= x <= 2 and 0 <= y <= 1 for x, y in places), places
             assert "x   4.0  y  12.0 mm" in screen_of(pilot)  # a pitch of 4 mm
@@ -192,7 +195,8 @@ def test_a_recording_that_cannot_be_is_told_and_the_screen_goes_on(tmp_path: Pat
             assert await eventually(pilot, lambda: "recording: got" in screen_of(pilot))
             assert source.recording is None
 
-        in_app(source, play, folder=tmp_path / "none", size=(120, 40))
+        (tmp_path / "taken").touch()
+        in_app(source, play, folder=tmp_path / "taken", size=(120, 40))
 
 
 def test_pause_holds_the_picture_while_the_host_goes_on() -> None:

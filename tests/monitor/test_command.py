@@ -82,15 +82,15 @@ def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--simulate"], "standard input and output: got no terminal, allowed: one, or --json"),
+        (["--simulate"], "standard input and output: got no terminal, allowed: a terminal, or --json"),
         (["--json"], "HAND.toml: got nothing, allowed: one of HAND.toml, --simulate and --replay RECORDING"),
-        (["--json", "--simulate", "-o", "/nowhere"], "--output: got '/nowhere', allowed: an existing folder"),
-        (["--json", "--simulate", "-o", ""], "--output: got '', allowed: an existing folder"),
+        (["--json", "--simulate", "-o", "/dev/null"], "--output: got '/dev/null', allowed: a folder"),
+        (["--json", "--simulate", "-o", ""], "--output: got '', allowed: a folder"),
         (["--json", "/nowhere.toml"], "nowhere.toml"),
         (["--json", "--replay", "/nowhere.log"], "nowhere"),
-        (["--json", "--replay", "/x.log", "--interface", "pcan"], "--interface: got 'pcan', allowed: noth"),
-        (["--json", "--simulate", "--channel", "can1"], "--channel: got 'can1', allowed: nothing beside"),
-        (["--json", "--simulate", "--speed", "2"], "--speed: got 2.0, allowed: nothing without --replay"),
+        (["--json", "--replay", "/x.log", "--interface", "pcan"], "--interface: got 'pcan', allowed: only"),
+        (["--json", "--simulate", "--channel", "can1"], "--channel: got 'can1', allowed: only without"),
+        (["--json", "--simulate", "--speed", "2"], "--speed: got 2.0, allowed: only with --replay"),
     ],
 )
 def test_what_cannot_run_is_one_line(arguments: list[str], said: str) -> None:

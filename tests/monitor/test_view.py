@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from skinnode.monitor.report import FaultBook, as_json
 from skinnode.monitor.source import HostSource, ReplaySource
 from skinnode.monitor.state import History, View
 from skinnode.record import Recorder, replay
+from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 
 from .conftest import a_hand
@@ -192,6 +194,54 @@ def test_every_line_has_its_width_at_every_size(patches: int, colours: Colours) 
             assert {sum(segment.cell_length for segment in line) for line in lines} == {width}
             if width >= 80 and not zoomed:
                 assert all(f"p{number}" in as_text(lines) for number in range(patches))
+
+
+def test_untouched_skin_has_an_outline() -> None:
+    hand = a_hand(2, sync={"period_ms": 100}, simulation={"depth": 0.0})
+    with Fleet(hand), Host.from_config(hand) as host, HostSource(host) as source:
+        history = History(hand)
+        view = history.add(source.snapshot())
+        while any(patch.surface is None for patch in view.patches):
+            time.sleep(0.02)
+            view = history.add(source.snapshot())
+    for width, height in ((80, 24), (132, 43)):
+        text = as_text(screen(view, Ui("hand", "p0"), [], 1e-4, look_for("rgb"), width, height))
+        assert text.count("┌") == text.count("┘") == 2
+        alone = Ui("hand", "p0", zoomed=True)
+        text = as_text(screen(view, alone, [], 1e-4, look_for("rgb"), width, height))
+        assert text.count("┌") == text.count("┘") == 2  # depth and shear
+
+
+def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
+    hand = a_hand(2, sync={"period_ms": 50})
+    with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
+        history = History(hand)
+        ui, look = Ui("hand", "p0"), look_for("rgb")
+        begun_s = time.monotonic()
+        while time.monotonic() < begun_s + 8.0:
+            time.sleep(0.05)
+            view = history.add(source.snapshot())
+            if all(patch.level == "good" and patch.depth_m is not None for patch in view.patches):
+                break
+        well = as_text(screen(view, ui, [], 1e-4, look, 120, 40))
+        fleet.inject(Faults(lost=0.05, open_upper=1), "p0")
+        while time.monotonic() < begun_s + 20.0:
+            time.sleep(0.05)
+            view = history.add(source.snapshot())
+            patch = view.patch("p0")
+            if patch.level == "bad" and patch.lane.assembler.chunks_lost:
+                break
+        lines = screen(view, ui, [], 1e-4, look, 120, 40)
+    assert "nothing happened" in well
+    assert "nothing lost" in well
+    ill = as_text(lines)
+    assert "nothing happened" not in ill
+    assert "no event yet; faults from before: p0 faulty" in ill
+    assert "nothing lost" not in ill
+    (told,) = [segment for line in lines for segment in line if re.match(r"\d+ chunks? lost", segment.text)][
+        :1
+    ]
+    assert told.style != look.good
 
 
 def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> None:

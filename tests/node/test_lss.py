@@ -262,6 +262,22 @@ class TestFastscan:
     def test_questions_that_do_not_exist(self, frame: str) -> None:
         assert ask(LssSlave(ADDRESS, NOBODY), frame) is None
 
+    @pytest.mark.parametrize(
+        ("value", "bit", "agrees"),
+        [
+            ("60 03 00 00", 0, True),
+            ("61 03 00 00", 0, False),
+            ("7f 03 00 00", 5, True),  # 0x360 but for bits 0 to 4
+            ("5f 03 00 00", 5, False),  # less than 2⁵ away, but not the same above
+            ("ff ff ff 7f", 31, True),
+            ("60 03 00 80", 31, False),
+        ],
+    )
+    def test_bits_below_the_one_to_check_do_not_matter(self, value: str, bit: int, agrees: bool) -> None:
+        slave = LssSlave(ADDRESS, NOBODY)
+        ask(slave, "51 00 00 00 00 80 00 00")
+        assert ask(slave, f"51 {value} {bit:02x} 00 00") == ("4f 00 00 00 00 00 00 00" if agrees else None)
+
     @settings(max_examples=30, deadline=None)
     @given(st.sets(st.tuples(*[st.integers(0, 2**32 - 1)] * 4), min_size=1, max_size=5))
     def test_finds_every_slave_once(self, addresses: set[tuple[int, ...]]) -> None:

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skinnode.file_lock import FileInUse
 from skinnode.node.memory import (
     Fault,
     FileMemory,
@@ -174,6 +175,109 @@ class TestSaving:
             FileMemory(path.parent / "no" / "such.json").save(KEPT)
 
 
+class TestOthersInTheFolder:
+    """What somebody else who can write there has put in the way."""
+
+    def test_a_link_under_the_name_of_the_new_content(self, path: Path, tmp_path: Path) -> None:
+        victim = tmp_path / "victim"
+        victim.write_text("precious")
+        path.with_name(f".{path.name}.new").symlink_to(victim)
+        FileMemory(path).save(KEPT)
+        assert victim.read_text() == "precious"
+        assert FileMemory(path).load() == KEPT
+
+    def test_a_link_in_place_of_the_file(self, path: Path, tmp_path: Path) -> None:
+        victim = tmp_path / "victim"
+        victim.write_bytes(pack(KEPT))
+        path.symlink_to(victim)
+        with pytest.raises(MemoryFault, match="a symbolic link, which is not followed"):
+            FileMemory(path).load()
+        with pytest.raises(OSError, match="a symbolic link, which is not followed"):
+            FileMemory(path).save(Kept(KEPT.patch))
+        assert path.is_symlink()
+        assert victim.read_bytes() == pack(KEPT)
+
+    def test_a_link_in_place_of_the_lock(self, path: Path, tmp_path: Path) -> None:
+        victim = tmp_path / "victim"
+        victim.write_text("precious")
+        path.with_name(f".{path.name}.lock").symlink_to(victim)
+        with pytest.raises(OSError, match="symbolic link"):
+            FileMemory(path).save(KEPT)
+        assert victim.read_text() == "precious"
+
+    def test_nobody_else_may_read_it(self, path: Path) -> None:
+        kept = os.umask(0)
+        try:
+            FileMemory(path).save(KEPT)
+        finally:
+            os.umask(kept)
+        assert path.stat().st_mode & 0o777 == 0o600
+
+
+OWNER = """
+import sys
+from skinnode.node.memory import FileMemory
+
+memory = FileMemory(sys.argv[1])
+memory.claim()
+print("mine", flush=True)
+sys.stdin.read()
+"""
+
+
+class TestOneOwner:
+    def test_a_second_one_is_refused_and_damages_nothing(self, path: Path) -> None:
+        with FileMemory(path) as first:
+            first.save(KEPT)
+            second = FileMemory(path)
+            with pytest.raises(FileInUse, match=f"in use by process {os.getpid()}"):
+                second.save(Kept(KEPT.patch))
+            assert second.load() == KEPT
+        second.save(Kept(KEPT.patch))  # the first is closed
+        with pytest.raises(FileInUse):
+            first.claim()
+
+    def test_nothing_is_left_of_a_lock_that_was_released(self, path: Path) -> None:
+        with FileMemory(path):
+            assert os.listdir(path.parent) == [f".{path.name}.lock"]
+        FileMemory(path).claim()  # its end releases it as well
+        assert os.listdir(path.parent) == []
+
+    def test_an_owner_that_was_killed_is_in_nobodys_way(self, path: Path) -> None:
+        with subprocess.Popen(
+            [sys.executable, "-c", OWNER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as owner:
+            assert owner.stdout is not None
+            assert owner.stdout.readline() == "mine\n"
+            with pytest.raises(FileInUse, match=f"in use by process {owner.pid}"):
+                FileMemory(path).claim()
+            owner.kill()
+        leftover = path.with_name(f".{path.name}.0123456789abcdef.new")  # it was saving
+        leftover.touch()
+        FileMemory(path).save(KEPT)
+        assert os.listdir(path.parent) == [path.name]
+
+    def test_many_at_once(self, path: Path) -> None:
+        """Processes that claim and release as fast as they can: never two owners."""
+        script = (
+            "import os, sys\nfrom skinnode.node.memory import FileMemory\n"
+            "memory, mark, had = FileMemory(sys.argv[1]), sys.argv[1] + '.mark', 0\n"
+            "for _ in range(2000):\n"
+            "    try: memory.claim()\n"
+            "    except BlockingIOError: continue\n"
+            "    os.close(os.open(mark, os.O_CREAT | os.O_EXCL)); os.unlink(mark)\n"
+            "    memory.close(); had += 1\n"
+            "print(had)\n"
+        )
+        crowd = [
+            subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True)
+            for _ in range(3)
+        ]
+        had = [int(process.communicate(timeout=60)[0]) for process in crowd]
+        assert [process.returncode for process in crowd] == [0, 0, 0]
+        assert min(had) > 0
+
+
 WRITER = """
 import os, sys
 from skinnode.node.memory import FileMemory, Kept, Parameters
@@ -219,8 +323,10 @@ def test_killed_at_any_moment(path: Path) -> None:
             number = int(kept.baseline_ohm[0][0])
             assert kept == configuration(number)
             seen.add(number)
-            assert set(os.listdir(path.parent)) <= {path.name, f".{path.name}.new"}
+            left = set(os.listdir(path.parent)) - {path.name, f".{path.name}.lock"}
+            assert len(left) <= 1  # the next owner removes it
         nursery.stdin.close()
     assert len(seen) > 25  # they did save
     FileMemory(path).save(KEPT)
     assert FileMemory(path).load() == KEPT
+    assert not [name for name in os.listdir(path.parent) if name.startswith(".")]

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from skinnode.errors import BusError
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.od import ObjectStore
@@ -52,6 +54,23 @@ def test_shorted_lower_wire(operational) -> None:
     desk.source.ohm = broken
     assert desk.frame(0x80, "01")[0] == (0x084, "00 50 81 03 05 01 00 00")
     assert desk.read(0x2031, 2) == 1 << 5
+
+
+def test_each_word_of_wire_faults_has_32_wires(make) -> None:
+    layout = PatchLayout.preset("staggered", upper_wires=2, upper_electrodes=2, lower_wires=70)
+    ohm = np.array(resistance_ohm(layout, layout.upper_m))
+    desk = make(layout, ohm=ohm)
+    broken = ohm.copy()
+    broken[:, [0, 31, 33, 64]] = np.inf
+    broken[:, [32, 69]] = 0.0
+    desk.source.ohm = broken
+    desk.start()
+    desk.frame(0x80)
+    open_wires, shorted = (
+        [desk.read(0x2031, sub) for sub in (first, first + 2, first + 4)] for first in (1, 2)
+    )
+    assert open_wires == [1 << 31 | 1, 1 << 1, 1]
+    assert shorted == [0, 1, 1 << 69 - 64]
 
 
 SYNC_IS_OVER = (0x084, "00 00 00 40 82 00 00 00")

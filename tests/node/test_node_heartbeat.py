@@ -164,9 +164,21 @@ def test_entries_of_the_consumer(desk, value: int, answer: str) -> None:
     assert desk.read(0x1016, 2) == (value if answer.startswith("60") else 0)
 
 
-def test_there_are_four_entries(desk) -> None:
-    assert desk.read(0x1016, 0) == 4
-    assert desk.sdo("40 16 10 05 00 00 00 00") == "80 16 10 05 11 00 09 06"
+def test_there_are_eight_entries(desk) -> None:
+    assert desk.read(0x1016, 0) == 8
+    assert desk.sdo("40 16 10 09 00 00 00 00") == "80 16 10 09 11 00 09 06"
+
+
+def test_all_eight_are_watched(operational) -> None:
+    desk = operational
+    monitoring(desk, *range(11, 19))
+    for node_id in range(11, 19):
+        desk.frame(0x700 + node_id, "05")
+    desk.run(60)
+    for node_id in range(11, 18):
+        desk.frame(0x700 + node_id, "05")
+    desk.run(60)
+    assert desk.take() == [(0x084, "30 81 11 12 00 00 00 00")]
 
 
 def test_entry_that_is_rewritten_begins_anew_and_the_others_go_on(operational) -> None:

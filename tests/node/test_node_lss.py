@@ -63,7 +63,7 @@ class TestOnADesk:
         desk.run(100)
         assert {can_id for can_id, _ in desk.take()} == {0x189, 0x289}
 
-    @pytest.mark.parametrize("command", ["81 00", "82 04"])
+    @pytest.mark.parametrize("command", ["82 00", "82 04"])
     def test_another_node_id_counts_from_the_reset_on(self, desk, command: str) -> None:
         desk.frame(0x7E5, ON)
         assert desk.frame(0x7E5, "11 09 00 00 00 00 00 00") == DONE
@@ -73,6 +73,26 @@ class TestOnADesk:
         assert desk.read(0x1200, 1) == 0x609
         assert desk.read(0x1800, 1) == 0x189
         assert desk.frame(0x604, "40 00 10 00 00 00 00 00") == []
+
+    @pytest.mark.parametrize("kept", [None, 9])
+    def test_reset_node_takes_the_stored_node_id(self, make: Callable, kept: int | None) -> None:
+        """The persistent node-ID becomes the pending one; what was configured and never stored is lost."""
+        desk = make(memory=VolatileMemory())
+        desk.frame(0x7E5, ON)
+        if kept is not None:
+            desk.frame(0x7E5, f"11 {kept:02x} 00 00 00 00 00 00")
+            assert desk.frame(0x7E5, "17 00 00 00 00 00 00 00") == [(0x7E4, "17 00 00 00 00 00 00 00")]
+        desk.frame(0x7E5, "11 0a 00 00 00 00 00 00")
+        desk.frame(0x7E5, OFF)
+        booted = kept or 4
+        assert (0x700 + booted, "00") in desk.frame(0, "81 00")
+        assert desk.frame(0, "82 00") == [(0x700 + booted, "00")]  # nothing is pending any more
+
+    def test_reset_node_after_reset_communication_takes_the_stored_node_id(self, desk) -> None:
+        desk.frame(0x7E5, ON)
+        desk.frame(0x7E5, "11 0a 00 00 00 00 00 00")
+        assert desk.frame(0, "82 00") == [(0x70A, "00")]
+        assert desk.frame(0, "81 00") == [(0x704, "00")]
 
     def test_a_node_id_can_be_taken_away(self, desk) -> None:
         desk.frame(0x7E5, ON)
@@ -232,10 +252,23 @@ class TestTwoNodesWithOneId:
         assert desk.frame(0x704, "00") == [(0x084, "50 81 11 04 07 00 00 00")]
         assert desk.frame(0x704, "05") == []
         assert desk.node.nmt_state is NmtState.PRE_OPERATIONAL
-        assert desk.read(0x1001, 0) == 0x11  # for as long as nobody resets the node
+        assert desk.read(0x1001, 0) == 0x11
         desk.frame(0, "82 00")
         assert desk.read(0x1001, 0) == 0
         assert desk.frame(0x704, "7f") == [(0x084, "50 81 11 04 07 00 00 00")]
+
+    @pytest.mark.parametrize("period_ms", [0, 100, 250])
+    def test_it_is_over_after_three_heartbeat_periods_without(self, desk, period_ms: int) -> None:
+        desk.write(0x1017, 0, period_ms, 2)
+        for _ in range(4):
+            desk.frame(0x704, "05")
+            desk.run(2.9 * (period_ms or 250))
+        assert desk.read(0x1001, 0) == 0x11
+        desk.take()
+        desk.run(0.2 * (period_ms or 250))
+        assert (0x084, "00 00 00 50 81 00 00 00") in desk.take()
+        assert desk.read(0x1001, 0) == 0
+        assert desk.frame(0x704, "05")[-1:] == [(0x084, "50 81 11 04 07 00 00 00")]  # it is there again
 
     def test_guarding_and_others_are_no_collision(self, desk) -> None:
         desk.frame(0x704, remote=True)
@@ -292,7 +325,7 @@ def test_canopen_library_finds_and_numbers_new_nodes(
         with NodeRunner(port, [old, *new]):
             eventually(lambda: 1 in network.scanner.nodes)
             for node_id, serial in ((20, 0x2), (21, 0x8000_0001)):
-                assert lss.fast_scan() == (True, [0, 0x534B494E, 0x10000, serial])
+                assert lss.fast_scan() == (True, [0, 0x534B494E, 0x10001, serial])
                 assert lss.inquire_node_id() == NOT_CONFIGURED
                 assert lss.inquire_lss_address(canopen.lss.CS_INQUIRE_SERIAL_NUMBER) == serial
                 lss.configure_node_id(node_id)
@@ -323,7 +356,7 @@ def test_canopen_library_configures_one_of_two(
         ]
         with NodeRunner(port, nodes):
             eventually(lambda: {4, 5} <= set(network.scanner.nodes))
-            assert lss.send_switch_state_selective(0, 0x534B494E, 0x10000, 0x105)
+            assert lss.send_switch_state_selective(0, 0x534B494E, 0x10001, 0x105)
             assert lss.inquire_node_id() == 5
             with pytest.raises(canopen.lss.LssError, match="LSS Error: 1"):
                 lss.configure_node_id(128)
@@ -335,7 +368,7 @@ def test_canopen_library_configures_one_of_two(
             network.nmt.send_command(130)  # reset communication
             eventually(lambda: [node.node_id for node in nodes] == [4, 50])
             with pytest.raises(canopen.lss.LssError, match="No LSS response"):
-                lss.send_switch_state_selective(0, 0x534B494E, 0x10000, 0x106)
+                lss.send_switch_state_selective(0, 0x534B494E, 0x10001, 0x106)
             lss.send_switch_state_global(lss.CONFIGURATION_STATE)
             assert lss.inquire_node_id() in (4, 50)  # both answer, as after any global switch
             lss.send_switch_state_global(lss.WAITING_STATE)
@@ -365,7 +398,7 @@ def test_commissioning_with_python_can_alone(bus: BusConfig, layout: PatchLayout
             assert master.recv(0.0) is None  # it says nothing until it is asked
             send(0x7E5, "4c")
             assert receive() == (0x7E4, "50 00 00 00 00 00 00 00")
-            for question in ("40", "41 4e 49 4b 53", "42 00 00 01", "43 07"):
+            for question in ("40", "41 4e 49 4b 53", "42 01 00 01", "43 07"):
                 send(0x7E5, question)
             assert receive() == (0x7E4, "44 00 00 00 00 00 00 00")
             send(0x7E5, "11 2a")

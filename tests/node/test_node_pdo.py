@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from skinnode.model.layout import PatchLayout
 from skinnode.node import VolatileMemory
+from skinnode.node.od import ObjectStore
+from skinnode.node.pdo import PdoRecords
 from skinnode.wire.profile import PatchProfile, eds_text
 
 REGISTER, COUNTER, TIME, CODE = 0x1001_0008, 0x2011_0108, 0x2011_0420, 0x2100_0110
@@ -48,6 +50,12 @@ class TestBothWays:
 
     def test_on_only_with_something_mapped(self, desk, parameter: int, cob_id: int) -> None:
         assert download(desk, parameter, 1, cob_id, 4) == ABORTS["value"]
+
+    def test_an_entry_is_not_mapped_before_the_count_says_so(self, desk, parameter: int, cob_id: int) -> None:
+        desk.write(parameter + 0x200, 1, REGISTER if parameter >= 0x1800 else MODE, 4)
+        assert download(desk, parameter, 1, cob_id, 4) == ABORTS["value"]
+        desk.write(parameter + 0x200, 0, 1, 1)
+        assert download(desk, parameter, 1, cob_id, 4) == ""
 
     def test_mapping_while_on(self, desk, parameter: int, cob_id: int) -> None:
         entry = REGISTER if parameter >= 0x1800 else MODE
@@ -133,6 +141,16 @@ def test_inhibit_time_and_start_value_only_while_off(desk, subindex: int, size: 
     assert download(desk, 0x1802, 4, 1, 1) == ABORTS["no sub-index"]  # reserved
     desk.write(0x1802, 1, 0x8000_0384, 4)
     desk.write(0x1802, subindex, 1, size)
+
+
+def test_what_an_rpdo_does_not_have_reads_as_zero() -> None:
+    """0x1400 has neither an inhibit time nor a SYNC start value (CiA 301 v4.2, 7.5.2.35)."""
+    store = ObjectStore(PatchProfile(2, 6, 2, 1).objects(), 4)
+    rpdo = PdoRecords(store, 0x1400, 0x1600, transmits=False).read()
+    assert not store.has(0x1400, 3)
+    assert not store.has(0x1400, 6)
+    assert (rpdo.inhibit_ns, rpdo.sync_start) == (0, 0)
+    assert (rpdo.enabled, rpdo.cob_id, rpdo.kind, rpdo.size) == (True, 0x204, 255, 6)
 
 
 class TestCanFd:

@@ -16,7 +16,9 @@ from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, NodeRunner, PatchNode
+from skinnode.node.clock import THRIFTY
 from skinnode.transport import CanPort
+from skinnode.transport.frame import Frame
 from skinnode.wire.profile import PatchProfile, eds_text
 
 WAIT_S = 5.0
@@ -284,7 +286,7 @@ def test_a_node_survives_its_source(virtual: BusConfig, layout: PatchLayout) -> 
             send(0x000, "01 00")
             send(0x080, "")
             (summary,) = collect(manager, lambda ms: len(ms) == 1)
-            assert (summary.arbitration_id, bytes(summary.data)[1:4]) == (0x284, b"\x10\0\0")
+            assert (summary.arbitration_id, bytes(summary.data)[1:4]) == (0x284, b"\x30\0\0")
             source.error = None
             send(0x080, "")
             frames = collect(manager, lambda ms: bool(ms) and ms[-1].arbitration_id == 0x284)
@@ -343,6 +345,80 @@ def test_bus_that_goes_away_and_comes_back(virtual: BusConfig, layout: PatchLayo
             eventually(lambda: (0x084, "40 81 11 00 00 00 00 00") in heard())
             manager.send(0x000, bytes((1, 0)))
             eventually(lambda: (0x704, "05") in heard())
+
+
+def test_two_short_faults_far_apart_are_not_a_bus_that_is_off(
+    virtual: BusConfig, layout: PatchLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames that got through in between end the first fault, however many the node has heard by then."""
+    monkeypatch.setattr("skinnode.node.runner.OFF_AFTER_S", 0.3)
+    with CanPort(virtual) as port, CanPort(virtual) as manager:
+        refused: list[bytes] = []
+        refuse = threading.Event()
+
+        def send(can_id: int, data: bytes) -> None:
+            if refuse.is_set():
+                refuse.clear()
+                refused.append(data)
+                raise BusError("can0: no buffer space available")
+            port.send(can_id, data)
+
+        def ask(times: int) -> None:
+            for _ in range(times):
+                manager.send(0x604, bytes.fromhex("4000100000000000"))
+
+        def answered(times: int) -> None:
+            for _ in range(times):
+                frame = manager.recv(WAIT_S)
+                assert frame is not None
+                assert frame.can_id == 0x584
+
+        node = PatchNode(4, layout, Steady(layout), send=send)
+        with NodeRunner(port, [node]) as runner:
+            boot_up = manager.recv(WAIT_S)
+            assert boot_up is not None
+            assert boot_up.can_id == 0x704
+            manager.send(0x000, bytes((1, 0)))
+            for _ in range(3):
+                manager.send(0x7F0, b"")  # heard, and not answered
+            refuse.set()
+            ask(1)
+            eventually(lambda: len(refused) == 1)
+            ask(2)
+            answered(2)
+            time.sleep(0.4)  # longer than a bus that is off takes to be called that
+            refuse.set()
+            ask(1)
+            eventually(lambda: len(refused) == 2)
+            ask(1)
+            answered(1)
+            assert runner.bus_errors == 2
+            assert node.nmt_state is NmtState.OPERATIONAL
+            assert manager.recv(0.05) is None  # no emergency
+
+
+def test_the_thread_waits_for_its_timers_and_does_not_turn_idly(
+    virtual: BusConfig, layout: PatchLayout
+) -> None:
+    """Beats of 10 ms of a thrifty node: the thread wakes once for each, up to 2 ms late, and never early."""
+    turns: list[None] = []
+
+    class Counted(CanPort):
+        def recv(self, timeout_s: float) -> Frame | None:
+            turns.append(None)
+            return super().recv(timeout_s)
+
+    with Counted(virtual) as port, CanPort(virtual) as manager:
+        node = PatchNode(4, layout, Steady(layout), send=port.send, pacing=THRIFTY)
+        with NodeRunner(port, [node]):
+            manager.send(0x604, bytes.fromhex("2b1710000a000000"))
+            beats = 0
+            end_s = time.monotonic() + WAIT_S
+            while beats < 30:
+                frame = manager.recv(0.1)
+                beats += frame is not None and (frame.can_id, frame.data) == (0x704, b"\x7f")
+                assert time.monotonic() < end_s
+        assert len(turns) < 3 * beats + 10
 
 
 @pytest.mark.parametrize("heartbeat", ["05 00", "c8 00"])  # 5 ms; 200 ms, with turns of nothing between

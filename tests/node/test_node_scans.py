@@ -10,9 +10,11 @@ import pytest
 
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
-from skinnode.node import Pacing
+from skinnode.node import THRIFTY, Pacing
 from skinnode.wire.codec import CodeScale, encode
 from skinnode.wire.profile import PatchProfile
+
+from ..scan_crc import check_of_scan
 
 CHUNK, SUMMARY, EMCY = 0x184, 0x284, 0x084
 STEPS = 65532  # 2**16 - 4
@@ -45,7 +47,13 @@ def test_scan_at_sync_bit_by_bit(operational) -> None:
         (CHUNK, struct.pack("<BB3H", index, 0x11, *codes[3 * index : 3 * index + 3]).hex(" "))
         for index in range(4)
     ]
-    expected.append((SUMMARY, struct.pack("<BBHI", 0x11, 0, 4, t_us).hex(" ")))
+    head = struct.pack("<BBHH", 0x11, 0x20, 4, t_us >> 6 & 0xFFFF)  # CHECKED, time in steps of 64 µs
+    sent = [code for chunk in codes_of(frames).values() for code in chunk]
+    expected.append((SUMMARY, (head + struct.pack("<H", check_of_scan(sent, 16, head))).hex(" ")))
+    assert [desk.read(0x2011, sub) for sub in range(1, 7)] == [
+        *(0x11, 0x20, 4, t_us, t_us >> 6 & 0xFFFF),
+        check_of_scan(sent, 16, head),
+    ]
     # R0 is kept as REAL32 and R/R0 may round to the neighbouring code: compare within one step.
     assert [frame[0] for frame in frames] == [frame[0] for frame in expected]
     assert frames[-1] == expected[-1]
@@ -183,7 +191,8 @@ def test_scan_in_progress_is_finished_before_the_next(operational) -> None:
     numbers = [int(data[3:5] if can_id == CHUNK else data[:2], 16) for can_id, data in frames]
     assert numbers == [1] * 5 + [2] * 5
     assert abs(codes_of(frames[5:])[0][0] - round(0.25 * STEPS)) <= 1
-    assert struct.unpack("<I", bytes.fromhex(frames[-1][1])[4:]) == (second_us,)
+    assert struct.unpack("<H", bytes.fromhex(frames[-1][1])[4:6]) == (second_us >> 6 & 0xFFFF,)
+    assert desk.read(0x2011, 4) == second_us
     assert desk.node.overruns == 0
 
 
@@ -202,6 +211,52 @@ def test_overrun_skips_scans_and_says_so(operational) -> None:
     for counter in (6, 7, 8):
         desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
     assert (EMCY, "10 81 11 03 00 00 00 00") in desk.take()  # told again, the third in all
+
+
+def test_a_thread_with_a_coarse_timer_keeps_pace_and_an_overrun_ends(make: Callable) -> None:
+    """100 ticks a second: the thread wakes at the second tick after what it waited for, now and then two
+    ticks later still. Chunks are paced to take 80 % of the SYNC period, as the host sets it."""
+    desk = make(pacing=THRIFTY)
+    desk.write(0x1019, 0, 240, 1)
+    desk.write(0x1800, 1, 0x80000184, 4)
+    desk.write(0x1800, 3, 160, 2)  # 5 frames in 80 ms
+    desk.write(0x1800, 1, 0x184, 4)
+    desk.start()
+    desk.take()
+    tick_ns, period_ns = 10_000_000, 100_000_000
+    begin_ns, wakings = desk.t_ns, 0
+    for sync in range(50):
+        end_ns = begin_ns + (sync + 1) * period_ns
+        desk.node.on_frame(0x80, bytes((sync + 1,)), desk.t_ns)
+        stalled = sync in (10, 11, 12)  # the thread does not run at all: an overrun in earnest
+        while not stalled and (due_ns := desk.node.next_deadline_ns()) is not None:
+            wakings += 1
+            late = 2 if wakings % 5 else 4
+            woken_ns = (max(due_ns, desk.t_ns) // tick_ns + late) * tick_ns
+            if woken_ns >= end_ns:
+                break
+            desk.t_ns = woken_ns
+            desk.node.on_timer(desk.t_ns)
+        desk.t_ns = end_ns
+    emergencies = [(t_ns, data[:2]) for can_id, data, t_ns in desk.sent if can_id == EMCY]
+    assert [code.hex() for _, code in emergencies] == ["1081", "0000"]
+    assert emergencies[1][0] < begin_ns + 13 * period_ns + 1_000_000_000
+    assert desk.node.overruns <= 3  # those of the stall
+
+
+def test_an_overrun_of_a_slow_computer_says_so(operational) -> None:
+    """SYNCs that come in time, and a thread that does not."""
+    desk = operational
+    for counter in (1, 2, 3):
+        desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
+        desk.t_ns += 50_000_000  # nobody drives the node meanwhile
+    assert [data for can_id, data in desk.take() if can_id == EMCY] == ["10 81 11 01 00 01 00 00"]
+    assert (desk.node.overruns, desk.node.slow_overruns) == (1, 1)
+    desk.run(200)
+    for counter in (4, 5, 6):
+        desk.node.on_frame(0x80, bytes((counter,)), desk.t_ns)
+        desk.run(0.1)  # in time, but a scan takes longer than that
+    assert (desk.node.overruns, desk.node.slow_overruns) == (2, 1)
 
 
 @pytest.mark.parametrize(("command", "told_at_once"), [("80 00", True), ("02 00", False)])
@@ -240,8 +295,8 @@ def test_disabling_the_chunk_pdo_under_way_is_told_by_the_summary(operational) -
     desk.run(5)
     frames = desk.take()
     assert [can_id for can_id, _ in frames] == [0x584, SUMMARY]
-    assert frames[1][1][:11] == "01 02 02 00"  # OVERRUN: chunks left out; two were sent
-    assert desk.frame(0x80, "02")[-1][1][:11] == "02 02 00 00"
+    assert frames[1][1][:11] == "01 22 02 00"  # OVERRUN: chunks left out; two were sent
+    assert desk.frame(0x80, "02")[-1][1][:11] == "02 22 00 00"
     desk.write(0x1800, 1, 0x184, 4)
     frames = scan(desk, "03")
     assert [data[:5] for can_id, data in frames if can_id == CHUNK] == ["00 03", "01 03", "02 03", "03 03"]
@@ -260,14 +315,14 @@ class TestChangedOnly:
         assert len(scan(desk, "01")) == 5
         frames = scan(desk, "02")
         assert len(frames) == 1
-        assert frames[0][1][:11] == "02 01 00 00"  # CHANGED_ONLY, no chunk
+        assert frames[0][1][:11] == "02 21 00 00"  # CHANGED_ONLY, no chunk
         ohm = desk.source.ohm.copy()
         ohm[1, 0] *= 1 - 11.5 / STEPS  # chunk 2, more than ten codes
         ohm[0, 0] *= 1 - 8.5 / STEPS
         desk.source.ohm = ohm
         frames = scan(desk, "03")
         assert list(codes_of(frames)) == [2]
-        assert frames[-1][1][:11] == "03 01 01 00"
+        assert frames[-1][1][:11] == "03 21 01 00"
 
     def test_slow_drift_is_measured_from_what_was_sent(self, changed) -> None:
         desk = changed
@@ -338,8 +393,8 @@ class TestTare:
             assert desk.frame(0x204, "74 61 72 65 00 00") == []
         frames = scan(desk, "01")
         assert all(abs(code - REST) <= 1 for codes in codes_of(frames).values() for code in codes)
-        assert frames[-1][1][:5] == "01 08"  # BASELINE_CHANGED
-        assert scan(desk, "02")[-1][1][:5] == "02 00"
+        assert frames[-1][1][:5] == "01 28"  # BASELINE_CHANGED
+        assert scan(desk, "02")[-1][1][:5] == "02 20"
 
     def test_open_wires_keep_the_baseline_they_have(self, operational, rest_ohm) -> None:
         desk = operational
@@ -361,7 +416,7 @@ class TestTare:
         desk.write(0x2200, 1, pattern, 4)
         frames = scan(desk, "01")
         assert abs(codes_of(frames)[0][0] - round(0.25 * STEPS)) <= 1
-        assert frames[-1][1][:5] == "01 08"  # BASELINE_CHANGED
+        assert frames[-1][1][:5] == "01 28"  # BASELINE_CHANGED
 
     def test_survives_a_power_cycle(self, operational, rest_ohm) -> None:
         desk = operational
@@ -620,7 +675,7 @@ class TestCanFd:
         fd.source.ohm = rest_ohm.copy()
         fd.source.ohm[1, 2] *= 0.9
         frames = scan(fd, "")
-        assert [data[:11] for _, data in frames] == ["01 01 00 00", "01 01 01 00"]
+        assert [data[:11] for _, data in frames] == ["01 01 00 00", "01 21 01 00"]
 
     def test_up_to_64_bytes_are_mapped(self, fd) -> None:
         fd.write(0x1801, 1, 0x80000284, 4)

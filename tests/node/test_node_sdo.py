@@ -114,7 +114,6 @@ def test_download_in_two_segments_toggles(desk) -> None:
         ("2f 19 10 00 01 00 00 00", "value"),  # 0 or 2 to 240
         ("2f 19 10 00 f1 00 00 00", "too high"),
         ("2f 03 10 00 01 00 00 00", "value"),  # only 0 clears the error history
-        ("23 05 10 00 80 00 00 80", "value"),  # bit 31 means nothing here
         ("23 06 10 00 63 00 00 00", "too low"),  # SYNC every 99 µs
         ("23 05 10 00 80 00 00 20", "value"),  # no extended identifiers
         ("23 05 10 00 01 06 00 00", "value"),  # an SDO's identifier

@@ -430,13 +430,13 @@ def test_baseline_written_whole_counts_from_the_next_scan_on(desk) -> None:
         return [code for chunk in codes for code in chunk], [d for i, d in frames if i == 0x284][-1][3:5]
 
     desk.start()
-    assert scan() == ([49149] * 12, "00")  # (R/R0 − 0.25) · 65532
+    assert scan() == ([49149] * 12, "20")  # (R/R0 − 0.25) · 65532
     doubled = struct.pack("<12f", *(2 * desk.source.ohm).ravel())
     assert desk.sdo("21 01 23 00 30 00 00 00") == "60 01 23 00 00 00 00 00"
     for number in range(7):
         part = doubled[number * 7 : number * 7 + 7]
         desk.sdo(segment((number & 1) << 4 | (7 - len(part)) << 1 | (number == 6), part))
-    assert scan() == ([16383] * 12, "08")  # BASELINE_CHANGED
+    assert scan() == ([16383] * 12, "28")  # BASELINE_CHANGED
 
 
 def test_baseline_is_read_whole(desk) -> None:

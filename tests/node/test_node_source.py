@@ -10,6 +10,8 @@ import pytest
 
 from skinnode.model.layout import Float
 
+from ..scan_crc import check_of_scan
+
 CHUNK, SUMMARY, EMCY = 0x184, 0x284, 0x084
 
 
@@ -45,10 +47,12 @@ def scan(desk, counter: int) -> list[tuple[int, str]]:
 def test_a_failing_source_is_told_once_and_each_scan_says_that_it_is_empty(failing) -> None:
     failing.failing.error = OSError("the converter\n is gone")
     t_us = failing.t_ns // 1000
+    codes = [failing.read(0x2100 + row, sub) for row in range(2) for sub in range(1, 7)]
+    head = struct.pack("<BBHH", 1, 0x30, 0, t_us >> 6 & 0xFFFF)  # CHECKED, SOURCE_FAILED, no chunk
     frames = scan(failing, 1)
     assert frames == [
         (EMCY, "00 ff 81 01 01 00 00 00"),  # 0xFF00, manufacturer's error, raised, the first
-        (SUMMARY, struct.pack("<BBHI", 1, 0x10, 0, t_us).hex(" ")),  # SOURCE_FAILED, no chunk
+        (SUMMARY, (head + struct.pack("<H", check_of_scan(codes, 16, head))).hex(" ")),
     ]
     assert [can_id for can_id, _ in scan(failing, 2)] == [SUMMARY]
     assert failing.read(0x1001, 0) == 0x81
@@ -59,7 +63,7 @@ def test_a_failing_source_is_told_once_and_each_scan_says_that_it_is_empty(faili
     frames = scan(failing, 3)
     assert frames[0] == (EMCY, "00 00 00 00 ff 00 00 00")
     assert [can_id for can_id, _ in frames[1:]] == [CHUNK] * 4 + [SUMMARY]
-    assert frames[-1][1][:5] == "03 00"
+    assert frames[-1][1][:5] == "03 20"
     assert failing.read(0x1001, 0) == 0
 
 
@@ -153,7 +157,7 @@ def test_tare_is_made_up_for_if_the_source_was_not_there_at_power_on(make: Calla
     desk.node.on_frame(0x80, b"", desk.t_ns)
     desk.run(50)
     frames = desk.take()
-    assert frames[-1][1][3:5] == "08"  # BASELINE_CHANGED
+    assert frames[-1][1][3:5] == "28"  # BASELINE_CHANGED
     assert desk.read(0x1001, 0) == 0
     (first,) = struct.unpack("<H", bytes.fromhex(next(d for c, d in frames if c == CHUNK))[2:4])
     assert abs(first - round(0.75 * 65532)) <= 1

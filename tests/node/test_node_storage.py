@@ -91,6 +91,17 @@ def test_groups(desk, subindex: int, communication: int, application: int) -> No
     assert desk.read(0x2020, 2) == application
 
 
+@pytest.mark.parametrize("change", ["an entry", "the count"])
+def test_a_mapping_changed_in_one_place_only_survives(desk, change: str) -> None:
+    """Either the entries or their count are those of the default."""
+    entries = [desk.read(0x1A01, sub) for sub in range(1, desk.read(0x1A01, 0) + 1)]
+    wanted = [0x1001_0008, *entries[1:]] if change == "an entry" else entries[:2]
+    desk.configure_pdo(0x1801, *wanted, cob_id=0x284)
+    desk.write(0x1010, 1, SAVE, 4)
+    cycle(desk)
+    assert [desk.read(0x1A01, sub) for sub in range(1, desk.read(0x1A01, 0) + 1)] == wanted
+
+
 def test_without_saving_nothing_survives(desk) -> None:
     desk.write(0x2020, 2, 77, 2)
     cycle(desk)
@@ -350,8 +361,12 @@ class TestBaseline:
         memory.broken = True
         desk.source.ohm = desk.source.ohm / 2
         frames = desk.frame(0x604, "23 21 20 04 74 61 72 65")
-        assert emergencies(frames) == ["00 63 81 05 00 00 00 00", OVER]
+        assert emergencies(frames) == ["00 63 81 05 00 00 00 00"]
         assert (0x584, "60 21 20 04 00 00 00 00") in frames  # the tare itself was done
+        assert desk.read(0x1001, 0) == 0x81
+        memory.broken = False
+        assert emergencies(desk.frame(0x604, "23 21 20 04 74 61 72 65")) == [OVER]
+        assert desk.read(0x1001, 0) == 0
 
     @pytest.mark.parametrize("rows", [((1.0,) * 6,), ((1.0,) * 6, (1.0,)), ((float("nan"),) * 6,) * 2])
     def test_of_no_use_is_taken_anew(self, desk, memory: Breakable, rows) -> None:
@@ -440,9 +455,10 @@ class TestVerifyConfiguration:
 
 class TestFilesOfNoUse:
     def save(self, make: Callable, path: Path) -> None:
-        desk = make(memory=FileMemory(path))
-        desk.write(0x2020, 2, 77, 2)
-        desk.write(0x1010, 1, SAVE, 4)
+        with FileMemory(path) as memory:
+            desk = make(memory=memory)
+            desk.write(0x2020, 2, 77, 2)
+            desk.write(0x1010, 1, SAVE, 4)
 
     def start(self, desk_type, layout, path: Path):
         desk = desk_type(layout, memory=FileMemory(path))
@@ -458,13 +474,29 @@ class TestFilesOfNoUse:
         again = self.start(type(desk), desk.layout, path)
         frames = again.take()
         assert frames[0] == (0x704, "00")
-        assert emergencies(frames) == ["00 63 81 02 00 00 00 00", OVER]
+        assert emergencies(frames) == ["00 63 81 02 00 00 00 00"]
+        assert again.read(0x1001, 0) == 0x81
         assert again.read(0x2020, 2) == 2
         assert again.read(0x1003, 1) == 0x0002_6300
         # Its tare went to a new file; what could be read of the old one is still there for people.
         (aside,) = tmp_path.glob("n.unused-*")
         assert aside.read_bytes() == damaged
+        for reset in ("81 00", "82 00"):  # the parameters are still not those that were stored
+            assert emergencies(again.frame(0, reset)) == ["00 63 81 02 00 00 00 00"]
+            assert again.read(0x1001, 0) == 0x81
         assert emergencies(cycle(again)) == []
+        assert again.read(0x1001, 0) == 0
+
+    @pytest.mark.parametrize("command", ["23 10 10 01 73 61 76 65", "23 11 10 02 6c 6f 61 64"])
+    def test_damage_is_over_when_parameters_are_stored_or_restored(
+        self, make: Callable, tmp_path: Path, command: str
+    ) -> None:
+        path = tmp_path / "n"
+        path.write_bytes(b"{}")
+        desk = make(memory=FileMemory(path))
+        assert desk.read(0x1001, 0) == 0x81
+        assert emergencies(desk.frame(0x604, command)) == [OVER]
+        assert desk.read(0x1001, 0) == 0
 
     def test_of_another_patch(self, make: Callable, layout, tmp_path: Path) -> None:
         path = tmp_path / "n"
@@ -473,7 +505,7 @@ class TestFilesOfNoUse:
         desk_type = type(make())
         moved = type(layout)(layout.upper_m * 1.01, layout.lower_m, layout.resistivity_ohm_per_m)
         foreign = self.start(desk_type, moved, path)
-        assert emergencies(foreign.take()) == ["00 63 81 03 00 00 00 00", OVER]
+        assert emergencies(foreign.take()) == ["00 63 81 03 00 00 00 00"]
         assert foreign.read(0x2020, 2) == 2
         (aside,) = tmp_path.glob("n.unused-*")
         assert aside.read_bytes() == good
@@ -482,8 +514,6 @@ class TestFilesOfNoUse:
         desk = self.start(type(make()), layout, tmp_path)  # a folder
         assert emergencies(desk.take()) == [
             "00 63 81 01 00 00 00 00",
-            OVER,
             "00 63 81 05 00 00 00 00",
-            OVER,
         ]
         assert desk.sdo("23 10 10 01 73 61 76 65") == f"80 10 10 01 {HARDWARE}"

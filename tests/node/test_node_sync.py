@@ -1,8 +1,11 @@
-"""SYNC, consumed and produced: raw bytes and times of CiA 301 v4.2, 7.2.5, 7.5.2.5, 7.5.2.6 and 7.5.2.22."""
+"""SYNC, consumed and produced: raw bytes and times of CiA 301 v4.2, 7.2.5, 7.5.2.5 to 7.5.2.7, 7.5.2.22."""
 
 from __future__ import annotations
 
 import pytest
+
+from skinnode.node import VolatileMemory
+from skinnode.wire.codec import SummaryFlag
 
 SYNC, PDO = 0x080, 0x384
 PRODUCE = 0x4000_0080
@@ -128,10 +131,19 @@ class TestObjects:
         assert desk.sdo("23 05 10 00 81 00 00 40") == "80 05 10 00 30 00 09 06"
         desk.write(0x1005, 0, 0x81, 4)  # no producer any more: that may be
 
-    @pytest.mark.parametrize("value", [0x8000_0080, 0x2000_0080, 0x880, 0x000, 0x101, 0x4000_0601, 0x704])
+    @pytest.mark.parametrize("value", [0x8000_0101, 0x2000_0080, 0x880, 0x000, 0x101, 0x4000_0601, 0x704])
     def test_identifiers_refused(self, desk, value: int) -> None:
         answer = desk.sdo((b"\x23\x05\x10\x00" + value.to_bytes(4, "little")).hex())
         assert answer == "80 05 10 00 30 00 09 06"
+
+    @pytest.mark.parametrize("value", [0x8000_0080, 0xC000_0080, 0x8000_00A0])
+    def test_bit_31_means_nothing(self, desk, value: int) -> None:
+        """Not "invalid", as in other COB-IDs: old tools set it for a consumer (CiA 301 v4.2, 7.5.2.5)."""
+        desk.write(0x1006, 0, 10_000, 4)
+        desk.write(0x1005, 0, value, 4)
+        assert desk.read(0x1005, 0) == value
+        desk.run(10)
+        assert syncs(desk) == ([(SYNC, b"")] if value >> 30 & 1 else [])
 
     @pytest.mark.parametrize(
         ("value", "code"), [(1, "30 00 09 06"), (241, "31 00 09 06"), (255, "31 00 09 06")]
@@ -174,3 +186,96 @@ class TestConsumer:
 
     def test_a_remote_frame_is_no_sync(self, cyclic) -> None:
         assert cyclic.frame(SYNC, remote=True) == []
+
+
+class TestWindow:
+    """0x1007, µs after the SYNC (CiA 301 v4.2, 7.5.2.7): synchronous PDOs travel within it or not at all."""
+
+    LATE = (0x084, "00 82 11 02 00 00 00 00")
+    IN_TIME_AGAIN = (0x084, "00 00 00 00 82 00 00 00")
+
+    @pytest.fixture
+    def windowed(self, operational):
+        """Scans of four chunks, 0.5 ms apart: the synchronous summary follows 1.5 ms after SYNC."""
+        operational.write(0x1007, 0, 1000, 4)
+        return operational
+
+    def summaries(self, desk) -> list[str]:
+        return [data for can_id, data in desk.take() if can_id == 0x284]
+
+    def test_there_is_none_by_default(self, operational) -> None:
+        assert operational.read(0x1007, 0) == 0
+        operational.node.on_frame(SYNC, b"\x01", operational.t_ns)
+        operational.run(10)
+        assert len(self.summaries(operational)) == 1
+
+    def test_a_tpdo_that_is_late_is_discarded_and_told_once(self, windowed) -> None:
+        desk = windowed
+        frames = desk.frame(SYNC, "01")
+        desk.run(10)
+        frames += desk.take()
+        assert [can_id for can_id, _ in frames] == [0x184] * 4 + [0x084]  # event-driven chunks know no window
+        assert frames[-1] == self.LATE
+        assert desk.read(0x1001, 0) == 0x11
+        desk.frame(SYNC, "02")
+        desk.run(10)
+        assert {can_id for can_id, _ in desk.take()} == {0x184}
+        desk.write(0x1007, 0, 1500, 4)
+        desk.frame(SYNC, "03")
+        desk.run(10)
+        frames = desk.take()
+        assert next(frame for frame in frames if frame[0] != 0x184) == self.IN_TIME_AGAIN
+        assert frames[-1] == (0x284, frames[-1][1])
+        assert frames[-1][1][:2] == "03"
+        assert desk.read(0x1001, 0) == 0
+
+    def test_synchronous_chunks_end_with_it_and_the_summary_says_so(self, windowed) -> None:
+        desk = windowed
+        desk.write(0x1800, 1, 0x80000184, 4)
+        desk.write(0x1800, 2, 1, 1)
+        desk.write(0x1800, 1, 0x184, 4)
+        desk.write(0x1801, 1, 0x80000284, 4)
+        desk.write(0x1801, 2, 254, 1)
+        desk.write(0x1801, 1, 0x284, 4)
+        frames = desk.frame(SYNC, "01")
+        desk.run(10)
+        frames += desk.take()
+        assert [can_id for can_id, _ in frames] == [0x184] * 3 + [0x084, 0x284]  # at 0, 0.5 and 1 ms
+        summary = bytes.fromhex(frames[-1][1])
+        assert (SummaryFlag.OVERRUN in SummaryFlag(summary[1]), summary[2]) == (True, 3)
+
+    def test_leaving_operational_ends_the_error(self, windowed) -> None:
+        windowed.node.on_frame(SYNC, b"\x01", windowed.t_ns)
+        windowed.run(10)
+        windowed.take()
+        assert windowed.frame(0, "80 00") == [self.IN_TIME_AGAIN]
+
+    def test_an_rpdo_that_is_late_is_discarded_until_the_next_sync(self, windowed) -> None:
+        desk = windowed
+        desk.configure_pdo(0x1400, 0x2020_0108, cob_id=0x204, kind=1)
+
+        def mode_after(*, late_by_ms: float, mode: int) -> int:
+            desk.frame(SYNC, "01")
+            desk.run(late_by_ms)
+            desk.frame(0x204, f"{mode:02x}")
+            desk.run(20)
+            desk.frame(SYNC, "02")
+            desk.run(20)
+            return desk.read(0x2020, 1)
+
+        desk.frame(0x204, "01")  # before the first SYNC none is late
+        desk.frame(SYNC, "01")
+        desk.run(20)
+        assert desk.read(0x2020, 1) == 1
+        assert mode_after(late_by_ms=1.1, mode=0) == 1
+        assert mode_after(late_by_ms=0.9, mode=0) == 0
+
+    def test_it_is_stored_and_restored(self, make) -> None:
+        desk = make(memory=VolatileMemory())
+        desk.write(0x1007, 0, 5000, 4)
+        desk.write(0x1010, 2, 0x65766173, 4)
+        desk.frame(0, "81 00")
+        assert desk.read(0x1007, 0) == 5000
+        desk.write(0x1011, 2, 0x64616F6C, 4)
+        desk.frame(0, "81 00")
+        assert desk.read(0x1007, 0) == 0

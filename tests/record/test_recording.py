@@ -240,13 +240,33 @@ def test_a_recording_without_a_field_is_a_fault_and_stays(tmp_path: Path) -> Non
     assert list(replay(path)) == []
 
 
+def test_a_folder_that_is_not_there_is_made(tmp_path: Path) -> None:
+    hand, folder = tmp_path / "hand.toml", tmp_path / "runs" / "today"
+    hand.write_text(HAND)
+    done = CliRunner().invoke(app, ["record", str(hand), "-o", str(folder), "--listen", "--seconds", "0.1"])
+    assert done.exit_code == 0, done.output
+    assert sorted(file.suffix for file in folder.iterdir()) == [".jsonl", ".log"]
+
+
+def test_what_cannot_be_a_folder_is_one_line(tmp_path: Path) -> None:
+    hand, taken = tmp_path / "hand.toml", tmp_path / "taken"
+    hand.write_text(HAND)
+    taken.touch()
+    too_long = tmp_path / ("x" * 300)
+    for name in (taken, taken / "below", tmp_path / "run.txt", too_long, too_long.with_suffix(".log")):
+        done = CliRunner().invoke(app, ["record", str(hand), "-o", str(name)])
+        said = str(done.exception)
+        assert said.startswith(f"recording: got '{str(name)[:150]}")  # long ones are shown in part
+        assert "', allowed: a folder " in said
+
+
 def test_an_empty_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("hand.toml").write_text(HAND)
     done = CliRunner().invoke(app, ["record", "hand.toml", "-o", ""])
     assert isinstance(done.exception, ConfigError)
     assert str(done.exception) == (
-        "recording: got '', allowed: an existing folder, or a file ending in .log or .blf"
+        "recording: got '', allowed: a folder (created if needed), or a file ending in .log or .blf"
     )
     assert list(tmp_path.iterdir()) == [tmp_path / "hand.toml"]
 

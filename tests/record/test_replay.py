@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -16,10 +17,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from skinnode.cli._contacts import contact_tables
+from skinnode.cli.main import app
 from skinnode.errors import ConfigError
 from skinnode.host import Host
-from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.config import HandConfig, load_hand, parse_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, replay
 from skinnode.transport.frame import Frame
@@ -42,11 +46,18 @@ def key(field: FieldFrame) -> tuple[str, int]:
     return field.stamp.patch, field.stamp.scan
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf"])
-def test_a_replay_gives_the_bits_of_the_live_run(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "unchecked"),
+    [(".log", ()), (".blf", ()), (".log", ("p0", "p1")), (".log", ("p1",))],
+    ids=["log", "blf", "all nodes of revision 1.0", "one node of revision 1.0"],
+)
+def test_a_replay_gives_the_bits_of_the_live_run(
+    tmp_path: Path, suffix: str, unchecked: tuple[str, ...]
+) -> None:
     hand, path = a_hand(), tmp_path / f"run{suffix}"
     live: dict[tuple[str, int], FieldFrame] = {}
-    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+    fleet = Fleet(hand, unchecked=unchecked)
+    with fleet, Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
         fields = host.fields(capacity=1000)
         end_s = time.monotonic() + 2.0
         while time.monotonic() < end_s:
@@ -56,6 +67,11 @@ def test_a_replay_gives_the_bits_of_the_live_run(tmp_path: Path, suffix: str) ->
     assert len(live) > 40
     assert recorder.stats().failure is None
     assert recorder.stats().dropped == 0
+    if unchecked == ("p0", "p1"):  # as the hosts wrote it that knew no checks
+        journal = path.with_suffix(".jsonl")
+        text = journal.read_text()
+        assert text.count('"checked": false, ') == 2
+        journal.write_text(text.replace('"checked": false, ', ""))
     run = replay(path)
     again = {key(field): field for field in run}
     assert (run.log.damaged, run.complaints, run.ended, run.incomplete) == (0, [], True, None)
@@ -223,3 +239,53 @@ def test_a_full_disk_is_one_line_and_nobody_is_held_up(tmp_path: Path, suffix: s
     assert len(done.stderr.splitlines()) == 1
     assert "recording ended, the disk does not take it" in done.stderr
     assert list(replay(path)) == []
+
+
+def test_contacts_and_forces_are_in_the_json_of_host_and_replay(tmp_path: Path) -> None:
+    file, path = tmp_path / "hand.toml", tmp_path / "run.log"
+    sizes = ", ".join(f"{name} = {value}" for name, value in SMALL.items())
+    file.write_text(
+        f'[[buses]]\nname = "can0"\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
+        '[sync]\nperiod_ms = 25\n[solver]\nmethod = "posterior"\n[simulation]\ncycle_s = 2.0\n'
+        f'[[patches]]\nname = "p0"\nnode_id = 5\nlayout = {{ preset = "staggered", {sizes} }}\n'
+    )
+    hand = load_hand(file)
+    live: dict[int, FieldFrame] = {}
+    with Fleet(hand):
+        with Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+            fields, end_s = host.fields(capacity=1000), time.monotonic() + 2.0
+            while time.monotonic() < end_s:
+                field = fields.get(0.1)
+                if field is not None and field.stamp is not None:
+                    live[field.stamp.scan] = field
+        seconds = CliRunner().invoke(app, ["host", str(file), "--json", "--seconds", "2"]).stdout
+    played = CliRunner().invoke(app, ["replay", str(path), "--fast", "--json"]).stdout
+    tables = [table for line in played.splitlines() if "scan" in (table := json.loads(line))]
+    compared = 0
+    for table in tables:
+        field = live.get(table["scan"])
+        if field is None or not field.contacts:
+            continue
+        for told, contact in zip(table["contacts"], field.contacts, strict=True):
+            assert told["normal_force_n"] == contact.normal_force_n  # bit by bit
+            assert told["normal_force_std_n"] == contact.normal_force_std_n
+            assert told["shear_force_n"] == contact.shear_force_n.tolist()
+            assert told["shear_force_std_n"] == contact.shear_force_std_n.tolist()
+            assert (told["area_m2"], told["area_std_m2"]) == (contact.area_m2, contact.area_std_m2)
+            assert told["centroid_m"] == contact.centroid_m.tolist()
+            assert told["centroid_std_m"] == contact.centroid_std_m.tolist()
+            compared += 1
+    assert compared > 5
+    newest = [json.loads(line) for line in seconds.splitlines() if "patches" in line][-1]
+    found = newest["patches"]["p0"]["contacts"]
+    assert isinstance(found, list)
+    assert all(contact["normal_force_n"] > 0 for contact in found)
+
+
+def test_an_exact_field_knows_no_contacts(tmp_path: Path) -> None:
+    assert contact_tables(None) is None
+    hand, path = a_hand(), tmp_path / "run.log"
+    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+        field = host.fields().get(5.0)
+    assert field is not None
+    assert contact_tables(field) is None

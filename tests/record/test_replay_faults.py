@@ -67,11 +67,7 @@ def play(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Play:
         lines = [line if isinstance(line, str) else json.dumps(line) for line in journal]
         path.with_suffix(".jsonl").write_text("\n".join([*lines, ""]))
         capsys.readouterr()
-        status = 0
-        try:
-            run(app, ["replay", str(path), "--fast", "--json"])
-        except SystemExit as end:
-            status = int(end.code or 0)
+        status = run(app, ["replay", str(path), "--fast", "--json"])
         said = capsys.readouterr()
         told = [json.loads(line) for line in said.out.splitlines()]
         return Played(
@@ -211,11 +207,9 @@ def test_ctrl_c_ends_a_replay_before_its_first_scan(recorded: Recorded, tmp_path
 
     sender = threading.Thread(target=interrupt)
     sender.start()
-    begun_s, status = time.monotonic(), 0
+    begun_s = time.monotonic()
     try:
-        run(app, ["replay", str(path), "--speed", "0.001"])
-    except SystemExit as end:
-        status = int(end.code or 0)
+        status = run(app, ["replay", str(path), "--speed", "0.001"])
     finally:
         over.set()
         sender.join()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import Pacing
 from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
+from skinnode.wire.codec import Codes
 from skinnode.wire.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.faulty_node import FaultyNode
@@ -34,11 +36,11 @@ STEP = 1.0 / 65532
 class Stream:
     """A node with faults and the assembler that hears it, one SYNC after the other."""
 
-    def __init__(self) -> None:
+    def __init__(self, **profile_options: Any) -> None:
         layout = PatchLayout.preset(
             "staggered", upper_wires=4, lower_wires=12, upper_electrodes=4, lower_electrodes=4
         )
-        profile = PatchProfile.from_layout(layout)
+        profile = dataclasses.replace(PatchProfile.from_layout(layout), **profile_options)
         self._rest_ohm = resistance_ohm(layout, layout.upper_m)
         self.readings = self.syncs = 0
         self._tare_left = 16  # the node's own at power-on
@@ -47,6 +49,7 @@ class Stream:
         self.chunks = 0
         """That the node sent, or would have."""
         self._jitter = np.random.default_rng(5)
+        self.profile = profile
         self.assembler = ScanAssembler(profile, counter_overflow=COUNTERS, period_ns=PERIOD_MS * MS)
         self.node = FaultyNode(
             NODE_ID, layout, self, emit=self._emit, on_sent=self._on_sent, serial=1, profile=profile
@@ -84,9 +87,27 @@ class Stream:
     def counted(self) -> AssemblerStats:
         return self.assembler.stats
 
+    @property
+    def mixed_and_complete(self) -> int:
+        """Scans published as complete of more than one reading."""
+        return sum(scan.complete and self._readings(scan.codes) > 1 for scan in self.scans)
+
+    def _readings(self, codes: Codes) -> int:
+        """How many readings there are in codes; those of one may differ by a rounding error of REAL32."""
+        step = 1 << self.profile.code_bits - 16
+        return len(np.unique((codes + step // 2) // step))
+
+    def suffer(self, faults: Faults, scans: int) -> None:
+        """Every other scan suffers, so that two faults do not meet."""
+        for number in range(scans):
+            self.node.faults = NO_FAULTS if number % 2 else faults
+            self.run(1)
+        self.node.faults = NO_FAULTS
+        self.run(5)
+
     def assert_none_is_mixed(self) -> None:
         for scan in self.scans:
-            assert len(np.unique(scan.codes[scan.valid])) <= 1, f"scan {scan.counter}"
+            assert self._readings(scan.codes[scan.valid]) <= 1, f"scan {scan.counter}"
 
     # --- the clock
 
@@ -170,7 +191,10 @@ def test_all_faults_at_once_are_counted_to_the_frame(seed: int) -> None:
     assert counted.scans_missed == injected.torn + injected.sync_lost
     assert counted.scans_discarded == counted.bad_index == counted.resyncs == 0
     assert frames_counted(counted) == injected.pdos
-    assert counted.scans_complete + injected.scans_spoilt + 2 * injected.torn == stream.readings
+    assert counted.scans_unchecked <= injected.summary_lost  # some of them lack chunks as well
+    published = counted.scans_complete + counted.scans_unchecked + counted.scans_torn
+    assert published + 2 * injected.torn == stream.readings
+    assert counted.scans_corrupt == counted.bad_form == 0
     stream.assert_none_is_mixed()
 
 
@@ -231,3 +255,128 @@ def test_counter_of_the_scan_that_comes_as_the_timeout_ends(place: int) -> None:
         stream.run(8)
         stream.assert_none_is_mixed()
         assert place == 0 or stream.counted.scans_mixed == times
+
+
+# --- what neither counters nor numbers show
+
+
+WIRES = [{}, {"code_bits": 24}, {"bus": "fd"}]
+IDS = ["u16", "u24", "fd"]
+
+
+@pytest.mark.parametrize("wire", WIRES, ids=IDS)
+@pytest.mark.parametrize("attack", ["displaced", "understated"])
+def test_a_scan_with_a_chunk_of_another_is_never_complete(attack: str, wire: dict[str, Any]) -> None:
+    """A chunk with the counter of the next scan, whose own chunk is lost; a summary that says that only
+    changed chunks were sent, one less than were, of which one is lost. Every chunk of many scans: without a
+    check all of them are published as complete; with it none is."""
+    complete, injected = {}, {}
+    for checked in (False, True):
+        stream = Stream(checked=checked, **wire)
+        stream.run(3)
+        for chunk in range(stream.profile.n_chunks):
+            stream.suffer(Faults(struck=chunk, **{attack: 1.0}), 40)
+        complete[checked] = stream.mixed_and_complete
+        injected[checked] = getattr(stream.node.injected, attack)
+        if checked:
+            counted = stream.counted
+            assert counted.scans_corrupt == injected[True]
+            assert counted.scans_mixed == counted.conflicts == counted.bad_form == 0
+            stream.assert_none_is_mixed()  # nor in part
+        assert stream.scans[-1].complete
+        assert frames_counted(stream.counted) == stream.node.injected.pdos
+    assert injected[False] == injected[True] == 20 * stream.profile.n_chunks
+    assert complete == {False: injected[False], True: 0}
+
+
+@pytest.mark.parametrize("wire", WIRES, ids=IDS)
+def test_a_code_changed_after_it_was_packed_is_never_complete(wire: dict[str, Any]) -> None:
+    stream = Stream(**wire)
+    stream.run(3)
+    stream.suffer(Faults(corrupted=0.1), 300)
+    injected, counted = stream.node.injected, stream.counted
+    assert injected.corrupted > 20
+    assert counted.scans_corrupt == injected.scans_spoilt
+    assert counted.scans_complete == stream.readings - injected.scans_spoilt
+    assert counted.scans_torn == counted.chunks_lost == counted.scans_unchecked == 0
+    assert frames_counted(counted) == injected.pdos
+    stream.assert_none_is_mixed()
+
+
+def test_a_summary_without_its_check_makes_no_scan_complete() -> None:
+    stream = Stream()
+    stream.run(3)
+    stream.suffer(Faults(unchecked=1.0), 40)
+    injected, counted = stream.node.injected, stream.counted
+    assert injected.unchecked == 20
+    assert counted.bad_form == counted.summaries_lost == counted.scans_unchecked == 20
+    assert counted.scans_complete == stream.readings - 20
+    assert frames_counted(counted) == injected.pdos
+
+
+@pytest.mark.parametrize("wire", WIRES, ids=IDS)
+@pytest.mark.parametrize("seed", range(2))
+def test_what_a_check_finds_among_all_other_faults(wire: dict[str, Any], seed: int) -> None:
+    """Frames are lost, repeated, late and falsified, and only changed chunks are sent: nothing complete is
+    mixed."""
+    stream = Stream(**wire)
+    stream.node._random = np.random.default_rng(seed)
+    stream._sdo(0x2F, 0x2020, 1, 1)
+    chunks = dict.fromkeys(
+        ("lost", "duplicated", "reordered", "late", "short", "miscounted", "corrupted"), 0.01
+    )
+    scans = dict.fromkeys(("torn", "summary_lost", "displaced", "understated", "unchecked"), 0.03)
+    stream.node.faults = Faults(sync_lost=0.03, **chunks, **scans)
+    stream.run(600)
+    stream.node.faults = NO_FAULTS
+    stream.run(25)
+    assert stream.mixed_and_complete == 0
+    assert stream.counted.scans_complete > 100
+    assert stream.scans[-1].complete
+    assert frames_counted(stream.counted) == stream.node.injected.pdos
+
+
+def test_codes_that_stay_below_the_threshold_are_checked_as_they_were_sent() -> None:
+    """What a receiver holds is not the newest reading, by design: the check is over the former."""
+    stream = Stream()
+    stream._sdo(0x2B, 0x2020, 2, 10)
+    stream._sdo(0x2B, 0x2020, 3, 0)  # no refresh
+    stream._sdo(0x2F, 0x2020, 1, 1)
+    stream.run(100)  # each reading is one code above the one before
+    assert stream.counted.scans_complete == len(stream.scans) == 100
+    sent = [scan.chunks_received for scan in stream.scans]
+    assert set(sent) == {0, CHUNKS}
+    assert sent.count(CHUNKS) == 10
+
+
+def test_device_time_is_that_of_the_node() -> None:
+    """To 64 µs, of a clock that host and node share."""
+    stream = Stream()
+    begun: list[int] = []
+    for _ in range(300):
+        begun.append(stream.t_ns // 1000)
+        stream.run(1)
+    assert [scan.device_time_us for scan in stream.scans] == [t_us // 64 * 64 for t_us in begun]
+
+
+def test_a_node_reset_mid_scan_leaves_a_part_of_it() -> None:
+    stream = Stream()
+    stream.run(3)
+    stream.node.faults = Faults(reset=1.0)
+    stream.run(1)
+    stream.node.faults = NO_FAULTS
+    stream.run(4)
+    assert stream.node.injected.reset == 1
+    assert [scan.complete for scan in stream.scans] == [True] * 3 + [False]
+    assert stream.counted.scans_torn == 1
+
+
+def test_a_single_scan_is_checked() -> None:
+    stream = Stream()
+    stream._sdo(0x2F, 0x1019, 0, 0)  # otherwise it would be taken for the scan of the next SYNC
+    stream._sdo(0x2F, 0x1801, 2, 254)
+    stream.assembler = ScanAssembler(stream.profile, period_ns=PERIOD_MS * MS)
+    for number in range(3):
+        stream._frame(0x205, bytes((0, 0, 0, 0, 1, 0)))
+        stream._until(stream.t_ns + PERIOD_MS * MS)
+        assert [(scan.complete, scan.flags) for scan in stream.scans[number:]] == [(True, 0x20)]

@@ -15,7 +15,7 @@ from skinnode.model.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.node import NmtState
 from skinnode.transport import CanPort, Frame
-from skinnode.wire.codec import CodeScale, encode, unpack_chunk, unpack_summary
+from skinnode.wire.codec import CodeScale, encode, restore_time_us, unpack_chunk, unpack_summary
 from vcan_sim.fleet import Fleet
 
 SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
@@ -95,7 +95,8 @@ def test_scans_on_the_bus_are_the_truth_in_codes() -> None:
                 layout = plan.patch(name).layout.build()
                 summary = next(unpack_summary(f.data) for f in frames if f.can_id == 0x280 + node_id)
                 assert summary.chunks == 16
-                truth = fleet.truth_m(name, summary.device_time_us)
+                now_us = time.monotonic_ns() // 1000
+                truth = fleet.truth_m(name, restore_time_us(summary.device_time_us, now_us))
                 rest = resistance_ohm(layout, layout.upper_m)
                 expected = encode(resistance_ohm(layout, truth), rest, CodeScale(16))
                 # noise of converter and baseline is a fifth of a code: rounding differs by one, rarely two

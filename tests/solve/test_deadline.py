@@ -15,19 +15,29 @@ from skinnode.solve.patch_solver import TAKE, PatchSolver
 
 from .press import dent, frame_ohm, hertz_press
 
+MOST_READINGS = 10_000
+"""Readings of the clock between two calls of the solver; more would be an endless loop."""
+
 
 class Clock:
     """Time stands still but for the solver: every wire that has its turn in a call takes ``call_s``."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, call_s: float) -> None:
         self.now, self.call_s = 0.0, call_s
+        self.calls, self._readings = 0, 0
         for module in (exact, patch_stream):
-            monkeypatch.setattr(module, "perf_counter", lambda: self.now)
+            monkeypatch.setattr(module, "perf_counter", self._read)
         monkeypatch.setattr(PatchSolver, "solve", self._timed(PatchSolver.solve))
         monkeypatch.setattr(PatchSolver, "advance", self._timed(PatchSolver.advance, clears=TAKE))
 
+    def _read(self) -> float:
+        self._readings += 1
+        assert self._readings < MOST_READINGS
+        return self.now
+
     def _timed(self, call: Callable[..., Any], clears: int = 0) -> Callable[..., Any]:
         def timed(solver: PatchSolver, *args: Any, **kwargs: Any) -> Any:
+            self.calls, self._readings = self.calls + 1, 0
             turns = solver.report[:, wires.TURN]
             before = turns.copy()
             turns[:] = 0
@@ -132,3 +142,13 @@ class TestDeadline:
             a, b = free.update(frame), bound.update(frame)
             np.testing.assert_array_equal(a.displacement_m, b.displacement_m)
             np.testing.assert_array_equal(a.displacement_std_m, b.displacement_std_m)
+
+    @pytest.mark.parametrize("deadline_us", [None, 1e6])
+    def test_all_wires_of_a_frame_with_time_to_spare_are_solved_in_one_call(
+        self, staggered, stream, monkeypatch, deadline_us
+    ):
+        tracker = ExactTracker(staggered, deadline_us=deadline_us, hold=False)
+        clock = Clock(monkeypatch, 20e-6)
+        for number, (_, frame) in enumerate(stream[:12], 1):
+            assert tracker.update(frame).trusted
+            assert clock.calls == number

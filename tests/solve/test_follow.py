@@ -47,6 +47,51 @@ class TestFollow:
         assert field.trusted
         assert field.stats.jacobians >= 10
 
+    def test_cost_is_that_of_simplified_newton_steps(self):
+        """A NumPy copy of the method with the inverse at rest, which four wires keep for four frames.
+
+        Every step but the last correction leads to a point where F is evaluated again.
+        """
+        layout = sk.PatchLayout.preset("staggered", upper_wires=4, upper_electrodes=4, lower_electrodes=4)
+        tracker = ExactTracker(layout, hold=False)
+        at = np.zeros_like(layout.upper_m)
+        before = frame_ohm(layout, at)
+        inverse = np.linalg.inv(relative_slopes(layout, at))
+
+        def step(ratio):
+            return -np.einsum("ujk,uk->uj", inverse, ratio - 1.0).reshape(at.shape)
+
+        for number in range(1, 6):
+            frame = frame_ohm(layout, hertz_press(layout, 0.003 * number, centre_m=(6e-3, 6e-3)))
+            field = tracker.update(frame)
+            assert field.trusted
+            assert field.stats.steps == field.stats.evaluations - 4
+            if number == 5:
+                break
+            assert field.stats.jacobians == 0
+            at, before, expected = at + step(frame / before), frame, 0
+            todo = np.ones(4, bool)
+            while todo.any():
+                expected += np.count_nonzero(todo)
+                ratio = frame / frame_ohm(layout, at)
+                correction = np.where(todo[:, None, None], step(ratio), 0.0)
+                at = at + correction
+                size = np.abs(correction).max(axis=(1, 2)) / layout.pitch_m
+                top = np.abs((layout.upper_m + at) / layout.pitch_m).max(axis=(1, 2))
+                todo &= (size > 1e-9 * np.maximum(1.0, top)) | (np.abs(ratio - 1.0).max(axis=1) > 1e-9)
+            assert field.stats.evaluations == expected > 4
+        assert field.stats.jacobians > 0
+
+    @pytest.mark.parametrize("depth", [0.01, 0.03, 0.1])
+    def test_steps_are_counted_whatever_inverse_they_were_taken_with(self, depth):
+        """Wires followed to the end, with a new inverse at the root, and with Newton's steps after four
+        simplified ones: all evaluate F once at the start and once after each step."""
+        layout = sk.PatchLayout.preset("staggered", upper_wires=4, upper_electrodes=4, lower_electrodes=4)
+        moved = hertz_press(layout, depth, centre_m=(6e-3, 6e-3))
+        stats = ExactTracker(layout, hold=False).update(frame_ohm(layout, moved)).stats
+        assert stats.steps == stats.evaluations - 4
+        assert (stats.jacobians > 0) == (depth > 0.02)
+
     def test_every_wire_has_a_new_inverse_after_eight_frames(self, staggered):
         tracker, counts = ExactTracker(staggered, hold=False), []
         for n in range(1, 17):

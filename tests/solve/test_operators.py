@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import KroghInterpolator
+from scipy.optimize import minimize_scalar
 
 from skinnode.solve import operators
 from skinnode.solve.operators import EPS, LAM, LEVENBERG_MARQUARDT, LIMIT, RADIUS, REJECTED, TRY, workspace
+
+DOGLEG = operators.OPERATORS["dogleg"]
 
 
 @settings(max_examples=60, deadline=None)
@@ -47,3 +51,78 @@ def test_shortened_step_is_the_damped_one_of_the_right_length(n, spare, decades,
     condition = np.sqrt((sigma[0] ** 2 + lam) / lam)
     open_ = condition * (radius + np.linalg.norm(r) / np.sqrt(lam))
     np.testing.assert_allclose(scale * w.step, truth, rtol=0, atol=10 * (n + m) * EPS * open_)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(1, 12),
+    st.integers(0, 6),
+    st.booleans(),
+    st.sampled_from([0.01, 0.3, 0.9]),
+    st.sampled_from([0.0, 1e-6, 1e-2, 1.0]),
+    st.integers(0, 2**32 - 1),
+)
+@example(n=6, spare=0, singular=False, share=0.9, kept=1.0, seed=1)
+@example(n=6, spare=2, singular=False, share=0.9, kept=1.0, seed=2)
+@example(n=6, spare=0, singular=True, share=0.9, kept=1.0, seed=3)
+def test_a_damping_that_is_too_strong_is_lowered(n, spare, singular, share, kept, seed):
+    """The damping kept from an earlier step, as a share of the largest possible one, may be far too strong.
+
+    The step still has the length of the radius within a tenth, by the SVD. The radius is shorter than the
+    shortest minimiser of ‖J s + r‖, so that such a step exists where J is singular too.
+    """
+    rng = np.random.default_rng(seed)
+    m = n + spare
+    size = np.linspace(1.0, 0.2, n)
+    if singular and n > 1:
+        size[-1] = 0.0
+    left, right = np.linalg.qr(rng.normal(size=(m, n)))[0], np.linalg.qr(rng.normal(size=(n, n)))[0]
+    j, r = (left * size) @ right, rng.normal(size=m)
+    scale = np.linalg.norm(j, axis=0)
+    u, sigma, vt = np.linalg.svd(j / scale, full_matrices=False)
+    known = sigma > 1e-12 * sigma[0]
+    u, sigma, vt = u[:, known], sigma[known], vt[known]
+    along = u.T @ r
+    radius = share * np.linalg.norm(along / sigma)
+    w = workspace(n, m)
+    w.r[:], w.jt[:] = r, j.T
+    assert operators.start(w) == TRY
+    w.s[RADIUS], w.s[LAM] = radius, kept * np.linalg.norm(sigma * along) / radius
+    assert operators.advance(LEVENBERG_MARQUARDT, w, REJECTED, 0.0, 0.0) == TRY
+    assert w.s[RADIUS] == radius
+    assert abs(np.linalg.norm(scale * w.step) - radius) <= 0.1001 * radius
+    truth = -(vt.T @ (sigma / (sigma**2 + w.s[LAM]) * along))
+    np.testing.assert_allclose(scale * w.step, truth, rtol=0, atol=1e-9 * radius)
+
+
+@pytest.mark.parametrize("operator", [LEVENBERG_MARQUARDT, DOGLEG])
+@pytest.mark.parametrize("growth", [1.02, 1.5, 2.0, 2.9, 3.5, 9.9, 10.1, np.inf])
+@pytest.mark.parametrize("share", [0.2, 0.9, 20.0])
+def test_a_rejected_step_shrinks_the_radius_to_the_minimiser_of_the_parabola(operator, growth, share):
+    """The parabola through ‖r‖² at both ends of the step with its slope at the start, minimised by scipy.
+
+    The factor lies between 1/10 and 1/2, and is 1/10 if ‖r‖ grew tenfold (Moré 1978; MINPACK lmder).
+    """
+    rng = np.random.default_rng(5)
+    n = 6
+    j, r = rng.normal(size=(n, n)), rng.normal(size=n)
+    w = workspace(n, n)
+    w.x[:], w.r[:], w.jt[:] = rng.normal(size=n), r, j.T
+    scale = np.linalg.norm(j, axis=0)
+    newton = np.linalg.norm(scale * np.linalg.solve(j, r))
+    assert operators.start(w) == TRY
+    w.s[RADIUS] = share * newton
+    assert operators.advance(operator, w, REJECTED, 0.0, 0.0) == TRY
+    radius, step = w.s[RADIUS], w.step.copy()
+    slope = 2.0 * (r @ j @ step) / (r @ r)
+    with np.errstate(invalid="ignore"):
+        w.r_trial[:] = growth * np.linalg.norm(r) * np.eye(n)[0]
+    expected = 0.1
+    if growth < 10.0:
+        parabola = KroghInterpolator([0.0, 0.0, 1.0], [1.0, slope, growth**2])
+        expected = minimize_scalar(parabola, bounds=(0.1, 0.5), method="bounded", options={"xatol": 1e-10}).x
+    assert operators.advance(operator, w, TRY, 0.0, 0.0) == TRY
+    length = np.linalg.norm(scale * step)
+    assert w.s[RADIUS] == pytest.approx(expected * min(10.0 * length, radius), rel=1e-6)
+    np.testing.assert_array_equal(w.r, r)
+    assert np.linalg.norm(scale * w.step) <= 1.1001 * w.s[RADIUS]

@@ -557,6 +557,25 @@ def test_covariance_belongs_to_the_field(small):
         assert np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > 0
 
 
+@pytest.mark.parametrize("noise", [1e12, np.inf, np.nan, 0.0, -1e-5])
+def test_noise_that_is_no_knowledge_makes_a_frame_unused(small, noise):
+    field = sk.Posterior(small).update(frame_ohm(small, hertz_press(small, 0.1)), relative_noise=noise)
+    assert set(field.status) == {sk.Status.ILL_CONDITIONED}
+    assert np.isinf(field.displacement_std_m).all()
+
+
+def test_noise_of_one_frame_is_that_of_its_deviations(small):
+    """The same resistances, said to be a hundred times noisier: deviations as of a tracker that never heard
+    otherwise."""
+    frame = noisy(frame_ohm(small, hertz_press(small, 0.1, centre_m=(8e-3, 8e-3))), np.random.default_rng(20))
+    tracker = sk.Posterior(small, relative_noise=SIGMA, hold=False)
+    sharp = tracker.update(frame)
+    loose = tracker.update(frame, relative_noise=100 * SIGMA)
+    fresh = sk.Posterior(small, relative_noise=100 * SIGMA, hold=False).update(frame)
+    assert np.median(loose.displacement_std_m / sharp.displacement_std_m) > 3
+    assert np.median(loose.displacement_std_m / fresh.displacement_std_m) == pytest.approx(1.0, abs=0.3)
+
+
 def test_covariance_says_how_errors_hang_together(small):
     """Whitened by it, errors of 150 noisy frames of one press are of deviation 1 in all 75 directions, up
     to what the prior takes from the weakest of them."""

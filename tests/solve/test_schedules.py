@@ -125,12 +125,15 @@ def test_the_cycle_is_proportional_to_the_number_of_samples(layout, fifty):
 
 
 @pytest.mark.parametrize("plain", [False, True])
-def test_a_known_cycle_is_not_looked_for(layout, fifty, plain):
-    path = sk.solve_path(layout, fifty, schedule=sk.Periodic(cycle=7, plain=plain))
+@pytest.mark.parametrize(
+    ("cycle", "solved"), [(7, [6, 13, 20, 27, 34, 41, 48, 49]), (8, [7, 15, 23, 31, 39, 47, 49])]
+)
+def test_a_known_cycle_is_not_looked_for(layout, fifty, cycle, solved, plain):
+    path = sk.solve_path(layout, fifty, schedule=sk.Periodic(cycle=cycle, plain=plain))
     uniform = sk.solve_path(layout, fifty, schedule=sk.Uniform(plain=plain))
     assert path.searched == 0
-    assert path.cycle == 7
-    np.testing.assert_array_equal(samples_solved(path), [6, 13, 20, 27, 34, 41, 48, 49])
+    assert path.cycle == cycle
+    np.testing.assert_array_equal(samples_solved(path), solved)
     assert path.stats.steps < 0.5 * uniform.stats.steps
     assert wire_errors(path, hertz_press(layout, 0.1)).max() < 1e-6
 
@@ -229,6 +232,41 @@ def test_a_step_that_leaves_the_branch_is_taken_back():
     fresh = Walk(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
     expected = fresh.predict(np.full(10, -0.5)) - problem.rest
     np.testing.assert_array_equal(halfway[~arrived], expected[~arrived])
+
+
+@pytest.mark.parametrize("second_tries", [True, False])
+def test_the_likelier_of_two_roots_is_kept_and_neither_of_equals_is_believed(second_tries):
+    """Thick layer: most wires have a second root across a fold.
+
+    The energy is a multiple of the squared distance from the truth. The truth is the likelier root if the
+    multiple is positive, the other root if it is negative, and neither if it is zero.
+    """
+    layout = staggered(1.0)
+    problem = PatchProblem.of(layout)
+    truth = hertz_press(layout, 0.3)
+    samples = press_samples(layout, 0.3, 10)
+    pitches = (truth / layout.pitch_m).reshape(10, -1)
+    doubted = {}
+    for weight in (1, -1, 0):
+        walk = Walk(problem, samples * problem.gain, OPERATORS.index("dogleg"))
+        sk.Uniform().follow(walk)
+        assert (walk.status == sk.Status.CONVERGED).all()
+        walk.second_tries = second_tries
+        none = np.zeros((0, *pitches.shape))
+        walk.weigh_rivals(
+            none, lambda moved, w=weight: w * 1e9 * ((moved - pitches) ** 2).sum(), np.ones(10), 1e-9, 100
+        )
+        at = problem.displacement_m(walk.solver.x)
+        stayed = np.abs(at - truth).max(axis=(1, 2)) < 1e-9 * layout.height_m
+        doubted[weight] = walk.status != sk.Status.CONVERGED
+        if weight == -1 and second_tries:
+            assert 4 < np.count_nonzero(~stayed) < 10
+            np.testing.assert_allclose(frame_ohm(layout, at), samples[-1], rtol=1e-8)  # a root too
+            assert not doubted[weight][stayed].any()
+        else:
+            assert stayed.all()
+    assert not doubted[1].any()
+    assert doubted[0].sum() >= doubted[-1].sum() > 4
 
 
 def test_adaptive_is_bounded_where_there_is_no_solution(layout):

@@ -161,7 +161,7 @@ def test_steps_are_bounded_and_counted():
     system = System("trigonometric", trigonometric, (0.1,) * 10)
     cut = solve(system, "dogleg", max_steps=3)
     assert cut.status is sk.Status.MAX_STEPS
-    assert cut.stats.steps == 3
+    assert (cut.stats.steps, cut.stats.evaluations) == (3, 1 + 3)
     calls = {"f": 0, "j": 0}
 
     def f(x):
@@ -174,6 +174,7 @@ def test_steps_are_bounded_and_counted():
 
     stats = sk.solve_system(f, j, system.x0).stats
     assert (stats.evaluations, stats.jacobians) == (calls["f"], calls["j"])
+    assert stats.steps == calls["f"] - 1  # one trial point each, after the start
 
 
 def test_a_wrong_jacobian_never_ends_converged():

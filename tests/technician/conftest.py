@@ -46,6 +46,7 @@ def boards(bus: BusConfig, *node_ids: int, **options: Any) -> Iterator[list[Patc
                 send=port.send,
                 serial=options.get("serial", node_id),
                 memory=options.get("memory", VolatileMemory()),
+                profile=options.get("profile"),
             )
             for node_id in node_ids
         ]

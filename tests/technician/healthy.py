@@ -52,6 +52,8 @@ def node(node_id: int = 5, **changes: Any) -> FoundNode:
         "state": "operational",
         "state_known_by": "heartbeat",
         "name": "skinnode patch",
+        "device_type": 0,
+        "error_register": 0,
         "vendor_id": od.VENDOR_ID,
         "product_code": od.PRODUCT_CODE,
         "revision": od.REVISION_NUMBER,

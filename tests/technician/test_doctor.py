@@ -212,6 +212,31 @@ def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
     assert "160 ms, the period is 25 ms" in found["thumb: a scan takes longer than a SYNC period"][1]
 
 
+def test_a_node_that_no_host_has_configured_is_no_fault(hand_file: HandFile, on: On) -> None:
+    """Its default inhibit time suits the default period; bring-up writes one that suits the hand's period."""
+    file = hand_file()
+    file.write_text(file.read_text().replace("period_ms = 25", "period_ms = 10"))
+    hand = load_hand(file)
+    on(Fleet(hand))
+    assert examine(file) == (0, {})
+    done = run(["doctor", file, "--json", "--active"])
+    what = {finding["what"] for finding in done.json["findings"]}
+    assert not what & {"a scan takes longer than a SYNC period", "scans end when the next has begun"}
+    assert not any("overrun" in finding["evidence"] for finding in done.json["findings"])
+
+
+def test_a_default_inhibit_time_is_a_fault_once_the_node_runs(hand_file: HandFile, on: On) -> None:
+    """Another master may have started it without configuring it."""
+    file = hand_file()
+    file.write_text(file.read_text().replace("period_ms = 25", "period_ms = 10"))
+    hand = load_hand(file)
+    on(Fleet(hand))
+    on(CanPort(hand.buses[0])).send(od.NMT_COB_ID, b"\x01\x05")
+    found = examine(file)[1]
+    assert "thumb: a scan takes longer than a SYNC period" in found
+    assert "index: a scan takes longer than a SYNC period" not in found
+
+
 class _Page(html.parser.HTMLParser):
     def __init__(self) -> None:
         super().__init__()
@@ -223,7 +248,10 @@ class _Page(html.parser.HTMLParser):
         self.outside += [value for name, value in attrs if name in ("src", "href") and value]
 
 
-def test_the_report_needs_nothing_else(hand_file: HandFile, on: On, tmp_path: Path) -> None:
+def test_the_report_needs_nothing_else(
+    hand_file: HandFile, on: On, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     file, report = hand_file(), tmp_path / "report.html"
     fleet = on(Fleet(load_hand(file)))
     fleet.patches["index"].fault = _noisy_wire

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.doctor.checks import diagnose, not_judged
+from skinnode.doctor.checks import diagnose, not_judged, others
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.model.config import PatchConfig, SimulationConfig
 from skinnode.model.layout import PatchLayout
+from skinnode.printable import printable
 from skinnode.technician.heard import Emergency
 from skinnode.wire.lss import LssAddress
 from vcan_sim.scene import Scene
@@ -47,6 +48,11 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
         ({"foreign": {0x3F0: 100}}, "nothing in the hand explains", Sure.POSSIBLE),
         ({"unconfigured": (LssAddress(0, 1, 2, 7),)}, "without a node-ID", Sure.CERTAIN),
         ({"strangers": (node(9),)}, "node 9 is not in the hand", Sure.CERTAIN),
+        (
+            {"strangers": (node(9, product_code=1, duplicate="one question got 2 answers"),)},
+            "two nodes have node-ID 9",
+            Sure.CERTAIN,
+        ),
         ({"dropped": 12}, "this machine dropped frames", Sure.CERTAIN),
         ({"sync_s": np.empty(0)}, "nobody sends SYNC", Sure.CERTAIN),
         ({"sync_counters": (1, 200, 2, 201, 3, 202) * 4}, "two producers of SYNC", Sure.CERTAIN),
@@ -226,7 +232,7 @@ def test_frozen_values_and_a_frozen_node() -> None:
     assert diagnose(quiet) == []
     (line,) = not_judged(quiet)
     assert line.startswith("thumb: frozen or only quiet: no code changed in 50 scans")
-    assert "touch it" in line
+    assert "touch the patch" in line
     assert not_judged(bus_of(replace(WELL, scans=scans_of(frozen)))) == []  # that is a finding
     flickers = frozen.copy()
     flickers[30, 2, 5] += STEP
@@ -265,6 +271,8 @@ def test_crossings_open_always_and_now_and_then() -> None:
     ("counts", "what"),
     [
         ({"scans_torn": 2, "chunks_lost": 5}, "scans with holes"),
+        ({"scans_corrupt": 2}, "codes are not those that the node packed"),
+        ({"bad_form": 3}, "frames that are no chunks of this patch"),
         ({"scans_missed": 3}, "whole scans are missing"),
         ({"conflicts": 4}, "two different chunks with one number"),
         ({"bad_length": 1}, "frames that are no chunks"),
@@ -288,3 +296,34 @@ def test_few_scans_are_not_judged() -> None:
     stopped = replace(bus.patches[0], found=replace(WELL.found, state="pre-operational"))
     assert not_judged(replace(bus, patches=(stopped,))) == [f"{few}; it does not run: --active starts it"]
     assert not_judged(replace(bus, patches=(stopped,), active=True)) == [few]
+
+
+DRIVE: dict[str, Any] = {
+    "name": None,
+    "device_type": 0x0002_0192,
+    "vendor_id": 0x42,
+    "product_code": None,
+    "serial": None,
+    "state": "unknown",
+    "state_known_by": "no heartbeat, no guarding",
+}
+
+
+def test_a_device_of_others_beside_a_hand_is_named_and_no_finding() -> None:
+    bus = bus_of(WELL, strangers=(node(16, **DRIVE),))
+    assert diagnose(bus) == []
+    assert others(bus) == [
+        "can0: node 16, not in the hand file: device profile 402, vendor 0x00000042, "
+        "NMT state unknown (no heartbeat, no guarding)"
+    ]
+    assert others(replace(bus, period_s=None))[0].startswith("can0: node 16, not a skinnode patch: ")
+
+
+def test_a_device_of_others_in_place_of_a_patch_is_described() -> None:
+    found = one(bus_of(replace(WELL, found=node(**DRIVE))))
+    assert found.evidence == "unnamed, device profile 402, vendor 0x00000042"
+
+
+def test_a_name_that_was_made_printable_is_not_escaped_again() -> None:
+    found = one(bus_of(replace(WELL, found=node(**{**DRIVE, "name": printable(b"\x1b[31mdrive")}))))
+    assert found.evidence.startswith(r"'\x1b[31mdrive', device profile 402")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +14,13 @@ from skinnode.errors import SdoAbort
 from skinnode.host.network import RemoteOd
 from skinnode.model.config import BusConfig
 from skinnode.node import PatchNode
+from skinnode.technician import survey
 from skinnode.technician.info import read_info
 from skinnode.technician.line import Line
+from skinnode.technician.sheet import read_profile
+from skinnode.transport import CanPort
 from skinnode.wire import indices as od
+from skinnode.wire.profile import PatchProfile
 
 from .conftest import LAYOUT, Rest, run
 
@@ -36,7 +43,7 @@ def test_tells_what_is_in_the_node(any_bus: BusConfig, powered: Powered, line_on
     assert (found.vendor_id, found.product_code, found.serial) == (0, 0x534B494E, 4711)
     assert found.heartbeats_watched == ("node 9 within 1500 ms",)
     assert found.storing == "on command; no verified configuration (0x1020)"
-    assert found.errors == ("0x8240 SYNC of unexpected length: 1 bytes in place of 0",)
+    assert found.errors == ("0x8240 SYNC of unexpected length: 1 byte in place of 0",)
     assert found.pdo_texts[0] == (
         "TPDO1 0x185, on event, 1 ms apart at least, sent every 500 ms at least, 8 bytes: "
         "Chunk index; Chunk scan counter; Code 1 to 3"
@@ -53,6 +60,25 @@ def test_tells_what_is_in_the_node(any_bus: BusConfig, powered: Powered, line_on
     assert found.faults == ()
 
 
+@pytest.mark.parametrize(
+    ("checked", "revision", "mapped"),
+    [
+        (True, 0x1_0001, "Summary scan counter; Flags; Chunks sent; Device time 64us; Scan check"),
+        (False, 0x1_0000, "Summary scan counter; Flags; Chunks sent; Device time us"),
+    ],
+)
+def test_a_summary_is_described_as_its_revision_has_it(
+    bus: BusConfig, powered: Powered, line_on: LineOn, checked: bool, revision: int, mapped: str
+) -> None:
+    profile = replace(PatchProfile.from_layout(LAYOUT), checked=checked)
+    powered(bus, 5, profile=profile)
+    line = line_on(bus)
+    found = read_info(line, 5)
+    assert found.revision == revision
+    assert found.pdo_texts[1] == f"TPDO2 0x285, every SYNC, 8 bytes: {mapped}"
+    assert read_profile(line.od(5)) == profile
+
+
 def test_the_baseline_is_read_as_a_block_and_else_in_segments(
     bus: BusConfig, powered: Powered, line_on: LineOn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -61,11 +87,11 @@ def test_the_baseline_is_read_as_a_block_and_else_in_segments(
     line, expected = line_on(bus), np.median(skin.read(0))
     segments = RemoteOd.read_bytes
 
-    def no_segments(remote: RemoteOd, index: int, subindex: int) -> bytes:
+    def no_segments(remote: RemoteOd, index: int, subindex: int, *most: int) -> bytes:
         assert index != od.BASELINE_DOMAIN
-        return segments(remote, index, subindex)
+        return segments(remote, index, subindex, *most)
 
-    def no_block(remote: RemoteOd, index: int) -> bytes:
+    def no_block(remote: RemoteOd, index: int, *most: int) -> bytes:
         raise SdoAbort(remote.node_id, 0x05040001, "no such command")
 
     for name, refused in (("read_bytes", no_segments), ("read_block", no_block)):
@@ -106,19 +132,75 @@ def test_a_patch_without_a_baseline_is_a_fault(bus: BusConfig, powered: Powered)
     powered(bus, 5, source=Rest(LAYOUT, lambda ohm: np.full_like(ohm, np.inf)))
     done = run(["info", "5"], bus)
     assert done.status == 1
-    assert "12 crossings have no baseline: tare" in done.stdout
+    assert "12 crossings have no baseline: skinnode tare" in done.stdout
 
 
-def test_fits_a_terminal_of_80_columns(bus: BusConfig, powered: Powered) -> None:
+def test_fits_a_terminal_of_80_columns_and_is_whole_in_a_pipe(
+    bus: BusConfig, powered: Powered, monkeypatch: pytest.MonkeyPatch
+) -> None:
     powered(bus, 5)
-    done = run(["info", "0x5"], bus)
-    assert done.status == 0
-    assert max(map(len, done.stdout.splitlines())) <= 80
+    monkeypatch.delenv("COLUMNS", raising=False)
+    whole = run(["info", "0x5"], bus)
+    assert whole.status == 0
+    assert any(len(line.rstrip()) > 80 for line in whole.stdout.splitlines())
+    monkeypatch.setenv("COLUMNS", "80")
+    wrapped = run(["info", "0x5"], bus)
+    assert max(map(len, wrapped.stdout.splitlines())) <= 80
+    assert len(wrapped.stdout.splitlines()) > len(whole.stdout.splitlines())
+    assert wrapped.stdout.split() == whole.stdout.split()
 
 
 def test_nobody_there_or_no_node_id(bus: BusConfig) -> None:
     done = run(["info", "99"], bus)
     assert (done.status, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: node 99: does not answer by SDO")
+    assert done.stderr.startswith("error: node 99: does not answer SDO requests")
     assert "got 128, allowed: a node-ID from 1 to 127" in run(["info", "128"], bus).stderr
     assert "got 'thumb', allowed: a node-ID from 1 to 127" in run(["info", "thumb"], bus).stderr
+
+
+@contextmanager
+def _babbler(bus: BusConfig, node_id: int, answer: Callable[[bytes], bytes]) -> Iterator[None]:
+    """A node that sends heartbeats, and ``answer`` of each SDO request."""
+    over = threading.Event()
+
+    def babble(port: CanPort) -> None:
+        while not over.is_set():
+            port.send(od.heartbeat_cob_id(node_id), b"\x7f")
+            frame = port.recv(0.05)
+            while frame is not None and not over.is_set():
+                if frame.can_id == od.sdo_request_cob_id(node_id):
+                    port.send(od.sdo_response_cob_id(node_id), answer(frame.data))
+                frame = port.recv(0.05)
+
+    with CanPort(bus) as port:
+        thread = threading.Thread(target=babble, args=(port,))
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    ("answer", "shown"),
+    [
+        (lambda request: bytes(8), "00 00 00 00 00 00 00 00"),
+        (lambda request: b"\x13\x37", "13 37"),
+        (lambda request: b"", "no data"),
+    ],
+)
+def test_nonsense_is_not_called_silence(
+    bus: BusConfig, monkeypatch: pytest.MonkeyPatch, answer: Callable[[bytes], bytes], shown: str
+) -> None:
+    monkeypatch.setattr(survey, "LISTEN_S", 0.5)
+    monkeypatch.setattr(survey, "PACE_S", 0.0001)
+    said = f"answers SDO requests with data that is no answer of CiA 301 (newest: {shown})"
+    with _babbler(bus, 9, answer):
+        for command in (["info", "9"], ["od", "9", "1000"], ["od", "9"]):
+            done = run(command, bus)
+            assert (done.status, done.stdout) == (2, "")
+            assert done.stderr.startswith(f"error: node 9: {said}")
+            assert len(done.stderr.splitlines()) == 1
+        assert said in run(["doctor"], bus).stdout.replace("\n", " ")
+        assert "no valid answer" in run(["scan"], bus).stdout

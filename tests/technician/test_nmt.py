@@ -29,9 +29,8 @@ def test_a_node_follows(any_bus: BusConfig, powered: Powered, line_on: LineOn, h
     ):
         done = run(["nmt", "5", command, "--json"], any_bus)
         assert done.status == 0
-        assert done.json == [
-            {"node_id": 5, "before": before, "after": after, "followed": True, "known_by": by}
-        ]
+        change = {"node_id": 5, "before": before, "after": after, "followed": True, "known_by": by}
+        assert done.json == [{**change, "bus": any_bus.channel}]
         assert node.nmt_state is state
 
 

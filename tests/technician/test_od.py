@@ -74,14 +74,14 @@ def test_writes_and_reads_bytes(bus: BusConfig, powered: Powered) -> None:
         (["1017", "--write", "70000"], "--write: got '70000', allowed: a value of 0x1017:00"),
         (["1017", "--write", "soon"], "UNSIGNED16"),
         (["1017", "--hex", "--write", "xy"], "bytes in hexadecimal"),
-        (["1018", "--write", "1"], "one with :SUB"),
+        (["1018", "--write", "1"], "allowed: INDEX:SUB"),
         (["1000", "--write", "1"], "SDO abort 0x06010002"),
         (["1018:9"], "SDO abort 0x06090011"),
         (["5000"], "SDO abort 0x06020000"),
         (["5000", "--write", "1"], "allowed: --hex and bytes in hexadecimal"),
         (["no-index"], "INDEX: got 'no-index'"),
         (["1018:256"], "INDEX: got '1018:256'"),
-        (["--write", "1"], "--write: got '1', allowed: a value beside INDEX"),
+        (["--write", "1"], "--write: got '1', allowed: only with INDEX[:SUB]"),
         (["--diff", "no/such.eds"], "a file that can be read"),
         (["--diff", "/dev/null"], "/dev/null: EDS: got no section DeviceInfo or 1000, allowed: a file"),
         (["--eds", "no/such.eds"], "a file that can be read"),
@@ -152,11 +152,12 @@ def test_a_device_of_others_needs_its_sheet(
 ) -> None:
     powered(bus, 5)
     monkeypatch.setattr(od, "PRODUCT_CODE", 0x1234)  # what the tool takes for a patch of ours
-    for arguments in ([], ["1017", "--write", "100"]):
-        done = run(["od", "5", *arguments], bus)
-        assert done.status == 2
-        assert "--eds" in done.stderr
-    assert "4e 49 4b 53" in run(["od", "5", "1018:2"], bus).stdout  # bytes need no sheet
+    done = run(["od", "5", "2020:3", "--write", "100"], bus)  # of what type?
+    assert done.status == 2
+    assert "--eds" in done.stderr
+    assert "4e 49 4b 53" in run(["od", "5", "1018:2", "--hex"], bus).stdout  # bytes need no sheet
+    assert run(["od", "5", "2020:3", "--hex", "--write", "09 00"], bus).status == 0
+    assert run(["od", "5", "1017", "--write", "100"], bus).status == 0  # CiA 301 has its type
     eds = tmp_path / "of-others.eds"
     eds.write_text(eds_text(PROFILE))
     assert value(bus, "1018:2", "--eds", str(eds)) == 0x534B494E

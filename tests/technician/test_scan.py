@@ -9,11 +9,12 @@ import pytest
 
 from skinnode.model.config import BusConfig
 from skinnode.node import NmtState, PatchNode, VolatileMemory
+from skinnode.node.lss import LssSlave
 from skinnode.technician.line import Line
 from skinnode.technician.survey import survey
 from skinnode.transport import CanPort
 from skinnode.wire import indices as od
-from skinnode.wire.lss import NOT_CONFIGURED, LssAddress
+from skinnode.wire.lss import NOT_CONFIGURED, LssAddress, LssCommand
 
 from .conftest import LAYOUT, run
 
@@ -37,7 +38,7 @@ def test_finds_every_node_with_its_identity(any_bus: BusConfig, powered: Powered
         ("operational", "heartbeat"),
         ("pre-operational", "guarding"),
     ]
-    assert {(n.vendor_id, n.product_code, n.revision) for n in found.nodes} == {(0, 0x534B494E, 0x10000)}
+    assert {(n.vendor_id, n.product_code, n.revision) for n in found.nodes} == {(0, 0x534B494E, 0x10001)}
     assert [n.duplicate for n in found.nodes] == ["", "", ""]
     assert found.unconfigured == ()
     assert found.seconds < 3.0
@@ -49,10 +50,24 @@ def test_nodes_without_a_node_id_are_told_apart_and_wait_again(
     serials = (0, 7, 0xDEADBEEF)
     nodes = [powered(bus, NOT_CONFIGURED, serial=serial)[0] for serial in serials]
     found = survey(line_on(bus))
-    assert sorted(found.unconfigured) == [LssAddress(0, 0x534B494E, 0x10000, serial) for serial in serials]
+    assert sorted(found.unconfigured) == [LssAddress(0, 0x534B494E, 0x10001, serial) for serial in serials]
     assert not found.more_unconfigured
     assert {node.nmt_state for node in nodes} == {NmtState.INITIALISING}
     assert sorted(survey(line_on(bus)).unconfigured) == sorted(found.unconfigured)
+
+
+def test_a_node_that_serves_fastscan_alone_is_found(
+    bus: BusConfig, powered: Powered, line_on: LineOn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As CANopenNode does: no answer to *identify non-configured remote slave*."""
+    serve = LssSlave.on_request
+
+    def fastscan_alone(slave: LssSlave, data: bytes) -> bytes | None:
+        return None if data[0] == LssCommand.IDENTIFY_NOT_CONFIGURED else serve(slave, data)
+
+    monkeypatch.setattr(LssSlave, "on_request", fastscan_alone)
+    powered(bus, NOT_CONFIGURED, serial=7)
+    assert survey(line_on(bus)).unconfigured == (LssAddress(0, 0x534B494E, 0x10001, 7),)
 
 
 def test_two_nodes_with_one_node_id(bus: BusConfig, powered: Powered) -> None:
@@ -122,7 +137,7 @@ def test_an_empty_bus_is_a_fault(bus: BusConfig) -> None:
         (["--channel", ""], "--channel: got '', allowed: a name of printable characters"),
         (["--channel", "a\x1b"], "--channel: got 'a\\x1b', allowed: a name of printable characters"),
         (["--interface", ""], "--interface: got '', allowed: a name of printable characters"),
-        (["--bus", "can1"], "--bus: got 'can1', allowed: nothing without a hand file"),
+        (["--bus", "can1"], "--bus: got 'can1', allowed: only with a hand file"),
         (["--hand", "no/such.toml"], "hand file"),
     ],
 )
@@ -145,4 +160,6 @@ def test_nothing_is_changed_in_a_node(bus: BusConfig, powered: Powered, line_on:
     sdo = {data[0] & 0xE0 for can_id, data, _ in sent if can_id & 0x780 == 0x600}
     assert sdo == {0x40, 0x60}  # upload, and its segments
     assert 0x000 not in {can_id for can_id, _, _ in sent}
-    assert {data[0] for can_id, data, _ in sent if can_id == 0x7E5} == {0x4C}
+    # Identify non-configured, and the question of fastscan that asks whether there is anybody.
+    lss = {data for can_id, data, _ in sent if can_id == 0x7E5}
+    assert lss == {b"\x4c" + bytes(7), b"\x51\0\0\0\0\x80\0\0"}

@@ -195,6 +195,63 @@ def test_what_goes_wrong_on_one_bus_is_told_to_its_reader_and_the_others_go_on(
             assert take(receiver, intakes[1], 1) == [3]
 
 
+def test_a_port_that_is_opened_again_before_its_thread_has_ended_is_received_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As on a machine where threads wait long for their turn."""
+    port, failed, tell = Script(3, BusError("script: gone")), threading.Event(), Receiver._tell
+
+    def slowly(receiver: Receiver) -> None:
+        tell(receiver)
+        if port.error is not None and port.played.is_set():
+            failed.set()
+            time.sleep(0.2)
+
+    monkeypatch.setattr(Receiver, "_tell", slowly)
+    intake = Intake(port)
+    with Receiver([intake]) as receiver:
+        assert failed.wait(5)
+        port.left, port.error = 4, None
+        again = threading.Thread(target=receiver.resume, args=(intake,), daemon=True)
+        again.start()
+        again.join(5)
+        ended = not again.is_alive()
+        assert take(receiver, intake, 7) == [0, 1, 2, -1, 0, 1, 2]
+    assert ended
+
+
+@pytest.mark.parametrize("name", ["gather", "_next_awaited", "failed"])
+def test_what_goes_wrong_beside_a_port_is_told_and_all_buses_go_on(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Exception] = []
+    error = ZeroDivisionError("of ours")
+
+    def broken(*args: object) -> None:
+        if len(told) < 3:
+            raise error
+
+    with buses(2) as (ports, senders):
+        intakes = [Intake(port) for port in ports]
+        with Receiver(intakes, told.append) as receiver:
+            with monkeypatch.context() as patch:
+                patch.setattr(Intake, name, property(broken) if name == "failed" else broken)
+                end_s = time.monotonic() + 5
+                while len(told) < 3 and time.monotonic() < end_s:
+                    for send in senders:
+                        send(1)
+                    time.sleep(0.01)
+            assert told == [error] * 3
+            for send, intake in zip(senders, intakes, strict=True):
+                sent = sum(take(receiver, intake, 1)) + intake.queued  # those of before, at least one
+                assert sent
+                send(2)
+                got: list[int] = []
+                while 2 not in got and time.monotonic() < end_s + 5:
+                    got += take(receiver, intake, 1)
+                assert 2 in got
+
+
 def test_a_port_that_is_closed_meanwhile_fails_alone() -> None:
     with buses(2) as (ports, senders):
         intakes = [Intake(port) for port in ports]

@@ -2,7 +2,8 @@
 
 Each code on the model's wire is unique to the scan in which it was sampled and to its place, so that a
 published scan shows by itself what it was made of. Frames are then lost, repeated, delayed and so reordered,
-whole stretches are blacked out, and whatever comes out must be a part of what exactly one scan was.
+whole stretches are blacked out, and whatever comes out must be a part of what exactly one scan was. Where the
+node sends a check, frames are falsified too, and what is published as complete must be the scan itself.
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
 from skinnode.wire.codec import MISSING, SummaryFlag, pack_chunk, pack_summary
 from skinnode.wire.profile import PatchProfile
 
+from ..scan_crc import check_of_scan
+
 PERIOD = 80_000_000
 GRACE = 5_000_000
 PACE = PERIOD // 20
+STEPS_64US = PERIOD // 64_000
 PROFILES = [
     PatchProfile(2, 5, 1, 1, 16),
     PatchProfile(2, 5, 1, 1, 24),
@@ -65,6 +69,7 @@ class ModelNode:
 
     profile: PatchProfile
     counter_overflow: int
+    checked: bool = False
     truth: dict[int, NDArray[np.int64]] = field(default_factory=dict)
     sent: dict[int, tuple[int, ...]] = field(default_factory=dict)
     codes: NDArray[np.int64] = field(init=False)
@@ -92,8 +97,17 @@ class ModelNode:
         for chunk in chosen:
             data = payload(self.profile, chunk, counter, self.codes[owner == chunk].tolist())
             frames.append(Frame(data, t := t + PACE, False, sample))
-        summary = pack_summary(counter, flags, len(chosen), sample)  # device time: the true number
+        summary = self.summary(sample, flags, len(chosen))
         return [*frames, Frame(summary, t + PACE, True, sample)]
+
+    def summary(self, sample: int, flags: int, chunks: int) -> bytes:
+        """With the true number for a device time, or in steps of 64 µs, with a check, the true time."""
+        counter = self.counter(sample)
+        if not self.checked:
+            return pack_summary(counter, flags, chunks, sample)
+        head = struct.pack("<BBHH", counter, flags | 0x20, chunks, sample * STEPS_64US & 0xFFFF)
+        check = check_of_scan(self.truth[sample], self.profile.code_bits, head)
+        return head + struct.pack("<H", check)
 
 
 def receive(
@@ -106,8 +120,7 @@ def receive(
         while polled and (deadline := assembler.next_deadline_ns()) is not None and deadline <= t_ns:
             before = assembler.stats
             published.append(assembler.poll(deadline))
-            thrown = (assembler.stats.scans_mixed, assembler.stats.scans_joined)
-            assert published[-1] is not None or thrown > (before.scans_mixed, before.scans_joined), "in vain"
+            assert published[-1] is not None or thrown_away(assembler.stats) > thrown_away(before), "in vain"
 
     for frame in frames:
         poll(frame.t_ns)
@@ -118,10 +131,19 @@ def receive(
     return [scan for scan in published if scan is not None]
 
 
+def thrown_away(stats: AssemblerStats) -> int:
+    return stats.scans_mixed + stats.scans_joined + stats.scans_corrupt
+
+
 def origin(scan: Scan, node: ModelNode) -> int:
-    """The true number of the scan that ``scan`` claims to be."""
+    """The true number of the scan that ``scan`` claims to be. Of the 16 bits of a device time, which are all
+    that a node sends, it is told apart from the 32,768 scans next to it."""
     if scan.device_time_us is not None:
-        return scan.device_time_us
+        if not node.checked:
+            return scan.device_time_us
+        low = scan.device_time_us // 64 & 0xFFFF
+        (sample,) = (number for number in node.truth if number * STEPS_64US & 0xFFFF == low)
+        return sample
     known = scan.codes[scan.codes != MISSING]
     return int(known.max()) // node.profile.n_codes
 
@@ -148,6 +170,7 @@ def frames_counted(stats: AssemblerStats) -> int:
         + stats.bad_length
         + stats.bad_index
         + stats.bad_counter
+        + stats.bad_form
     )
 
 
@@ -162,7 +185,7 @@ def worlds(draw: st.DrawFn) -> tuple[ModelNode, list[Frame]]:
     """
     overflow = draw(st.sampled_from([2, 3, 5, 8, 240, 0]))
     counters = overflow or 256
-    node = ModelNode(draw(st.sampled_from(PROFILES)), overflow)
+    node = ModelNode(draw(st.sampled_from(PROFILES)), overflow, draw(st.booleans()))
     timeout = PERIOD * min(3, max(1, (counters - 1) // 2))
     duration = (node.profile.n_chunks + 1) * PACE
     longest = min(counters * PERIOD - timeout - duration, 40 * PERIOD) - 1
@@ -212,14 +235,88 @@ def test_no_scan_is_ever_mixed_from_two(world: tuple[ModelNode, list[Frame]], po
     assert all((scan.scan - scan.counter) % counters == 0 for scan in published)
     stats = assembler.stats
     assert frames_counted(stats) == len(frames)
-    assert (stats.scans_complete, stats.scans_torn) == (
+    assert (stats.scans_complete, stats.scans_torn + stats.scans_unchecked) == (
         sum(scan.complete for scan in published),
         sum(not scan.complete for scan in published),
     )
+    assert stats.scans_corrupt == stats.bad_form == 0
+    if node.checked:
+        assert all(
+            scan.valid.all() for scan in published if scan.complete and scan.device_time_us is not None
+        )
+    else:
+        assert stats.scans_unchecked == 0
     came: dict[int, list[int]] = {}
     for frame in frames:
         came.setdefault(frame.sample, []).append(frame.t_ns)
     assert stats.scans_mixed <= sum(max(times) - min(times) > 2 * PERIOD for times in came.values())
+
+
+@st.composite
+def falsified(draw: st.DrawFn) -> tuple[ModelNode, list[Frame]]:
+    """Frames of a node with checks, in order, of which some are lost and some are not as they were sent: a
+    chunk has another code, another counter or another index, a summary other flags, or other numbers."""
+    node = ModelNode(draw(st.sampled_from(PROFILES)), draw(st.sampled_from([5, 240])), checked=True)
+    n, head = node.profile.n_chunks, node.profile.chunk_head_bytes
+    chunks = st.none() | st.sets(st.integers(0, n - 1))
+    frames: list[Frame] = []
+    for sample in range(3, 3 + draw(st.integers(1, 8))):
+        *sent, summary = node.scan(sample, draw(chunks))
+        for frame in sent:
+            match draw(st.sampled_from(["", "", "", "", "lost", "code", "counter", "index"])):
+                case "":
+                    frames.append(frame)
+                case "code":
+                    at = head + draw(st.integers(0, node.profile.code_bits // 8 - 1))
+                    frames.append(changed(frame, at, draw(st.integers(1, 255))))
+                case "counter":
+                    ahead = node.counter(sample + draw(st.sampled_from([-1, 1, 1, 2])))
+                    frames.append(changed(frame, 1, frame.data[1] ^ ahead))
+                case "index" if node.profile.bus == "classic":
+                    frames.append(changed(frame, 0, frame.data[0] ^ draw(st.integers(0, n - 1))))
+        match draw(st.sampled_from(["", "", "", "lost", "CHANGED_ONLY", "fewer", "any", "miscounted"])):
+            case "":
+                frames.append(summary)
+            case "CHANGED_ONLY":
+                frames.append(changed(summary, 1, summary.data[1] & 1 ^ 1))
+            case "fewer":
+                frames.append(changed(summary, 2, summary.data[2] ^ max(0, summary.data[2] - 1)))
+            case "any":
+                frames.append(changed(summary, draw(st.integers(1, 7)), draw(st.integers(1, 255))))
+            case "miscounted":  # by the node itself, whose check is right for what it says
+                fewer = max(0, summary.data[2] - 1)
+                frames.append(dataclasses.replace(summary, data=node.summary(sample, 1, fewer)))
+    return node, frames
+
+
+def changed(frame: Frame, at: int, by: int) -> Frame:
+    data = bytearray(frame.data)
+    data[at] ^= by
+    return dataclasses.replace(frame, data=bytes(data))
+
+
+@settings(deadline=None, max_examples=500)
+@given(world=falsified())
+def test_nothing_false_is_ever_complete(world: tuple[ModelNode, list[Frame]]) -> None:
+    node, frames = world
+    assembler = ScanAssembler(
+        node.profile, counter_overflow=node.counter_overflow, period_ns=PERIOD, grace_ns=GRACE
+    )
+    assembler.expect_check()
+    end_ns = frames[-1].t_ns + 4 * PERIOD if frames else 0
+    published = receive(assembler, frames, until_ns=end_ns)
+    for scan in published:
+        if not scan.complete:
+            continue
+        assert scan.valid.all()
+        truth = node.truth[origin(scan, node)].reshape(scan.codes.shape)
+        if (scan.codes != truth).any():  # one in 65,536: damage that turns the check as little as none does
+            bits = node.profile.code_bits
+            assert check_of_scan(scan.codes, bits, b"") == check_of_scan(truth, bits, b"")
+    stats = assembler.stats
+    assert frames_counted(stats) == len(frames)
+    assert stats.scans_complete == sum(scan.complete for scan in published)
+    assert stats.scans_torn + stats.scans_unchecked == sum(not scan.complete for scan in published)
 
 
 # --- a channel in order: what must come out is known exactly
@@ -231,13 +328,20 @@ def arrivals_in_order(frames: Sequence[Frame], copies: Sequence[int]) -> Iterato
 
 
 @settings(deadline=None, max_examples=150)
-@given(profile=st.sampled_from(PROFILES), overflow=st.sampled_from([5, 240, 0]), data=st.data())
+@given(
+    profile=st.sampled_from(PROFILES),
+    overflow=st.sampled_from([5, 240, 0]),
+    checked=st.booleans(),
+    data=st.data(),
+)
 def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
-    profile: PatchProfile, overflow: int, data: st.DataObject
+    profile: PatchProfile, overflow: int, checked: bool, data: st.DataObject
 ) -> None:
-    node = ModelNode(profile, overflow)
+    node = ModelNode(profile, overflow, checked)
     n = profile.n_chunks
     assembler = ScanAssembler(profile, counter_overflow=overflow, period_ns=PERIOD, grace_ns=GRACE)
+    if checked:
+        assembler.expect_check()
     fates = data.draw(  # of each scan: how often each of its frames arrives, the summary last
         st.lists(st.lists(st.sampled_from([1, 1, 1, 1, 0, 2]), min_size=n + 1, max_size=n + 1), min_size=1)
     )
@@ -257,18 +361,20 @@ def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
         copies = expected[origin(scan, node)]
         assert_from_one_scan(scan, node)
         arrived = [count > 0 for count in copies[:n]]
-        assert scan.complete == all(arrived)
+        assert scan.complete == all(copies if checked else arrived)
         assert (scan.chunks_received, scan.chunks_expected) == (sum(arrived), n)
         assert (scan.device_time_us is None) == (copies[n] == 0)
         shown = np.array(arrived)[owners(profile)]
         np.testing.assert_array_equal(scan.valid.ravel(), shown)
     stats = assembler.stats
     assert stats == AssemblerStats(
-        scans_complete=sum(all(copies[:n]) for _, copies in seen),
+        scans_complete=sum(all(copies if checked else copies[:n]) for _, copies in seen),
         scans_torn=sum(not all(copies[:n]) for _, copies in seen),
+        scans_unchecked=sum(checked and all(copies[:n]) and not copies[n] for _, copies in seen),
         scans_missed=seen[-1][0] - seen[0][0] + 1 - len(seen) if seen else 0,
         scans_discarded=0,
         scans_mixed=0,
+        scans_corrupt=0,
         scans_joined=0,
         chunks_accepted=sum(min(count, 1) for _, copies in seen for count in copies[:n]),
         summaries_accepted=sum(min(copies[n], 1) for _, copies in seen),
@@ -280,6 +386,7 @@ def test_counters_are_exact_when_frames_are_only_lost_and_repeated(
         bad_length=0,
         bad_index=0,
         bad_counter=0,
+        bad_form=0,
         resyncs=0,
     )
 
@@ -418,6 +525,18 @@ def test_half_the_counter_range_ahead_is_newer_and_the_rest_late(
     assert len(published) == is_newer
     assert assembler.stats.late == (0 if is_newer else len(last))
     assert assembler.stats.scans_missed == (ahead - 1 if is_newer else 0)
+
+
+@pytest.mark.parametrize(
+    ("overflow", "periods"), [(2, 1), (3, 1), (4, 1), (5, 2), (6, 2), (7, 3), (8, 3), (240, 3), (0, 3)]
+)
+def test_a_scan_is_waited_for_no_longer_than_its_counter_tells_it_apart(overflow: int, periods: int) -> None:
+    """At most three periods, and less than half the counter's range: a later frame may be of another scan."""
+    node = ModelNode(PROFILES[0], overflow)
+    assembler = ScanAssembler(PROFILES[0], counter_overflow=overflow, period_ns=PERIOD)
+    first = node.scan(7)[0]
+    receive(assembler, [first])
+    assert assembler.next_deadline_ns() == first.t_ns + periods * PERIOD
 
 
 def test_a_scan_that_stops_half_way_is_published_at_the_timeout(
@@ -641,7 +760,14 @@ def test_frames_of_the_wrong_length_are_rejected_and_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"counter_overflow": 1}, {"counter_overflow": 241}, {"period_ns": 0}, {"grace_ns": -1}]
+    "arguments",
+    [
+        {"counter_overflow": -5},
+        {"counter_overflow": 1},
+        {"counter_overflow": 241},
+        {"period_ns": 0},
+        {"grace_ns": -1},
+    ],
 )
 def test_settings_that_cannot_be_are_refused(arguments: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="allowed"):

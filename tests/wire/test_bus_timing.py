@@ -132,7 +132,8 @@ def test_bus_load_counts_foreign_frames_and_many_of_them() -> None:
     assert load.frames == 10_002
     extra = exact_bits(0x1234_5678, b"\x01", extended=True) + exact_bits(0x705, b"", remote=True, dlc=1)
     assert load.bits == 10_000 * 53 + extra
-    assert load.load(0.0) == 0.0
+    assert load.load(1.0) == load.bits / 1_000_000  # the bit rate of a bus that says nothing else
+    assert load.load(0.0) == load.load(-1.0) == 0.0
 
 
 def test_kernels_are_not_loaded_in_passing(monkeypatch: pytest.MonkeyPatch) -> None:

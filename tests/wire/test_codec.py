@@ -113,6 +113,7 @@ def test_zero_is_a_short_even_where_the_range_begins_at_zero() -> None:
     scale = CodeScale(16, 0.0, 2.0)
     assert encode(0.0, 1e4, scale) == scale.short
     assert encode(1e4, np.inf, scale) == scale.over_range
+    assert encode(1e-6, -0.5, scale) == scale.over_range  # rounds to the code 0, but R0 is no baseline
 
 
 @pytest.mark.parametrize("bits", [16, 24])
@@ -169,7 +170,7 @@ def test_payloads_are_these_bytes() -> None:
 def test_payloads_read_back() -> None:
     assert unpack_chunk(bytes.fromhex("0507010003 02ffff")) == (5, 7, (1, 0x0203, 0xFFFF))
     assert unpack_chunk(bytes.fromhex("fff0030201feffff"), 24) == (255, 240, (0x010203, 0xFFFFFE))
-    assert unpack_summary(bytes.fromhex("0703640078563412")) == (7, 3, 100, 0x12345678)
+    assert unpack_summary(bytes.fromhex("0703640078563412")) == (7, 3, 100, 0x12345678, None)
     assert unpack_command(b"tare\x01\x01") == (int.from_bytes(b"tare", "little"), 1, 1)
     assert unpack_command(b"tare\x01\x01\x99\x99") == unpack_command(b"tare\x01\x01")
 
@@ -237,7 +238,19 @@ def test_over_can_fd_a_frame_is_a_part_of_one_wire(
         assert chunk_of_code(profile)[wire_start] == chunk
 
 
-@pytest.mark.parametrize("length", [0, 7, 9, 64])
+@pytest.mark.parametrize(
+    ("wire", "column"), [(0, 256), (2, 512), (0, 0x8000), (0, 30), (1, 58), (0, 87), (3, 0)]
+)
+def test_over_can_fd_a_frame_of_no_chunk_has_the_number_after_the_last(wire: int, column: int) -> None:
+    """The first column is beyond the wire (also where its low byte is that of a chunk) or inside a chunk, or
+    the wire does not exist."""
+    profile = PatchProfile(3, 58, 1, 1, 16, bus="fd")
+    index = chunk_indexer(profile)
+    assert [index(struct.pack("<BBH", *at).ljust(64)) for at in ((0, 9, 29), (2, 9, 0))] == [1, 4]
+    assert index(struct.pack("<BBH", wire, 9, column).ljust(64)) == profile.n_chunks
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 9, 64])
 def test_a_payload_of_the_wrong_length_is_refused_in_one_line(length: int) -> None:
     data = bytes(length)
     for unpack in (unpack_chunk, unpack_summary):
@@ -245,7 +258,8 @@ def test_a_payload_of_the_wrong_length_is_refused_in_one_line(length: int) -> No
             unpack(data, cob_id=0x185)
         assert caught.value.cob_id == 0x185
         assert caught.value.data == data
-        assert str(caught.value).startswith(f"COB-ID 0x185: got {length} bytes")
+        unit = "byte" if length == 1 else "bytes"
+        assert str(caught.value).startswith(f"COB-ID 0x185: got {length} {unit} (")
         assert "allowed: 8 bytes" in str(caught.value)
         assert "\n" not in str(caught.value)
 

@@ -6,6 +6,7 @@ import io
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import canopen
@@ -19,7 +20,7 @@ from skinnode.cli.eds import eds
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
 from skinnode.wire import indices as od
-from skinnode.wire.codec import pack_command, pack_scan, pack_summary
+from skinnode.wire.codec import pack_checked_summary, pack_command, pack_scan, pack_summary
 from skinnode.wire.dictionary import DataType, Entry, ObjectType
 from skinnode.wire.profile import (
     DEFAULT_PERIOD_MS,
@@ -152,7 +153,7 @@ def test_cob_ids_are_the_predefined_connection_set() -> None:
 def test_every_object_asked_for_is_there_with_its_type() -> None:
     types = {item.index: item.type for item in REFERENCE_PROFILES[0].objects()}
     var, array, record = ObjectType.VAR, ObjectType.ARRAY, ObjectType.RECORD
-    expected = dict.fromkeys((0x1000, 0x1001, 0x1005, 0x1006, 0x1008, 0x1009, 0x100A, 0x100C), var)
+    expected = dict.fromkeys((0x1000, 0x1001, 0x1005, 0x1006, 0x1007, 0x1008, 0x1009, 0x100A, 0x100C), var)
     expected |= dict.fromkeys((0x100D, 0x1012, 0x1014, 0x1015, 0x1017, 0x1019), var)
     expected |= dict.fromkeys((0x1003, 0x1010, 0x1011, 0x1016, 0x1020, 0x1029), array)
     expected |= dict.fromkeys((0x1018, 0x1200), record)
@@ -222,12 +223,13 @@ def test_canopen_decodes_our_payloads_through_the_default_mapping(reference: Pat
     else:
         wire, first = (9, 0) if per == 30 else (4, 15)
         head, codes = [wire, 200, first], scan[wire, first : first + per].tolist()
-    summary.data = bytearray(pack_summary(200, 3, 77, 0xDEADBEEF))
+    summary.data = bytearray(pack_checked_summary(200, 3, 77, 0xDEADBEEF, 0x1234))
     command.data = bytearray(pack_command(tare=True, single_scan=True))
     assert [(v.index, v.subindex, v.raw) for v in chunk] == [
         (0x2010, sub, value) for sub, value in enumerate([*head, *codes], 1)
     ]
-    assert [v.raw for v in summary] == [200, 3, 77, 0xDEADBEEF]
+    check = int.from_bytes(summary.data[6:], "little")
+    assert [v.raw for v in summary] == [200, 0x23, 77, 0xDEADBEEF >> 6 & 0xFFFF, check]
     assert [(v.index, v.subindex, v.raw) for v in command] == [
         (0x2021, 4, od.TARE_SIGNATURE),
         (0x2021, 5, 1),
@@ -240,6 +242,21 @@ def test_canopen_decodes_our_payloads_through_the_default_mapping(reference: Pat
     )
     assert (summary.cob_id, summary.trans_type) == (0x285, 1)
     assert (command.cob_id, command.trans_type) == (0x205, 255)
+
+
+@pytest.mark.parametrize("reference", REFERENCE_PROFILES, ids=eds_name)
+def test_a_patch_of_revision_1_0_maps_32_bits_of_time_and_has_no_check(reference: PatchProfile) -> None:
+    old = replace(reference, checked=False)
+    node = canopen.Network().add_node(canopen.RemoteNode(NODE_ID, load(eds_text(old))))
+    node.tpdo.read(from_od=True)
+    node.tpdo[2].data = bytearray(pack_summary(200, 3, 77, 0xDEADBEEF))
+    assert [v.raw for v in node.tpdo[2]] == [200, 3, 77, 0xDEADBEEF]
+    assert node.object_dictionary[0x1018][3].default == 0x0001_0000
+    assert len(node.object_dictionary[0x2011]) == 5  # sub-index 0 and four
+    others = (0x1018, 0x1A01, 0x2011)
+    assert [o for o in old.objects() if o.index not in others] == [
+        o for o in reference.objects() if o.index not in others
+    ]
 
 
 # --- sizes
@@ -340,10 +357,10 @@ def test_the_command_takes_the_sizes_of_a_layout(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--dcf"], "--node-id: got None, allowed: 1 to 127, for --dcf"),
-        (["--node-id=4"], "--node-id: got 4, allowed: nothing without --dcf"),
-        (["--bitrate=500000"], "--bitrate: got 500000, allowed: nothing without --dcf"),
-        (["--layout=aligned", "--lower-wires=4"], "--lower-wires: got 4, allowed: nothing beside --layout"),
+        (["--dcf"], "--node-id: got nothing, allowed: 1 to 127, for --dcf"),
+        (["--node-id=4"], "--node-id: got 4, allowed: only with --dcf"),
+        (["--bitrate=500000"], "--bitrate: got 500000, allowed: only with --dcf"),
+        (["--layout=aligned", "--lower-wires=4"], "--lower-wires: got 4, allowed: only without --layout"),
         (
             ["--layout=wavy"],
             "--layout: got 'wavy', allowed: aligned, symmetric, staggered, FILE.toml, FILE.npz or",

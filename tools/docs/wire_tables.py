@@ -14,7 +14,15 @@ from skinnode.node.abort import AbortCode
 from skinnode.node.emcy import EmcyCode
 from skinnode.node.rejected import Rejected
 from skinnode.wire import indices as od
-from skinnode.wire.codec import CodeScale, SummaryFlag, encode, pack_command, pack_scan, pack_summary
+from skinnode.wire.codec import (
+    CodeScale,
+    SummaryFlag,
+    check_of_codes,
+    encode,
+    pack_checked_summary,
+    pack_command,
+    pack_scan,
+)
 from skinnode.wire.dictionary import Entry, Object, highest
 from skinnode.wire.emergency import error_text
 from skinnode.wire.profile import REFERENCE_PROFILES, PatchProfile, eds_name
@@ -109,8 +117,10 @@ def example_scan() -> str:
         (od.chunk_cob_id(NODE_ID), frames[-1], "chunk 99: crossings 9/27, 9/28, 9/29"),
         (
             od.summary_cob_id(NODE_ID),
-            pack_summary(scan, SummaryFlag.WIRE_FAULT, PROFILE.n_chunks, 560_000),
-            "summary: 100 chunks, a wire fault, device time 560 000 µs",
+            pack_checked_summary(
+                scan, SummaryFlag.WIRE_FAULT, PROFILE.n_chunks, 560_000, check_of_codes(codes, PROFILE)
+            ),
+            "summary: 100 chunks, a wire fault, device time 560 000 µs, scan check",
         ),
         (od.command_cob_id(NODE_ID), pack_command(tare=True), "command: tare"),
         (od.command_cob_id(NODE_ID), pack_command(single_scan=True), "command: one scan now"),
@@ -170,7 +180,11 @@ def manufacturer() -> str:
 
 def emergencies() -> str:
     """The error codes that a node sends."""
-    rows = ((md.c_hex(code), error_text(code), md.c_hex(code.register_bit, 2)) for code in EmcyCode if code)
+    rows = (
+        (md.c_hex(code), error_text(code, ours=True), md.c_hex(code.register_bit, 2))
+        for code in EmcyCode
+        if code
+    )
     return md.table(("code", "what happened", "bit of 0x1001 beside bit 0"), rows)
 
 

@@ -22,6 +22,7 @@ from skinnode.conformance.pdo import (
     tpdos,
 )
 from skinnode.conformance.sdo import Aborted, expedited
+from skinnode.words import counted
 
 NOT_MAPPABLE = (0x0602_0000, 0x0604_0041)
 TOO_MUCH = (0x0602_0000, 0x0604_0041, 0x0604_0042)
@@ -82,7 +83,9 @@ def default_mapping(dut: Dut) -> None:
     for pdo in pdos:
         words = mapped(dut, pdo)
         if payload_bytes(words) > _most_bytes(dut):
-            raise Failed(f"{pdo} of at most {_most_bytes(dut)} bytes", f"{payload_bytes(words)} bytes")
+            raise Failed(
+                f"{pdo} of at most {counted(_most_bytes(dut), 'byte')}", counted(payload_bytes(words), "byte")
+            )
         for subindex, word in enumerate(words, 1):
             _check_mapped(dut, pdo, subindex, word)
 
@@ -94,7 +97,7 @@ def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
             raise Failed(f"{where} to name an object or an allowed dummy", f"0x{word:08X}")
         return
     entry = dut.eds.find(word >> 16, word >> 8 & 0xFF)
-    if entry is None or word & 0xFF != 8 * entry.size:
+    if entry is None or (entry.size and word & 0xFF != 8 * entry.size):  # a string may have any length
         raise Failed(f"{where} to name an object of the EDS and its length", f"0x{word:08X}")
     if not (entry.into_tpdo if pdo.transmits else entry.into_rpdo):
         raise Failed(f"{where} to name an object that may be mapped into {pdo}", str(entry))

@@ -10,6 +10,7 @@ from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, Dut
 from skinnode.conformance.eds import SIGNED, UNSIGNED, EdsEntry
 from skinnode.conformance.sdo import expedited, mux
+from skinnode.words import counted
 
 READ_ONLY = (0x0601_0000, 0x0601_0002)
 WRITE_ONLY = (0x0601_0000, 0x0601_0001)
@@ -231,7 +232,7 @@ def read_announced(dut: Dut) -> None:
     if answer[0] != 0x41:
         raise Failed(f"41 … to {what}", answer.hex(" ").upper())
     if int.from_bytes(answer[4:], "little") != len(value):
-        raise Failed(f"{len(value)} bytes announced, {what}", answer.hex(" ").upper())
+        raise Failed(f"{counted(len(value), 'byte')} announced, {what}", answer.hex(" ").upper())
     dut.sdo.abort(entry.index, entry.subindex)
 
 

@@ -23,6 +23,7 @@ from skinnode.conformance.pdo import (
 )
 from skinnode.conformance.provoke import COMMUNICATION_LOST, expect_emcy, lose_partner
 from skinnode.conformance.sdo import mux
+from skinnode.words import counted
 
 _BEHAVIOUR = 0x1029
 _EVENT_MS = 20
@@ -122,7 +123,7 @@ def operational(dut: Dut) -> None:
     for can_id, length in can_ids.items():
         frame = dut.bus.expect(can_id, f"a TPDO each {_EVENT_MS} ms in OPERATIONAL")
         if len(frame.data) != length:
-            raise Failed(f"a TPDO of {length} bytes", describe(frame))
+            raise Failed(f"a TPDO of {counted(length, 'byte')}", describe(frame))
     entry = dut.eds.find(_BEHAVIOUR, 1)
     behaviours = (0, 1, 2) if entry is not None and entry.writable else (0,)
     for behaviour in behaviours:

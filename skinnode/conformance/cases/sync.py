@@ -8,6 +8,7 @@ from skinnode.conformance.dut import STORE, Dut
 from skinnode.conformance.pace import check_period
 from skinnode.conformance.pdo import SYNC_ID, Pdo, drain, mapped, payload_bytes, set_up, sync, tpdos
 from skinnode.conformance.sdo import Aborted, expedited
+from skinnode.words import counted
 
 COB_ID, PERIOD, OVERFLOW = 0x1005, 0x1006, 0x1019
 PRODUCE = 1 << 30
@@ -71,7 +72,7 @@ def count(dut: Dut) -> None:
     frames = dut.bus.pending(can_id)
     if len(frames) != 3 or any(len(frame.data) != length for frame in frames):
         raise Failed(
-            f"{pdo} 3 times, {length} bytes",
+            f"{pdo} 3 times, {counted(length, 'byte')}",
             f"{len(frames)} times: {describe(frames[0] if frames else None)}",
         )
 

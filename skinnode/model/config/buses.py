@@ -78,7 +78,7 @@ class BusConfig(Table):
     def _none_of_ours(cls, value: Any) -> Any:
         for key, option in value.items() if isinstance(value, dict) else ():
             if key in _OURS:
-                raise ConfigError(key, short(option), "a key of [[buses]] says this already")
+                raise ConfigError(key, short(option), "no such option here: [[buses]] has a key for it")
             if not isinstance(option, bool | int | float | str):
                 raise ConfigError(key, short(option), "a text, a number, true or false")
         return value

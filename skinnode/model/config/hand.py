@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
-from skinnode.errors import NOTHING, ConfigError
+from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.model.config.buses import BringUpConfig, BusConfig, SyncConfig
 from skinnode.model.config.explain import first_error, key_path, short
 from skinnode.model.config.patches import PatchConfig
@@ -17,6 +17,12 @@ from skinnode.model.config.simulation import SimulationConfig
 from skinnode.model.config.table import Allowed, Name, Table
 from skinnode.model.layout_file import impossible
 from skinnode.model.toml_text import Document, read_toml
+
+NODE_IDS: Final = 127
+"""Number of node-IDs on a bus (CiA 301 v4.2, 7.3.2)."""
+
+MOST_BUSES: Final = 64
+"""Maximum buses of a hand, far more than one machine has interfaces."""
 
 
 class HandConfig(Table):
@@ -66,13 +72,32 @@ class HandConfig(Table):
         Raises ConfigError where a channel is given for a hand of several buses.
         """
         if channel is not None and len(self.buses) > 1:
-            raise ConfigError("--channel", channel, f"no channel for a hand of {len(self.buses)} buses")
+            raise ConfigError(
+                "--channel", channel, f"only for a hand with one bus; this one has {len(self.buses)}"
+            )
         change = {"interface": interface, "channel": channel}
         kept = {key: value for key, value in change.items() if value is not None}
         for key, value in kept.items():
             if not value:
                 raise ConfigError(f"--{key}", value, "a name")
         return self.model_copy(update={"buses": tuple(bus.model_copy(update=kept) for bus in self.buses)})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _counts(cls, table: Any) -> Any:
+        """Check the number of buses and patches before building them: ten thousand patches would take
+        minutes."""
+        if isinstance(table, Mapping):
+            buses, patches = table.get("buses"), table.get("patches")
+            if isinstance(buses, list) and len(buses) > MOST_BUSES:
+                raise ConfigError("buses", Shown(f"{len(buses)} of them"), f"at most {MOST_BUSES}")
+            if isinstance(patches, list) and isinstance(buses, list):
+                most = NODE_IDS * len(buses)
+                if len(patches) > most > 0:
+                    on = "it has" if len(buses) == 1 else f"{len(buses)} have"
+                    allowed = f"at most {most}: a bus has node-IDs 1 to {NODE_IDS}, and {on} no more"
+                    raise ConfigError("patches", Shown(f"{len(patches)} of them"), allowed)
+        return table
 
     @model_validator(mode="after")
     def _cross_checks(self) -> HandConfig:
@@ -106,7 +131,9 @@ class HandConfig(Table):
         for i, bus in enumerate(self.buses):
             node_ids = [patch.node_id for patch in self.patches_on(bus.name)]
             if bus.role == "guest" and bus.heartbeat_node_id is not None:
-                raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, "none for a guest")
+                raise ConfigError(
+                    f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, 'only with role = "master"'
+                )
             if bus.heartbeat_node_id in node_ids:
                 allowed = "an integer from 1 to 127 that no node has"
                 raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, allowed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -77,7 +78,7 @@ class LayoutConfig(Table):
     def _file_or_keys(self) -> LayoutConfig:
         if self.file is not None:
             for key in sorted(self.model_fields_set - {"file", "coordinates"}):
-                raise ConfigError(key, getattr(self, key), "nothing beside layout.file, which says it")
+                raise ConfigError(key, getattr(self, key), "only without layout.file, which sets it")
         return self
 
     def build(self) -> PatchLayout:
@@ -85,7 +86,7 @@ class LayoutConfig(Table):
         none."""
         if self.file is not None:
             return load_layout(self.file)
-        return PatchLayout.preset(
+        return _preset(
             self.preset,
             pitch_m=self.pitch_m,
             height_m=self.height_m,
@@ -95,6 +96,13 @@ class LayoutConfig(Table):
             lower_electrodes=self.lower_electrodes,
             resistivity_ohm_per_m=self.resistivity_ohm_per_m,
         )
+
+
+@functools.lru_cache(maxsize=256)
+def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
+    """Return a cached layout: patches of a hand are mostly alike and built at every check, and layouts are
+    immutable."""
+    return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
 
 class PoseConfig(Table):
@@ -120,7 +128,7 @@ class PoseConfig(Table):
     @model_validator(mode="after")
     def _is_one(self) -> PoseConfig:
         if self.quaternion_xyzw is not None and self.rpy_rad is not None:
-            raise ConfigError("rpy_rad", list(self.rpy_rad), "nothing beside quaternion_xyzw")
+            raise ConfigError("rpy_rad", list(self.rpy_rad), "only without quaternion_xyzw")
         try:
             self.build()
         except ValueError as error:

@@ -43,8 +43,8 @@ class StreamConfig(Table):
     """What becomes of scans and fields on their way to a program."""
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
-    """A scan with chunks missing: ``pass`` it on with a mask of what is valid, or ``withhold`` it. Either way
-    it is counted."""
+    """A scan that is not complete, because chunks or the summary with its check were lost: ``pass`` it on,
+    unchecked, with a mask of what is valid, or ``withhold`` it. Either way it is counted."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
     """Fields that a subscriber may lag behind before it loses the oldest: more than a second of four patches
     at 12.5 scans a second."""

@@ -1,0 +1,169 @@
+"""Error against time of a few wires, ours beside every peer on the same compiled F and J.
+
+The wires are those pressed deepest; the samples of the press have no noise. Every solver starts from rest,
+either on the last sample alone or sample by sample, each solved from the solution of the one before, as the
+paper does it; at several tolerances, a point each. Beside the bare operators stands ``solve_path``, whose
+time has in it what the others leave out: setting up the patch, following the branch, the error estimate.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench.cases import preset
+from skinnode.bench.solve import Case, Solve, peers
+from skinnode.bench.truth import Press, Skin
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.status import Status
+from skinnode.solve.homotopy import solve_path
+from skinnode.solve.operators import OPERATORS
+from skinnode.solve.problem import PatchProblem
+from skinnode.solve.schedule import Adaptive, Periodic, Schedule, Uniform
+
+SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
+"""Preset, height in pitches, depth in heights: one that all solve from rest, one that needs the samples, and
+the paper's own layout."""
+TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
+SAMPLES: Final = (1, 5, 10, 20)
+SOLVED: Final = 0.01
+"""Largest error, as a share of the displacement, that is drawn: beyond it nothing was found."""
+ROUNDING: Final = 1e-11
+"""Errors below are equal: rounding of F through the condition of J decides about them."""
+LOOSE: Final = 1e-6
+"""Tolerance on the way, the paper's."""
+REPEATS: Final = 7
+LONG_S: Final = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A few upper wires and the samples of their press."""
+
+    name: str
+    layout: PatchLayout
+    samples_ohm: Float
+    """(T, U, K), the first after rest."""
+    truth_m: Float
+    """(U, N, 3) at the last."""
+
+    def thinned(self, samples: int) -> Float:
+        """So many of the samples, evenly spaced, the last among them."""
+        step = len(self.samples_ohm) // samples
+        return self.samples_ohm[step - 1 :: step]
+
+    def error(self, displacement_m: Float) -> float:
+        """As a share of the displacement."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
+
+
+def scene_of(name: str, height: float, depth: float) -> Scene:
+    """The four middle wires of a preset under a sphere at ``depth`` heights."""
+    full = preset(name, height)
+    layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
+    press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))
+    skin = Skin(layout)
+    moved = [skin.displacement_m((press,), share) for share in np.linspace(0, 1, max(SAMPLES) + 1)[1:]]
+    samples = np.stack([skin.resistance_ohm(each) for each in moved])
+    return Scene(f"{name} h={height:g}, {depth:.0%}", layout, samples, moved[-1])
+
+
+def _timed_us(call: Callable[[], object]) -> float:
+    """The fastest of a few, since what else runs on the machine only adds; fewer where one takes long."""
+    times: list[float] = []
+    while len(times) < REPEATS and sum(times) < LONG_S:
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return 1e6 * min(times)
+
+
+def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tuple[float, float, bool]:
+    """µs a wire, error, whether every wire converged."""
+    frames = scene.thinned(samples)
+    call = functools.partial(solve_path, scene.layout, frames, operator=operator, schedule=schedule)
+    path = call()
+    converged = all(status is Status.CONVERGED for status in path.status)
+    return _timed_us(call) / len(frames[0]), scene.error(path.displacement_m), converged
+
+
+def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
+    """µs a wire, error."""
+    problem = PatchProblem.of(scene.layout)
+    truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
+    frames = scene.thinned(samples) * problem.gain
+    found = problem.rest.copy()
+
+    def paths() -> None:
+        for wire in range(len(found)):
+            x = problem.rest[wire]
+            for number, frame in enumerate(frames[:, wire], 1):
+                loose = tolerance if number == len(frames) else max(tolerance, LOOSE)
+                x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
+            found[wire] = x
+
+    with np.errstate(all="ignore"):  # a solver that diverges says so by its error
+        us = _timed_us(paths) / len(found)
+        return us, scene.error(problem.displacement_m(found))
+
+
+def pareto(rows: list[dict[str, Any]]) -> list[int]:
+    """Rows that solved and that nobody beats in time and error at once, the fastest first."""
+    front: list[int] = []
+    best = SOLVED
+    for index in sorted(range(len(rows)), key=lambda i: (rows[i]["us"], rows[i]["error"])):
+        error = max(rows[index]["error"], ROUNDING)
+        if error < best:
+            best = error
+            front.append(index)
+    return front
+
+
+def run() -> list[dict[str, Any]]:
+    """A scatter for each scene: rows with time, error, and whether they are on the front."""
+    panels = []
+    for setting in SCENES:
+        scene = scene_of(*setting)
+        rows = _rows(scene)
+        front = pareto(rows)
+        for index, row in enumerate(rows):
+            row["front"] = index in front
+        panels.append({"scene": scene.name, "rows": rows})
+    return panels
+
+
+def _rows(scene: Scene) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    solvers = peers(PatchProblem.of(scene.layout))
+    del solvers["skinnode solve_system, Python callables"]  # the same operator, called from outside
+    for tolerance in TOLERANCES:
+        for name, solve in solvers.items():
+            for samples in (1, 10):
+                us, error = _bare(scene, solve, samples, tolerance)
+                how = "from rest" if samples == 1 else f"along {samples} samples"
+                rows.append({"who": name, "how": how, "tolerance": tolerance, "us": us, "error": error})
+        for how, (schedule, samples) in _schedules(tolerance).items():
+            for operator in OPERATORS:
+                us, error, converged = _path(scene, operator, schedule, samples)
+                row = {"who": f"solve_path {operator}", "how": how, "tolerance": tolerance, "us": us}
+                rows.append(row | {"error": error, "converged": converged})
+    return rows
+
+
+def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
+    """By name: the schedule, and the number of samples it gets."""
+    loose = max(tolerance, LOOSE)
+    uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
+    found: dict[str, tuple[Schedule, int]] = {
+        f"Uniform, {count} sample{'s' * (count > 1)}": (uniform, count) for count in SAMPLES
+    }
+    most = max(SAMPLES)
+    found[f"Periodic, {most} samples"] = Periodic(final_tolerance=tolerance), most
+    found["Adaptive, 1 sample"] = Adaptive(final_tolerance=tolerance), 1
+    return found

@@ -1,0 +1,327 @@
+"""Error against noise, code width and layout, and how honest the reported deviations are.
+
+Every scene is followed in four frames from rest; the last one counts. Errors and deviations are pooled over
+scenes and coordinates of the wires that converged, as RMS shares of the displacement.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench import methods
+from skinnode.bench.cases import Case, preset
+from skinnode.bench.score import bound_std_m
+from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, stream
+from skinnode.model.frames import Z_95, FieldFrame
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.model.status import Status
+from skinnode.solve.estimate import PRIOR_DOUBT, SMOOTH_SHARE
+
+METHODS: Final = ("exact", "posterior")
+SIGMAS: Final = (1e-6, 4e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+BITS: Final = (12, 14, 16, 24)
+LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
+PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+FEWEST: Final = 1000
+"""Coordinates for a quantile of 99.9 %."""
+SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
+
+PROTOTYPE: Final = {
+    ("staggered", 0.3): {
+        "exact": {1e-5: 0.02},
+        "posterior": {4e-6: 0.007, 1e-5: 0.015, 1e-4: 0.09, 1e-3: 0.30},
+    },
+    ("staggered", 0.5): {
+        "exact": {1e-5: 0.03},
+        "posterior": {4e-6: 0.009, 1e-5: 0.022, 1e-4: 0.10, 1e-3: 0.29},
+    },
+    ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
+    ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
+}
+"""RMS error of the prototype in the design notes: a 10 % press with shear by one Hertz-like indenter."""
+
+
+@dataclass
+class Pool:
+    """Errors and deviations of many scenes."""
+
+    scenes: int = 0
+    wires: int = 0
+    converged: int = 0
+    covered: int = 0
+    coordinates: int = 0
+    _error: float = 0.0
+    _variance: float = 0.0
+    _size: float = 0.0
+
+    def add(self, frame: FieldFrame, truth_m: Float) -> None:
+        """``truth_m``: (U, N, 3)"""
+        used = np.array([status is Status.CONVERGED for status in frame.status])
+        error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
+        self.scenes += 1
+        self.wires += used.size
+        self.converged += int(used.sum())
+        self.covered += int((np.abs(error) <= frame.half_width_95_m[used]).sum())
+        self.coordinates += error.size
+        self._error += float((error**2).sum())
+        self._variance += float((std**2).sum())
+        self._size += float((truth_m[used] ** 2).sum())
+
+    def row(self) -> dict[str, Any]:
+        """NaN where no wire converged."""
+        size = self._size or math.nan
+        return {
+            "scenes": self.scenes,
+            "converged": self.converged / self.wires,
+            "error": math.sqrt(self._error / size),
+            "reported": math.sqrt(self._variance / size),
+            "ratio": math.sqrt(self._error / (self._variance or math.nan)),
+            "coverage": self.covered / (self.coordinates or math.nan),
+        }
+
+
+@dataclass
+class Parts:
+    """Errors of the posterior against its variance n + b: n by the noise, b by what the prior leaves open."""
+
+    _error: list[Float] = field(default_factory=list)
+    _noise: list[Float] = field(default_factory=list)
+    _left: list[Float] = field(default_factory=list)
+
+    def add(self, frame: FieldFrame, truth_m: Float) -> None:
+        """``truth_m``: (U, N, 3). A held frame's deviations have more in them and do not count."""
+        if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
+            return
+        used = np.array([status is Status.CONVERGED for status in frame.status])
+        wide, core = frame.displacement_std_m[used] ** 2, frame.core_std_m[used] ** 2
+        left = (wide - core) / (PRIOR_DOUBT - SMOOTH_SHARE)
+        self._error.append(np.abs(frame.displacement_m - truth_m)[used].ravel())
+        self._noise.append((wide - PRIOR_DOUBT * left).ravel())
+        self._left.append(left.ravel())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """By the prior's share b / (n + b): error / √(n + b), its RMS, quantiles and kurtosis, beside the RMS
+        that n alone would give; and how much of b is in the errors."""
+        if not self._error:
+            return []
+        error, noise, left = (np.concatenate(each) for each in (self._error, self._noise, self._left))
+        share, z = left / (noise + left), error / np.sqrt(noise + left)
+        found = []
+        for low, high in itertools.pairwise(PRIOR_SHARES):
+            chosen = (share >= low) & (share < high)
+            if np.count_nonzero(chosen) >= FEWEST:
+                square, own = z[chosen] ** 2, share[chosen]
+                found.append(
+                    {"from": low, "to": high, "coordinates": int(chosen.sum())}
+                    | {"rms": float(np.sqrt(square.mean())), "by_noise": float(np.sqrt(1.0 - own.mean()))}
+                    | {"in_errors": float((square - 1.0 + own).mean() / own.mean())}
+                    | {f"q{at}": float(np.quantile(z[chosen], at / 1000)) for at in (950, 999)}
+                    | {"kurtosis": float((square**2).mean() / square.mean() ** 2)}
+                )
+        return found
+
+
+@dataclass
+class Bound:
+    """The Cramér-Rao bound of the wires without a prior, computed at the truth from the NumPy model."""
+
+    _variance: float = 0.0
+    _size: float = 0.0
+
+    def add(self, layout: PatchLayout, taken: Stream) -> None:
+        """The last frame of a stream."""
+        truth = taken.truth_m[-1]
+        std = bound_std_m(layout, layout.upper_m + truth, taken.noise[-1])
+        self._variance += float((std**2).sum())
+        self._size += float((truth**2).sum())
+
+    @property
+    def share(self) -> float:
+        """Of the displacement."""
+        return math.sqrt(self._variance / self._size)
+
+
+@dataclass
+class Forces:
+    """Contacts found against the truth; forces, where any contact was found, as shares of the true one,
+    centroids in metres."""
+
+    found_right: int = 0
+    found_none: int = 0
+    scenes: int = 0
+    _normal: list[tuple[float, float, float]] = field(default_factory=list)
+    _shear: list[tuple[float, float, float]] = field(default_factory=list)
+    _place: list[tuple[float, float]] = field(default_factory=list)
+
+    def add(self, frame: FieldFrame, taken: Stream) -> None:
+        """The last frame of a stream."""
+        contacts, truth = frame.contacts, taken.force_n[-1]
+        self.scenes += 1
+        self.found_right += len(contacts) == len(taken.presses)
+        if not contacts:
+            self.found_none += 1
+            return
+        normal = sum(contact.normal_force_n for contact in contacts)
+        normal_std = math.sqrt(sum(contact.normal_force_std_n**2 for contact in contacts))
+        self._normal.append((normal + truth[2], normal_std, -truth[2]))
+        for axis in range(2):
+            shear = sum(float(contact.shear_force_n[axis]) for contact in contacts)
+            std = math.sqrt(sum(float(contact.shear_force_std_n[axis]) ** 2 for contact in contacts))
+            self._shear.append((shear - truth[axis], std, -truth[2]))
+        if len(contacts) == len(taken.presses) == 1:
+            for axis in range(2):
+                off = contacts[0].centroid_m[axis] - taken.presses[0].center_m[axis]
+                self._place.append((float(off), float(contacts[0].centroid_std_m[axis])))
+
+    def row(self) -> dict[str, Any]:
+        """RMS errors and deviations, and the shares within 95 % intervals."""
+        figures: dict[str, Any] = {
+            "contacts_right": self.found_right / self.scenes,
+            "contacts_none": self.found_none / self.scenes,
+        }
+        for name, values in (("normal", self._normal), ("shear", self._shear)):
+            if not values:
+                continue
+            error, std, size = np.array(values).T
+            figures[f"{name}_error"] = float(np.sqrt(np.mean((error / size) ** 2)))
+            figures[f"{name}_reported"] = float(np.sqrt(np.mean((std / size) ** 2)))
+            figures[f"{name}_coverage"] = float(np.mean(np.abs(error) <= Z_95 * std))
+        if self._place:
+            off, std = np.array(self._place).T
+            figures["centroid_error_m"] = float(np.sqrt(np.mean(off**2)))
+            figures["centroid_reported_m"] = float(np.sqrt(np.mean(std**2)))
+            figures["centroid_coverage"] = float(np.mean(np.abs(off) <= Z_95 * std))
+        return figures
+
+
+def _case(kind: str, height: float) -> Case:
+    def never(rng: np.random.Generator) -> Stream:
+        raise RuntimeError("of this case the skin is used, and no stream")
+
+    return Case(0, f"{kind} h={height:g}", Skin(preset(kind, height)), never)
+
+
+class Follower:
+    """One layout, solved by every method."""
+
+    def __init__(self, kind: str, height: float) -> None:
+        self.case = _case(kind, height)
+        self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
+
+    def last(self, taken: Stream) -> dict[str, FieldFrame]:
+        """What each makes of the last frame of a stream."""
+        return {
+            name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
+        }
+
+
+def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
+    """Presses of a tenth of the height, the same for every converter and layout of one height."""
+    for seed in range(scenes):
+        rng = np.random.default_rng([seed, 10])
+        press = pad_press(rng, case.skin.layout, 0.1)
+        yield stream(case.skin, (press,), SHARES, converter, rng)
+
+
+def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
+    """A body as blunt as a fingertip: its contact has a radius of 1.5 to 2.5 pitches at full depth.
+
+    It displaces as much as the prototype's indenter: the Cramér-Rao bounds of the two agree, see PROTOTYPE.
+    """
+    press = random_press(rng, layout, depth)
+    contact = rng.uniform(1.5, 2.5) * layout.pitch_m
+    return dataclasses.replace(press, radius_m=float(contact**2 / press.depth_m))
+
+
+def against_noise(scenes: int) -> list[dict[str, Any]]:
+    """10 % presses: a row for each layout, noise and method."""
+    rows = []
+    for kind, height in LAYOUTS:
+        follower = Follower(kind, height)
+        for sigma in SIGMAS:
+            pools: dict[str, Pool] = {name: Pool() for name in METHODS}
+            bound = Bound()
+            for taken in _streams(follower.case, Converter(sigma=sigma), scenes):
+                for name, frame in follower.last(taken).items():
+                    pools[name].add(frame, taken.truth_m[-1])
+                bound.add(follower.case.skin.layout, taken)
+            for name, pool in pools.items():
+                printed = PROTOTYPE.get((kind, height), {}).get(name, {}).get(sigma)
+                rows.append(
+                    {"layout": kind, "height": height, "sigma": sigma, "method": name, **pool.row()}
+                    | {"bound": bound.share, "prototype": printed}
+                )
+    return rows
+
+
+def against_codes(scenes: int) -> list[dict[str, Any]]:
+    """10 % presses behind codes without other noise."""
+    rows = []
+    for kind in ("staggered", "aligned"):
+        follower = Follower(kind, 0.5)
+        for bits in BITS:
+            pools = {name: Pool() for name in METHODS}
+            for taken in _streams(follower.case, Converter(bits=bits), scenes):
+                for name, frame in follower.last(taken).items():
+                    pools[name].add(frame, taken.truth_m[-1])
+            rows += [
+                {"layout": kind, "height": 0.5, "bits": bits, "method": name, **pool.row()}
+                for name, pool in pools.items()
+            ]
+    return rows
+
+
+COVERAGE: Final = (
+    ("staggered", 0.5, 1e-5),
+    ("staggered", 0.5, 1e-3),
+    ("staggered", 1.0, 1e-5),
+    ("aligned", 0.5, 1e-5),
+)
+
+
+def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
+    """One body anywhere on the patch, sharp or blunt, or, in three of ten scenes, two in different halves."""
+    depth = rng.uniform(0.05, 0.3, 2)
+    if rng.random() >= 0.3:
+        if rng.random() < 0.5:
+            return (pad_press(rng, layout, depth[0]),)
+        return (random_press(rng, layout, depth[0], margin=0.5),)
+    middle = float(layout.upper_m[..., 0].mean())
+    away = rng.uniform(2.5, 4.0, 2) * layout.pitch_m
+    return tuple(
+        dataclasses.replace(press, center_m=(middle + side, press.center_m[1]))
+        for side, press in zip(
+            (-away[0], away[1]),
+            (random_press(rng, layout, each, radius=(1.0, 2.0)) for each in depth),
+            strict=True,
+        )
+    )
+
+
+def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Random scenes: a row for each layout and noise, method by method, with forces where there are any; and
+    the posterior's errors of all of them by the prior's share in its variance."""
+    rows, parts = [], Parts()
+    for kind, height, sigma in COVERAGE:
+        follower = Follower(kind, height)
+        skin = follower.case.skin
+        pools, forces = {name: Pool() for name in METHODS}, Forces()
+        for seed in range(scenes):
+            rng = np.random.default_rng([seed, 11])
+            taken = stream(skin, _random_scene(rng, skin.layout), SHARES, Converter(sigma=sigma), rng)
+            for name, frame in follower.last(taken).items():
+                pools[name].add(frame, taken.truth_m[-1])
+                if name == "posterior":
+                    forces.add(frame, taken)
+                    parts.add(frame, taken.truth_m[-1])
+        for name, pool in pools.items():
+            row = {"layout": kind, "height": height, "sigma": sigma, "method": name, **pool.row()}
+            rows.append(row | (forces.row() if name == "posterior" else {}))
+    return rows, parts.rows()

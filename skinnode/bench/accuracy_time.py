@@ -1,0 +1,78 @@
+"""Time of a tracked frame: the exact inverse, the posterior of a full frame, the posterior of few wires."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.bench.cases import preset
+from skinnode.bench.timing import take_turns
+from skinnode.bench.truth import Converter, Press, Skin, stream
+from skinnode.model.layout import Float
+from skinnode.solve.posterior import Posterior
+from skinnode.solve.tracker import Tracker
+
+FRAMES: Final = 12
+SIGMA: Final = 1e-5
+FEW: Final = 3
+LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior, {FEW} active wires": 1000.0}
+
+
+class Cycle:
+    """A press to and fro, of the wires that ``valid`` has; every call solves all of its frames, lest a turn
+    have the cheap ones and another the dear ones."""
+
+    def __init__(
+        self, solver: Tracker | Posterior, frames: Float, valid: NDArray[np.bool_] | None = None
+    ) -> None:
+        self._solver, self._valid = solver, valid
+        self.frames = np.concatenate([frames, frames[-2:0:-1]])
+        self.active: list[int] = []
+        """Wires that were solved, frame by frame."""
+
+    def __call__(self) -> None:
+        for frame_ohm in self.frames:
+            frame = self._solver.update(frame_ohm, self._valid)
+            held = 0 if frame.held is None else int(frame.held.sum())
+            self.active.append(len(frame.status) - held)
+
+
+def _frames(skin: Skin, press: Press, sigma: float) -> Float:
+    """A press that deepens from half to all of its depth."""
+    shares = np.linspace(0.5, 1.0, FRAMES)
+    return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
+
+
+def run(rounds: int) -> list[dict[str, Any]]:
+    """A row for each: µs a frame (of the mean frame, median over turns), the limit, how many wires were
+    solved.
+
+    All of a half-space moves when it is pressed, so a scene does not keep to three wires; here the others
+    give no resistances. Nothing is held: every frame is solved.
+    """
+    skin = Skin(preset("staggered", 0.5))
+    layout, rest = skin.layout, skin.rest_ohm
+    press = Press((18.3e-3, 17.1e-3), 10e-3, 0.3 * layout.height_m, (0.2, -0.1))
+    frames = _frames(skin, press, SIGMA)
+    exact, full, few = LIMITS_US
+    middle = np.zeros(layout.shape, bool)
+    middle[3 : 3 + FEW] = True
+    options: dict[str, Any] = {"relative_noise": SIGMA, "baseline_ohm": rest}
+    cycles: dict[str, Cycle] = {
+        exact: Cycle(Tracker(layout, method="exact", **options), frames),
+        full: Cycle(Posterior(layout, hold=False, **options), frames),
+        few: Cycle(Posterior(layout, hold=False, **options), frames, middle),
+    }
+    calls: dict[str, Callable[[], object]] = {**cycles}
+    return [
+        {
+            "what": name,
+            "us": timing.call_us / len(cycles[name].frames),
+            "limit_us": LIMITS_US[name],
+            "active": float(np.mean(cycles[name].active)),
+        }
+        for name, timing in take_turns(calls, rounds=rounds).items()
+    ]

@@ -1,0 +1,470 @@
+"""The hard cases, by the numbers of the list in the design notes; a new one is added when one is found.
+
+ 1 symmetric layout, J rank-deficient         8 drift of the baseline, gain, contact resistance
+ 2 thick layers                               9 wrong roots with zero residual
+ 3 presses of 30, 50 and 70 %                10 two indenters, shear only, edge, half off the patch
+ 4 a press between two frames                11 press and release many times
+ 5 an electrode almost touching              12 curved layouts, N = 1, K < 3N, K > 3N
+ 6 noise and code widths                     13 the wrong model
+ 7 open, shorted, missing, saturated
+
+A case is a patch as the solver is told, what an informed user would tell the solver beside it, and a stream
+of frames with its truth for every seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, stream
+from skinnode.model.layout import Float, PatchLayout
+
+PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", "path adaptive")
+TRACKERS: Final = ("exact", "posterior", "auto")
+PITCH_M: Final = 4e-3
+FINE: Final = Converter(sigma=1e-5)
+"""About a 16-bit converter."""
+STRIDE: Final = 4
+"""A tracker gets every so many of the samples of a path."""
+DRIFT: Final = 0.02
+MODEL_ERROR: Final = 0.05
+"""Share of the change of R that the wrong models of case 13 get wrong. Measured on a 30 % press, staggered,
+h = 0.5: ‖ΔR‖ is wrong by 2.2 to 5 %, the change of a pair by 1 to 5 % in the median and 7 % at worst."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A hard case. ``make`` gives the stream of a seed's generator."""
+
+    number: int
+    name: str
+    skin: Skin
+    make: Callable[[np.random.Generator], Stream]
+    methods: tuple[str, ...] = TRACKERS
+    converter: Converter = FINE
+    """The streams are read by it, and the user knows its noise."""
+    drift: str = "none"
+    stride: int = 1
+    """A tracker gets every so many of the frames; a path all of them."""
+    model_error: float = 0.0
+    """Share of the change of R that the user knows the model may get wrong."""
+
+
+def preset(name: str, height: float) -> PatchLayout:
+    """A preset of 10 × 10 electrodes, ``height`` in pitches."""
+    return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
+
+
+def narrowed(layout: PatchLayout) -> PatchLayout:
+    """Both outer upper wires and three in between: a path solves wire by wire, ten would tell little more."""
+    return PatchLayout(layout.upper_m[[0, 2, 5, 8, 9]], layout.lower_m, layout.resistivity_ohm_per_m)
+
+
+def press_and_release(steps: int) -> Float:
+    """Shares of the depth: at rest, down in equal steps, at rest."""
+    return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
+
+
+def pressing(
+    skin: Skin,
+    depth: float,
+    converter: Converter,
+    shares: Float,
+    *,
+    spoil: Callable[[np.random.Generator, Stream, Skin], Stream] | None = None,
+    gain: Callable[[np.random.Generator, int], Float] | None = None,
+    presses: Callable[[np.random.Generator], tuple[Press, ...]] | None = None,
+) -> Callable[[np.random.Generator], Stream]:
+    """Makes the stream of one random press, with what goes wrong."""
+
+    def make(rng: np.random.Generator) -> Stream:
+        found = (random_press(rng, skin.layout, depth),) if presses is None else presses(rng)
+        taken = stream(skin, found, shares, converter, rng, None if gain is None else gain(rng, len(shares)))
+        return taken if spoil is None else spoil(rng, taken, skin)
+
+    return make
+
+
+def all_cases() -> list[Case]:
+    """Every case, in the order of the list."""
+    return [
+        *_symmetric_and_thick(),
+        *_deep(),
+        *_sudden_and_close(),
+        *_noise(),
+        *_faults(),
+        *_drift(),
+        *_wrong_roots(),
+        *_contacts(),
+        *_shapes(),
+        *_wrong_models(),
+    ]
+
+
+def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: int) -> Case:
+    """A press without noise, for every operator along the samples and for the trackers."""
+    skin = Skin(narrowed(layout))
+    shares = np.linspace(0.0, 1.0, samples + 1)
+    make = pressing(skin, depth, Converter(), shares)
+    return Case(number, name, skin, make, (*PATHS, "exact"), Converter(), stride=STRIDE)
+
+
+def _noisy(number: int, name: str, layout: PatchLayout, depth: float, steps: int) -> Case:
+    skin = Skin(layout)
+    return Case(number, name, skin, pressing(skin, depth, FINE, press_and_release(steps)))
+
+
+def _symmetric_and_thick() -> Iterator[Case]:
+    for depth in (0.1, 0.3):
+        layout, name = preset("symmetric", 0.5), f"symmetric h=0.5, {depth:.0%}"
+        yield _exact(1, f"{name}, exact data", layout, depth, 20)
+        yield _noisy(1, name, layout, depth, 3)
+    for kind, height in (("staggered", 1.5), ("staggered", 2.0), ("aligned", 1.5)):
+        layout, name = preset(kind, height), f"{kind} h={height:g}, 10%"
+        yield _exact(2, f"{name}, exact data", layout, 0.1, 20)
+        yield _noisy(2, name, layout, 0.1, 3)
+
+
+def _deep() -> Iterator[Case]:
+    for kind, height in (
+        ("staggered", 0.3),
+        ("staggered", 0.5),
+        ("staggered", 1.0),
+        ("aligned", 0.5),
+        ("aligned", 1.0),
+    ):
+        for depth in (0.3, 0.5, 0.7):
+            layout, name = preset(kind, height), f"{kind} h={height:g}, {depth:.0%}"
+            yield _exact(3, f"{name}, exact data", layout, depth, 20)
+            yield _noisy(3, name, layout, depth, round(5 * depth) + 2)
+
+
+def _sudden_and_close() -> Iterator[Case]:
+    jump = np.array([0.0, 0.0, 1.0, 1.0, 0.0])
+    for kind, height in (("staggered", 0.3), ("staggered", 0.5), ("staggered", 1.0), ("aligned", 0.5)):
+        skin = Skin(preset(kind, height))
+        name = f"50% between two frames, {kind} h={height:g}"
+        few = Skin(narrowed(skin.layout))
+        exact = pressing(few, 0.5, Converter(), jump[:3])
+        yield Case(4, f"{name}, exact data", few, exact, (*PATHS, "exact"), Converter())
+        yield Case(4, name, skin, pressing(skin, 0.5, FINE, jump))
+    for height in (0.3, 0.5):
+        skin = Skin(preset("staggered", height))
+        name = f"almost touching, staggered h={height:g}"
+        path = pressing(skin, 1.0, Converter(), np.linspace(0, 1, 29), presses=_touching(skin))
+        yield Case(5, f"{name}, exact data", skin, path, (*PATHS, "exact"), Converter(), stride=STRIDE)
+        shares = press_and_release(7)
+        yield Case(5, name, skin, pressing(skin, 1.0, FINE, shares, presses=_touching(skin)))
+
+
+def _touching(skin: Skin) -> Callable[[np.random.Generator], tuple[Press, ...]]:
+    """A press that brings one electrode to a twentieth of the height above a lower one's level."""
+    layout = skin.layout
+    gap = layout.upper_m[..., None, None, :2] - layout.lower_m[None, None, ..., :2]
+    beside = np.linalg.norm(gap, axis=-1).min(axis=(2, 3))
+    beside[:2], beside[-2:], beside[:, :2], beside[:, -2:] = np.inf, np.inf, np.inf, np.inf
+    nearest = np.argsort(beside.ravel())[:6]
+
+    def presses(rng: np.random.Generator) -> tuple[Press, ...]:
+        wire, electrode = np.unravel_index(int(rng.choice(nearest)), beside.shape)
+        x, y, _ = layout.upper_m[wire, electrode]
+        radius = float(rng.uniform(1.5, 3.0)) * layout.pitch_m
+        return (Press((float(x), float(y)), radius, 0.95 * layout.height_m),)
+
+    return presses
+
+
+def _noise() -> Iterator[Case]:
+    shares = press_and_release(3)
+    for kind in ("staggered", "aligned"):
+        skin = Skin(preset(kind, 0.5))
+        for sigma in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
+            converter = Converter(sigma=sigma)
+            make = pressing(skin, 0.2, converter, shares)
+            yield Case(6, f"noise {sigma:.0e}, {kind} h=0.5", skin, make, TRACKERS, converter)
+        for bits in (12, 14, 16, 24):
+            converter = Converter(bits=bits)
+            make = pressing(skin, 0.2, converter, shares)
+            yield Case(6, f"{bits}-bit codes, {kind} h=0.5", skin, make, TRACKERS, converter)
+
+
+def _faults() -> Iterator[Case]:
+    skin = Skin(preset("staggered", 0.5))
+    shares = np.array([0.0, 0.3, 0.6, 1.0, 1.0, 0.5, 0.0])
+    faults: dict[str, Callable[[np.random.Generator, Stream, Skin], Stream]] = {
+        "open lower wire": _open_lower,
+        "shorted lower wire": _shorted_lower,
+        "open upper wire": _open_upper,
+        "missing chunks": _missing_chunks,
+        "impossible values": _impossible,
+        "a frame of garbage": _garbage,
+    }
+    for name, spoil in faults.items():
+        yield Case(7, name, skin, pressing(skin, 0.3, FINE, shares, spoil=spoil))
+    narrow = Converter(bits=16, lo=0.7, hi=1.02)
+    yield Case(7, "saturated codes", skin, pressing(skin, 0.5, narrow, shares), TRACKERS, narrow)
+
+
+def _spoilt(taken: Stream, frames: Float, valid: np.ndarray) -> Stream:
+    return Stream(frames, valid, taken.noise, taken.truth_m, taken.force_n, taken.presses)
+
+
+def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
+    """A lower wire breaks in the press and comes back before its end."""
+    frames, valid, k = taken.frames_ohm.copy(), taken.valid.copy(), rng.integers(skin.layout.shape[1])
+    frames[2:5, :, k], valid[2:5, :, k] = np.nan, False
+    return _spoilt(taken, frames, valid)
+
+
+def _shorted_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
+    """A shorted wire that nobody marked: 0 ohm."""
+    frames, k = taken.frames_ohm.copy(), rng.integers(skin.layout.shape[1])
+    frames[2:5, :, k] = 0.0
+    return _spoilt(taken, frames, taken.valid)
+
+
+def _open_upper(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
+    frames, valid, u = taken.frames_ohm.copy(), taken.valid.copy(), rng.integers(skin.layout.shape[0])
+    frames[2:5, u], valid[2:5, u] = np.nan, False
+    return _spoilt(taken, frames, valid)
+
+
+def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
+    """Five chunks of three codes lost in every frame, others each time."""
+    frames, valid = taken.frames_ohm.copy(), taken.valid.copy()
+    for t in range(len(frames)):
+        flat, lost = valid[t].reshape(-1), rng.choice(valid[t].size // 3, 5, replace=False)
+        flat[(3 * lost[:, None] + np.arange(3)).ravel()] = False
+        frames[t][~valid[t]] = np.nan
+    return _spoilt(taken, frames, valid)
+
+
+def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
+    """Zero, negative, infinite and no number at all, not marked, in the middle of the press."""
+    frames = taken.frames_ohm.copy()
+    for t in (2, 3, 4):
+        where = rng.choice(frames[t].size, 4, replace=False)
+        frames[t].reshape(-1)[where] = (0.0, -1e3, np.inf, np.nan)
+    return _spoilt(taken, frames, taken.valid)
+
+
+def _garbage(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
+    """A frame that no deformation explains, then the stream as if nothing had been."""
+    frames = taken.frames_ohm.copy()
+    frames[4] = skin.rest_ohm * rng.uniform(0.3, 1.2, skin.layout.shape)
+    return _spoilt(taken, frames, taken.valid)
+
+
+def _drift() -> Iterator[Case]:
+    shares = np.array([0.0, 0.3, 0.6, 1.0, 0.5, 0.0])
+
+    def common(rng: np.random.Generator, samples: int) -> Float:
+        end = rng.choice((-DRIFT, DRIFT))
+        return 1.0 + np.linspace(0.0, end, samples)[:, None, None]
+
+    def each_wire(rng: np.random.Generator, samples: int) -> Float:
+        end = rng.uniform(-DRIFT, DRIFT, 10)
+        return 1.0 + np.linspace(0.0, 1.0, samples)[:, None, None] * end[None, :, None]
+
+    def step(rng: np.random.Generator, samples: int) -> Float:
+        return np.full((samples, 1, 1), 1.0 + rng.choice((-DRIFT, DRIFT)))
+
+    for kind in ("staggered", "aligned"):
+        skin = Skin(preset(kind, 0.5))
+        where = f"{kind} h=0.5"
+        for name, gain, drift in (
+            ("drift of the patch to 2%", common, "patch"),
+            ("drift of every wire to 2%", each_wire, "wire"),
+            ("gain error of 2%", step, "patch"),
+        ):
+            make = pressing(skin, 0.3, FINE, shares, gain=gain)
+            yield Case(8, f"{name}, {where}", skin, make, drift=drift)
+    series = Skin(preset("staggered", 0.5), series=0.01)
+    make = pressing(series, 0.3, FINE, shares)
+    yield Case(8, "contact resistance of 1%, staggered h=0.5", series, make, model_error=0.01)
+
+
+def _wrong_roots() -> Iterator[Case]:
+    yield _exact(9, "staggered h=1, 70%, 100 samples", preset("staggered", 1.0), 0.7, 100)
+    yield _exact(9, "aligned h=0.5, 30%, 100 samples", preset("aligned", 0.5), 0.3, 100)
+    for height, converter in ((0.5, FINE), (1.5, Converter())):
+        skin = Skin(preset("staggered", height))
+        for name, detour in (("swapped electrodes", _swap), ("mirror branch", _mirror)):
+            make = _after_detour(skin, detour, converter)
+            yield Case(9, f"{name}, staggered h={height:g}", skin, make, TRACKERS, converter)
+
+
+def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
+    """Half a turn of two neighbours on a wire about their middle: F ends as it began."""
+    wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
+    middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
+    angle = np.pi * share
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    moved = np.zeros(layout.upper_m.shape)
+    for electrode in (first, first + 1):
+        arm = layout.upper_m[wire, electrode] - middle
+        moved[wire, electrode] = turn @ arm - arm
+    return moved
+
+
+def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
+    """One electrode through the lower layer to its mirror image: F ends as it began."""
+    moved = np.zeros(layout.upper_m.shape)
+    wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
+    moved[wire, electrode, 2] = -2 * share * layout.height_m
+    return moved
+
+
+def _after_detour(
+    skin: Skin,
+    detour: Callable[[np.random.Generator, PatchLayout, float], Float],
+    converter: Converter,
+) -> Callable[[np.random.Generator], Stream]:
+    """Frames of a motion that no skin can make, ending at the resistances of rest; then an honest press.
+
+    On the way there is nothing to hold a solver to: F does not tell a wire from the same with two electrodes
+    relabelled or mirrored.
+    """
+
+    def make(rng: np.random.Generator) -> Stream:
+        seed = rng.integers(2**32)
+        turns = np.linspace(0.0, 1.0, 7)
+        odd = np.stack([detour(np.random.default_rng(seed), skin.layout, turn) for turn in turns])
+        resistance = np.stack([skin.resistance_ohm(moved) for moved in odd])
+        frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
+        press = (random_press(rng, skin.layout, 0.2),)
+        after = stream(skin, press, np.array([0.3, 0.6, 1.0, 0.0]), converter, rng)
+        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # it ends at the resistances of rest
+        return Stream(
+            np.concatenate([frames, after.frames_ohm]),
+            np.concatenate([valid, after.valid]),
+            np.concatenate([noise, after.noise]),
+            np.concatenate([odd, after.truth_m]),
+            np.concatenate([np.full((len(odd), 3), np.nan), after.force_n]),
+            press,
+        )
+
+    return make
+
+
+def _contacts() -> Iterator[Case]:
+    shares = press_and_release(3)
+    for kind in ("staggered", "aligned"):
+        skin = Skin(preset(kind, 0.5))
+        layout = skin.layout
+
+        def two(rng: np.random.Generator, layout: PatchLayout = layout) -> tuple[Press, ...]:
+            y, other = rng.uniform(2.0, 7.0, 2) * PITCH_M
+            deep = Press((2.5 * PITCH_M, y), 2.0 * PITCH_M, 0.3 * layout.height_m)
+            return deep, Press((7.0 * PITCH_M, other), 1.5 * PITCH_M, 0.2 * layout.height_m, (0.3, 0.0))
+
+        def shear(rng: np.random.Generator, layout: PatchLayout = layout) -> tuple[Press, ...]:
+            press = random_press(rng, layout, 0.4, shear=1.0)
+            return (Press(press.center_m, press.radius_m, press.depth_m, press.traction_ratio, True),)
+
+        def edge(rng: np.random.Generator, layout: PatchLayout = layout) -> tuple[Press, ...]:
+            return (random_press(rng, layout, 0.3, where="edge"),)
+
+        def half_off(rng: np.random.Generator, layout: PatchLayout = layout) -> tuple[Press, ...]:
+            return (random_press(rng, layout, 0.3, where="half off"),)
+
+        def flat(rng: np.random.Generator, layout: PatchLayout = layout) -> tuple[Press, ...]:
+            return (random_press(rng, layout, 0.15, radius=(40.0, 60.0), margin=4.0),)
+
+        for name, presses in (
+            ("two indenters", two),
+            ("shear only", shear),
+            ("on the edge", edge),
+            ("half off the patch", half_off),
+            ("almost flat", flat),
+        ):
+            make = pressing(skin, 0.0, FINE, shares, presses=presses)
+            yield Case(10, f"{name}, {kind} h=0.5", skin, make)
+    skin = Skin(preset("staggered", 0.5))
+    yield Case(11, "press and release, six times", skin, _many_times(skin))
+
+
+def _many_times(skin: Skin) -> Callable[[np.random.Generator], Stream]:
+    def make(rng: np.random.Generator) -> Stream:
+        parts = [
+            stream(
+                skin,
+                (random_press(rng, skin.layout, float(rng.uniform(0.1, 0.4))),),
+                np.array([0.5, 1.0, 0.0]),
+                FINE,
+                rng,
+            )
+            for _ in range(6)
+        ]
+        return Stream(
+            np.concatenate([part.frames_ohm for part in parts]),
+            np.concatenate([part.valid for part in parts]),
+            np.concatenate([part.noise for part in parts]),
+            np.concatenate([part.truth_m for part in parts]),
+            np.concatenate([part.force_n for part in parts]),
+        )
+
+    return make
+
+
+def fingertip(radius_m: float = 20e-3) -> Skin:
+    """The staggered patch of h = 0.5 wrapped around a cylinder whose axis runs across the upper wires."""
+    flat = preset("staggered", 0.5)
+    middle = float(flat.upper_m[..., 0].mean())
+    turned = []
+    for points in (flat.upper_m, flat.lower_m):
+        angle = (points[..., 0] - middle) / radius_m
+        away = radius_m + points[..., 2] - flat.height_m
+        turned.append(np.stack([away * np.sin(angle), points[..., 1], away * np.cos(angle)], axis=-1))
+    angle = (flat.upper_m[..., 0] - middle) / radius_m
+    along = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
+    across = np.broadcast_to([0.0, 1.0, 0.0], along.shape)
+    out = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    layout = PatchLayout(turned[0], turned[1], name="fingertip")
+    return Skin(layout, points_m=flat.upper_m[..., :2], axes=np.stack([along, across, out], axis=-2))
+
+
+def _shapes() -> Iterator[Case]:
+    shares = press_and_release(3)
+    flat, tip = preset("staggered", 0.5), fingertip()
+
+    def on_tip(rng: np.random.Generator) -> tuple[Press, ...]:
+        return (random_press(rng, flat, 0.3),)
+
+    yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
+    for lower, depth in ((3, 0.1), (6, 0.3)):
+        # one electrode a wire: no pitch along it, so the patch is as narrow as the wire is short
+        layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
+        skin = Skin(layout)
+
+        def on_line(
+            rng: np.random.Generator, layout: PatchLayout = layout, depth: float = depth
+        ) -> tuple[Press, ...]:
+            center = (float(rng.uniform(-0.5, 0.5)) * PITCH_M, float(rng.uniform(2, 7)) * PITCH_M)
+            return (Press(center, 2 * PITCH_M, depth * layout.height_m, (0.2, 0.1)),)
+
+        make = pressing(skin, depth, FINE, shares, presses=on_line)
+        yield Case(12, f"N = 1, K = {lower}, {depth:.0%}", skin, make)
+    for lower in (20, 40):
+        skin = Skin(PatchLayout.preset("staggered", lower_wires=lower))
+        methods = TRACKERS if lower >= skin.layout.unknowns else TRACKERS[1:]
+        yield Case(12, f"K = {lower}, 3N = 30, 30%", skin, pressing(skin, 0.3, FINE, shares), methods)
+
+
+def _wrong_models() -> Iterator[Case]:
+    shares = press_and_release(3)
+    for kind in ("staggered", "aligned"):
+        layout = preset(kind, 0.5)
+        for name, skin in (
+            ("electrodes of 0.1 pitch", Skin(layout, electrode=0.1)),
+            ("resistivity +5% of strain", Skin(layout, strain=0.05)),
+            ("resistivity -5% of strain", Skin(layout, strain=-0.05)),
+            ("5% thicker", Skin(layout, height=1.05)),
+            ("5% thinner", Skin(layout, height=0.95)),
+        ):
+            make = pressing(skin, 0.3, FINE, shares)
+            yield Case(13, f"{name}, {kind} h=0.5", skin, make, model_error=MODEL_ERROR)

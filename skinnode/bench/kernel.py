@@ -1,0 +1,187 @@
+"""The compiled kernels against NumPy and LAPACK: F + J and one step of each operator, of one wire of the
+reference patch, and the dense kernels at the size of its posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench import dense as _bench_dense
+from skinnode.bench.timing import machine, take_turns
+from skinnode.jit import njit, njit_part
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.kernels import lower_rows, potential_jacobian
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.operators import (
+    LIMIT,
+    OPERATORS,
+    OUTSIDE,
+    Work,
+    begin,
+    judge,
+    propose,
+    shorten,
+    workspace,
+)
+from skinnode.solve.problem import PatchProblem
+
+SHORT: Final = 1e-3
+"""Trust radius, pitches a coordinate: well within Newton's step here, so that every operator has to work."""
+
+
+class NumpyWire:
+    """F and Jᵀ of one wire as fast as NumPy does it: structure of arrays, into buffers made once.
+
+    Of the orders of axes and ways to sum that were tried this is the fastest; it takes 0.85 of the time of
+    the obvious one.
+    """
+
+    def __init__(self, lower: Float, electrodes: int) -> None:
+        _, charges, wires = lower.shape
+        pairs = (charges, electrodes * wires)
+        self._lower = np.ascontiguousarray(
+            np.broadcast_to(lower[:, :, None], (3, charges, electrodes, wires))
+        )
+        self._lower.shape = (3, *pairs)
+        self._x = np.empty((3, electrodes, wires))
+        self._gap, self._square, self._near = np.empty((3, *pairs)), np.empty(pairs), np.empty(pairs)
+        self._ones = np.ones(charges * electrodes)
+        self._sums = np.empty((3, electrodes * wires))
+        self.f = np.empty(wires)
+        self.jt = np.empty((electrodes, 3, wires))
+
+    def __call__(self, x: Float) -> tuple[Float, Float]:
+        self._x[:] = x.reshape(-1, 3).T[:, :, None]
+        np.subtract(self._lower, self._x.reshape(3, 1, -1), out=self._gap)
+        np.einsum("amp,amp->mp", self._gap, self._gap, out=self._square)
+        np.sqrt(self._square, out=self._near)
+        np.reciprocal(self._near, out=self._near)
+        np.matmul(self._ones, self._near.reshape(-1, self.f.size), out=self.f)
+        np.multiply(self._near, self._near, out=self._square)
+        np.multiply(self._near, self._square, out=self._near)
+        np.einsum("amp,mp->ap", self._gap, self._near, out=self._sums)
+        self.jt[:] = self._sums.reshape(self._x.shape).transpose(1, 0, 2)
+        return self.f, self.jt.reshape(-1, self.f.size)
+
+
+def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
+    """Evaluate, step, evaluate, as :func:`compiled_steps` does.
+
+    The parameter of Levenberg-Marquardt, which that has to search for, is given.
+    """
+    f, jt = wire(x)
+    r, j = a * f - 1.0, (jt * a).T
+    if operator == "gauss_newton":
+        step = -np.linalg.solve(j, r)
+    else:
+        scale = np.linalg.norm(j, axis=0)
+        radius = SHORT * np.linalg.norm(scale)
+        gradient = j.T @ r
+        if operator == "dogleg":
+            newton = -np.linalg.solve(j, r)
+            down = -gradient / scale**2
+            along = j @ down
+            cauchy = down * (-(gradient @ down) / (along @ along))
+            if np.linalg.norm(scale * cauchy) >= radius:
+                step = down * (radius / np.linalg.norm(scale * down))
+            else:
+                leg, from_ = scale * (newton - cauchy), scale * cauchy
+                p, q = leg @ leg, leg @ from_
+                step = cauchy + (newton - cauchy) * (
+                    (np.sqrt(q * q + p * (radius**2 - from_ @ from_)) - q) / p
+                )
+        else:
+            n = x.size
+            augmented = np.zeros((r.size + n, n + 1))  # R and Qᵀr without Q: 0.7 of the time
+            augmented[: r.size, :n] = j
+            augmented[: r.size, n] = r
+            np.fill_diagonal(augmented[r.size :], 0.1 * scale)
+            triangle = np.asarray(np.linalg.qr(augmented, mode="r"))
+            step = -np.linalg.solve(triangle[:n, :n], triangle[:n, n])
+    trial = x + step
+    f, _ = wire(trial)
+    return np.asarray(a * f - 1.0)
+
+
+@njit_part
+def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
+    potential_jacobian(x, lower, r, jt)
+    for k in range(r.size):
+        r[k] = a[k] * r[k] - 1.0
+    for i in range(jt.shape[0]):
+        row = jt[i]
+        for k in range(r.size):
+            row[k] *= a[k]
+
+
+@njit
+def compiled_steps(operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float) -> None:
+    """One step of every wire from ``start`` (U, n), with the compiled parts the driver is made of.
+
+    The driver itself, told to stop after one step, works out the next before it looks whether it may.
+    """
+    for u in range(start.shape[0]):
+        for j in range(w.x.size):
+            w.x[j] = start[u, j]
+        _evaluate(w.x, lower, a[u], w.r, w.jt)
+        w.s[LIMIT] = SHORT
+        begin(w)
+        if propose(operator, w, 1e-14, 1e-14) == OUTSIDE:
+            shorten(operator, w)
+        _evaluate(w.trial, lower, a[u], w.r_trial, jt_trial)
+        judge(operator, w, 1e-14, 1e-14)
+
+
+def run(rounds: int) -> dict[str, Any]:
+    """The figures of the benchmark, µs a wire (dense kernels: a call) and ratios to ours."""
+    layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
+    problem = PatchProblem.of(layout)
+    rng = np.random.default_rng(1)
+    pressed = layout.upper_m - rng.uniform(0.0, 0.2, (10, 10, 1)) * np.array([0.2, 0.1, 1.0]) * 2e-3
+    a = resistance_ohm(layout, pressed) * problem.gain
+    lower = lower_rows(layout.lower_m / layout.pitch_m)
+    x = problem.rest[5].copy()
+    f, jt = np.empty(30), np.empty((30, 30))
+    wire = NumpyWire(lower, 10)
+    np.testing.assert_allclose(potential_of(x, lower), wire(x)[0], rtol=1e-12)
+
+    def broadcast() -> Float:
+        gap = x.reshape(10, 1, 1, 3) - layout.lower_m / layout.pitch_m
+        distance = np.linalg.norm(gap, axis=-1, keepdims=True)
+        return np.asarray((1.0 / distance).sum() - (gap / distance**3).sum(axis=2))
+
+    pairs: dict[str, dict[str, Callable[[], object]]] = {
+        "F + J": {
+            "compiled": lambda: potential_jacobian(x, lower, f, jt),
+            "NumPy, preallocated": lambda: wire(x),
+            "NumPy, broadcast": broadcast,
+        }
+    }
+    work, jt_trial = workspace(30, 30), np.empty((30, 30))
+    for operator, code in OPERATORS.items():
+
+        def compiled(code: int = code) -> None:
+            compiled_steps(code, problem.rest, lower, a, work, jt_trial)
+
+        def plain(operator: str = operator) -> None:
+            for u in range(10):
+                numpy_step(operator, wire, problem.rest[u], a[u])
+
+        pairs[f"step of {operator}"] = {"compiled": compiled, "NumPy, preallocated": plain}
+    rows = []
+    for what, candidates in pairs.items():
+        wires_a_call = 10 if what.startswith("step") else 1
+        for name, timing in take_turns(candidates, rounds=rounds).items():
+            rows.append(
+                {"what": what, "who": name, "us": timing.call_us / wires_a_call, "ratio": timing.ratio}
+            )
+    return {"benchmark": "kernel", "machine": machine(), "rows": rows + _bench_dense.measure(rounds)}
+
+
+def potential_of(x: Float, lower: Float) -> Float:
+    """F of one wire by the compiled kernel."""
+    f, jt = np.empty(lower.shape[2]), np.empty((x.size, lower.shape[2]))
+    potential_jacobian(x, lower, f, jt)
+    return f

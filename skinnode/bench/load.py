@@ -1,0 +1,332 @@
+"""The load of ``skinnode bench pipeline``: frames that real nodes sent on buses in simulated time, replayed
+at their pace by a process of its own.
+
+The nodes are those of ``skinnode node`` with the simulator's patches in front of them. Their frames go over a
+bus that arbitrates as CAN does: whenever it is free the waiting frame with the lowest identifier goes, and
+takes as long as its bits do, stuff bits included. This file may import the simulator, as the demo may: frames
+that the solver's own assumptions made would prove nothing.
+"""
+
+from __future__ import annotations
+
+import errno
+import heapq
+import multiprocessing
+import os
+import socket
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.child_processes import starting_children
+from skinnode.errors import BusError
+from skinnode.model.config import BusConfig, HandConfig, PatchConfig
+from skinnode.model.forward import resistance_ohm
+from skinnode.node import EXACT, PatchNode
+from skinnode.pauses import short_pauses
+from skinnode.transport.datagram import LOOPBACK, datagram
+from skinnode.wire import indices as od
+from skinnode.wire.plan import inhibit_time_100us
+from skinnode.wire.profile import PatchProfile
+from skinnode.wire.timing import exact_bits_batch, fd_bits
+from vcan_sim.scene import Scene
+from vcan_sim.sensor import SimulatedPatch
+
+TICK_S: Final = 0.25e-3
+"""How often the frames that are due are sent: two frames of a full bus at once, as a USB adapter does."""
+LEAD_S: Final = 0.5
+"""From the order to begin to the first frame."""
+_BEAT_S: Final = 0.1
+_FULL_S: Final = 1e-4
+
+_Queued = tuple[int, int, bytes, bool]
+"""When a node had a frame ready, ns; its COB-ID, data, and whether it is of CAN FD."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """What became of a replay."""
+
+    frames: dict[str, int]
+    """By bus, without the heartbeats before the start."""
+    bus_load: dict[str, float]
+    """Share of the simulated bus that the frames took."""
+    late_p99_ms: float
+    """How late frames were behind their time on the simulated bus: the generator's own."""
+    late_max_ms: float
+    cpu_s: float
+
+
+class Generator:
+    """A process with the load of ``hand``, for ``seconds``, ready when the constructor returns. All patches
+    are ``touched``, pressed and stroked as in the demo, or none; ``core``: that it keeps to."""
+
+    def __init__(self, hand: HandConfig, seconds: float, *, touched: bool, core: int | None) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._pipe, theirs = spawn.Pipe()
+        self._process = spawn.Process(target=_serve, args=(theirs, hand, seconds, touched, core), daemon=True)
+        with starting_children():
+            self._process.start()
+        theirs.close()
+        self._hear()
+
+    def beat(self, buses: Sequence[str]) -> None:
+        """Send the heartbeats of the patches on ``buses`` from now on, so that a host finds them."""
+        self._pipe.send(list(buses))
+
+    def begin(self) -> int:
+        """Replay from :data:`LEAD_S` later on; that time, monotonic ns."""
+        t_ns = time.monotonic_ns() + round(LEAD_S * 1e9)
+        self._pipe.send(t_ns)
+        return t_ns
+
+    def wait(self) -> Sent:
+        """The end of the replay."""
+        sent: Sent = self._hear()
+        return sent
+
+    def close(self) -> None:
+        """End the process."""
+        self._pipe.close()
+        self._process.join(5)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+    def _hear(self) -> Any:
+        try:
+            answer = self._pipe.recv()
+        except EOFError:
+            self._process.join()
+            raise BusError("the load generator ended by itself") from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, core: int | None) -> None:
+    try:
+        if core is not None:
+            os.sched_setaffinity(0, {core})
+        streams = {bus.name: stream_of(hand, bus, seconds, touched=touched) for bus in hand.buses}
+        with short_pauses():
+            pipe.send(True)
+            while True:
+                chosen = [hand.bus(name) for name in pipe.recv()]
+                pipe.send(_play(pipe, hand, [(bus, streams[bus.name]) for bus in chosen]))
+    except EOFError:
+        return
+    except Exception as error:  # the parent tells
+        pipe.send(error)
+
+
+# --- beforehand
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """What passes on a bus."""
+
+    t_ns: list[int]
+    """When each frame has been transmitted, from the first SYNC on, ascending."""
+    packets: list[bytes]
+    load: float
+
+
+def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool = True) -> Stream:
+    """The frames of ``bus`` in ``seconds`` of the hand's life, SYNC among them."""
+    scans = round(seconds / hand.sync.period_s)
+    late_ns = round([each.name for each in hand.buses].index(bus.name) * hand.sync.stagger_s * 1e9)
+    syncs = _syncs(hand, scans, late_ns)
+    queues = [syncs]
+    for number, patch in enumerate(hand.patches):
+        if patch.bus == bus.name:
+            queues.append(_node_frames(hand, patch, number, syncs, touched))
+    frames = [(*frame, queue) for queue, frames in enumerate(queues) for frame in frames]
+    durations = _durations_ns(bus, [frame[:4] for frame in frames])
+    return _arbitrate(frames, durations)
+
+
+def _syncs(hand: HandConfig, scans: int, late_ns: int) -> list[_Queued]:
+    period_ns, overflow = hand.sync.period_ms * 1_000_000, hand.sync.counter_overflow
+    return [(late_ns + k * period_ns, od.SYNC_COB_ID, bytes([k % overflow + 1]), False) for k in range(scans)]
+
+
+def _node_frames(
+    hand: HandConfig, patch: PatchConfig, number: int, syncs: Sequence[_Queued], touched: bool
+) -> list[_Queued]:
+    """What the node of a patch has ready to send, and when, after these SYNCs."""
+    bus, layout = hand.bus(patch.bus), patch.layout.build()
+    profile = PatchProfile.from_config(patch, bus)
+    source = SimulatedPatch(Scene(layout, hand.simulation, number))
+    out: list[_Queued] = []
+    now_ns = 0
+
+    def send(can_id: int, data: bytes) -> None:
+        out.append((now_ns, can_id, data, len(data) > 8))
+
+    node = PatchNode(
+        patch.node_id,
+        layout,
+        source,
+        send=send,
+        profile=profile,
+        baseline_ohm=resistance_ohm(layout, layout.upper_m),
+        pacing=EXACT,
+    )
+    node.power_on(now_ns)
+    inhibit = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1)
+    chunk, request = od.chunk_cob_id(patch.node_id), od.sdo_request_cob_id(patch.node_id)
+    for index, subindex, value, size in (
+        (od.SYNC_COUNTER_OVERFLOW, 0, hand.sync.counter_overflow, 1),
+        (od.HEARTBEAT_PRODUCER, 0, hand.bring_up.heartbeat_ms, 2),
+        (od.TPDO1_PARAMETER, od.PDO_COB_ID, chunk | 1 << 31, 4),
+        (od.TPDO1_PARAMETER, od.PDO_INHIBIT_TIME, inhibit, 2),
+        (od.TPDO1_PARAMETER, od.PDO_COB_ID, chunk, 4),
+    ):
+        out.clear()
+        command = 0x23 | (4 - size) << 2  # expedited download of `size` bytes, CiA 301, 7.2.4.3.3
+        multiplexer = index.to_bytes(2, "little") + bytes([subindex])
+        node.on_frame(request, bytes([command]) + multiplexer + value.to_bytes(4, "little"), now_ns)
+        assert out[-1][2][0] == 0x60, f"0x{index:04X}:{subindex} refused"
+    node.on_frame(od.NMT_COB_ID, bytes((1, patch.node_id)), now_ns)
+    if touched:
+        source.start(0)
+    out.clear()
+    for now_ns, can_id, counter, _ in syncs:
+        node.on_frame(can_id, counter, now_ns)
+        end_ns = now_ns + hand.sync.period_ms * 1_000_000
+        while (due_ns := node.next_deadline_ns()) is not None and due_ns < end_ns:
+            now_ns = max(due_ns, now_ns)
+            node.on_timer(now_ns)
+    node.power_off()
+    return out
+
+
+def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
+    """Time of each frame on the bus."""
+    ids = np.array([can_id for _, can_id, _, _ in frames])
+    lengths = np.array([len(data) for _, _, data, _ in frames])
+    durations = np.zeros(len(frames))
+    fd = np.array([is_fd for _, _, _, is_fd in frames], dtype=bool)
+    for length in set(lengths[fd].tolist()):
+        rows = np.flatnonzero(fd & (lengths == length)).tolist()
+        data = np.frombuffer(b"".join(frames[row][2] for row in rows), np.uint8).reshape(-1, length)
+        nominal, fast = fd_bits(ids[rows], data)
+        durations[rows] = 1e9 * (nominal / bus.bitrate_bps + fast / bus.data_bitrate_bps)
+    rows = np.flatnonzero(~fd).tolist()
+    data = np.frombuffer(b"".join(frames[row][2].ljust(8, b"\0") for row in rows), np.uint8).reshape(-1, 8)
+    durations[rows] = 1e9 * exact_bits_batch(ids[rows], lengths[rows], data) / bus.bitrate_bps
+    return [round(duration) for duration in durations]
+
+
+def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
+    """All frames one after the other. Those of a node keep their order, as in the queue of its controller;
+    of the first of each node the lowest identifier goes."""
+    order = sorted(range(len(frames)), key=lambda i: frames[i][0])
+    waiting: dict[int, list[int]] = {}  # by node, the first last
+    heads: list[tuple[int, int]] = []  # identifier and node
+    times, packets = [], []
+    now_ns = busy_ns = next_in = 0
+    while next_in < len(order) or heads:
+        if not heads:
+            now_ns = max(now_ns, frames[order[next_in]][0])
+        while next_in < len(order) and frames[order[next_in]][0] <= now_ns:
+            queue = waiting.setdefault(frames[order[next_in]][4], [])
+            if not queue:
+                heapq.heappush(heads, (frames[order[next_in]][1], frames[order[next_in]][4]))
+            queue.insert(0, order[next_in])
+            next_in += 1
+        _, node = heapq.heappop(heads)
+        sent = waiting[node].pop()
+        _, can_id, data, fd, _ = frames[sent]
+        now_ns += durations[sent]
+        busy_ns += durations[sent]
+        times.append(now_ns)
+        packets.append(datagram(can_id, data, fd=fd))
+        if waiting[node]:
+            heapq.heappush(heads, (frames[waiting[node][-1]][1], node))
+    return Stream(times, packets, busy_ns / max(1, now_ns))
+
+
+# --- at pace
+
+
+def _play(pipe: Connection, hand: HandConfig, loads: Sequence[tuple[BusConfig, Stream]]) -> Sent:
+    sockets = [_connect(bus) for bus, _ in loads]
+    try:
+        sent = [0] * len(loads)
+        beats = [
+            [datagram(od.heartbeat_cob_id(patch.node_id), b"\x05") for patch in hand.patches_on(bus.name)]
+            for bus, _ in loads
+        ]
+        while not pipe.poll(_BEAT_S):
+            for sock, packets in zip(sockets, beats, strict=True):
+                for packet in packets:
+                    _send(sock, packet)
+        begin_ns = pipe.recv()
+        cpu_s = time.process_time()
+        late_ns = _replay(sockets, [stream for _, stream in loads], begin_ns, sent)
+        return Sent(
+            frames={bus.name: count for (bus, _), count in zip(loads, sent, strict=True)},
+            bus_load={bus.name: stream.load for bus, stream in loads},
+            late_p99_ms=float(np.percentile(late_ns, 99)) / 1e6,
+            late_max_ms=float(np.max(late_ns)) / 1e6,
+            cpu_s=time.process_time() - cpu_s,
+        )
+    finally:
+        for sock in sockets:
+            sock.close()
+
+
+def _replay(
+    sockets: Sequence[socket.socket], streams: Sequence[Stream], begin_ns: int, sent: list[int]
+) -> list[int]:
+    """Send every frame at its time. Returns how late each turn found the first frame it had to send."""
+    late_ns, clock = [], time.monotonic_ns
+    at = [0] * len(streams)
+    left = sum(len(stream.packets) for stream in streams)
+    while left:
+        now_ns = clock() - begin_ns
+        for number, stream in enumerate(streams):
+            first, times, packets, send = at[number], stream.t_ns, stream.packets, sockets[number]
+            i = first
+            while i < len(times) and times[i] <= now_ns:
+                sent[number] += _send(send, packets[i])
+                i += 1
+            if i > first:
+                late_ns.append(now_ns - times[first])
+                left -= i - first
+                at[number] = i
+        time.sleep(TICK_S)
+    return late_ns
+
+
+def _connect(bus: BusConfig) -> socket.socket:
+    if bus.interface == "socketcan":
+        sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, int(bus.fd))
+        sock.bind((bus.channel,))
+    else:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.connect((LOOPBACK, int(bus.channel)))
+    return sock
+
+
+def _send(sock: socket.socket, packet: bytes) -> int:
+    """1, or 0 where nobody listens yet."""
+    while True:
+        try:
+            sock.send(packet)
+        except ConnectionRefusedError:
+            return 0
+        except OSError as error:
+            if error.errno != errno.ENOBUFS:
+                raise
+            time.sleep(_FULL_S)  # a CAN interface whose queue is full
+        else:
+            return 1

@@ -1,0 +1,96 @@
+"""The solvers as an informed user would set them up for a case: a stream in, what each frame gave out."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.bench.cases import DRIFT, Case
+from skinnode.bench.truth import Stream
+from skinnode.bench.verdict import LIMIT, Solved
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float
+from skinnode.model.status import Status
+from skinnode.solve.homotopy import solve_path
+from skinnode.solve.posterior import Posterior
+from skinnode.solve.schedule import Adaptive, Uniform
+from skinnode.solve.tracker import Tracker
+
+Method = Callable[[Stream], Solved]
+
+
+def of(case: Case, name: str) -> Method:
+    """The method ``name`` set up for ``case``, starting afresh with every stream."""
+    if last_only(name):
+        return functools.partial(_path, case, name.removeprefix("path "))
+    solver = solver_of(case, name)
+    return lambda stream: _solved(fields(case, name, solver, stream))
+
+
+def last_only(name: str) -> bool:
+    """Whether the method gives the last frame alone."""
+    return name.startswith("path ")
+
+
+def _path(case: Case, how: str, stream: Stream) -> Solved:
+    """``how``: an operator along all samples, or ``adaptive``."""
+    adaptive = how == "adaptive"
+    path = solve_path(
+        case.skin.layout,
+        stream.frames_ohm,
+        operator="dogleg" if adaptive else how,
+        schedule=Adaptive() if adaptive else Uniform(),
+        baseline_ohm=case.skin.rest_ohm,
+    )
+    # 5 deviations are what an error may reach; the estimate is just that
+    std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
+    return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
+
+
+def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -> list[FieldFrame]:
+    """Every frame of the stream by ``solver``, which was made for the case under that name."""
+    solver.reset()
+    noise = _noise_for_exact(case, stream) if name == "exact" else stream.noise
+    frames = zip(stream.frames_ohm, stream.valid, noise, strict=True)
+    return [solver.update(*frame) for frame in frames]
+
+
+def solver_of(case: Case, name: str) -> Tracker | Posterior:
+    """A solver of the case: ``exact``, ``posterior`` or ``auto``."""
+    # every frame comes with its own noise as well
+    common: dict[str, Any] = {
+        "relative_noise": case.converter.relative_std,
+        "baseline_ohm": case.skin.rest_ohm,
+    }
+    if name == "exact":
+        return Tracker(case.skin.layout, method="exact", **common)
+    if case.drift != "none":
+        common |= {"drift": case.drift, "drift_std": DRIFT}
+    if case.model_error:
+        common["model_error"] = case.model_error
+    if name == "posterior":
+        return Posterior(case.skin.layout, **common)
+    return Tracker(case.skin.layout, method="auto", **common)
+
+
+def _noise_for_exact(case: Case, stream: Stream) -> Float:
+    """The inverse knows noise of single resistances only: drift and model errors are told as that."""
+    change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
+    drift = 0.0 if case.drift == "none" else DRIFT
+    return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))
+
+
+def _solved(frames: list[FieldFrame]) -> Solved:
+    return Solved(
+        np.stack([frame.displacement_m for frame in frames]),
+        np.stack([frame.displacement_std_m for frame in frames]),
+        np.stack([_converged(frame.status) for frame in frames]),
+    )
+
+
+def _converged(status: tuple[Status, ...]) -> NDArray[np.bool_]:
+    return np.array([one is Status.CONVERGED for one in status])

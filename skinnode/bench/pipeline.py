@@ -1,0 +1,314 @@
+"""How much a host takes, and how fast: frames/s without loss, latency from the last frame of a scan to its
+field, CPU by group of threads, by number of buses and patches.
+
+The host is the one of ``skinnode host``, as guest of a robot whose master and nodes are a replay in another
+process (:mod:`skinnode.bench.load`). Frames come in by UDP, through SocketCAN's reader (see
+:mod:`skinnode.transport.datagram`), or on a real CAN interface.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+
+from skinnode.bench.load import LEAD_S, Generator
+from skinnode.bench.timing import machine
+from skinnode.host import Host, Subscription
+from skinnode.host.accounting import discrepancies
+from skinnode.model.config import HandConfig, LayoutConfig, parse_hand
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.frames import ScanStamp
+from skinnode.pauses import short_pauses
+from skinnode.transport import CanPort
+from skinnode.transport.datagram import DatagramPort, free_channel
+
+PATCHES_A_BUS: Final = 4
+CLASSIC_MS: Final = 50
+"""Four patches of 101 frames in 50 ms are 8,080 frames/s beside SYNC and heartbeats."""
+FD_MS: Final = 25
+STAGGER_MS: Final = 3.0
+"""From the SYNC of a bus to that of the next, where they are not sent at the same instant: four patches are
+then solved before the next four are due."""
+SCENES: Final = (
+    (False, True, 0.0),
+    (False, True, STAGGER_MS),
+    (False, False, 0.0),
+    (True, True, 0.0),
+    (True, True, STAGGER_MS),
+    (True, False, 0.0),
+)
+"""CAN FD, touched, and the stagger."""
+DEADLINE_US: Final = 1000
+"""For a field. An exact inverse takes 200 µs; one that is put to the posterior as well would take 13 ms."""
+RECEIVE_US: Final = 5.0
+LATENCY_MS: Final = 5.0
+SETTLE_S: Final = 5.0
+
+Row = dict[str, Any]
+_GROUPS: Final = ("receive", "mainline", "solve", "subscriber")
+
+
+def run(
+    seconds: float,
+    *,
+    short: bool,
+    interface: str,
+    channel: str,
+    all_cores: bool,
+    report: Callable[[Row], None],
+) -> dict[str, Any]:
+    """All rows, each told to ``report`` as it comes. ``short``: only those on which something is asked.
+    Raises BusError."""
+    fullest = 1 if interface == "socketcan" else 4
+    cores = sorted(os.sched_getaffinity(0))
+    apart = len(cores) > 1 and not all_cores
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        if apart:
+            stack.callback(os.sched_setaffinity, 0, cores)
+            os.sched_setaffinity(0, cores[:1])
+        for fd, touched, stagger_ms in SCENES:
+            if (short and not touched) or ((fd or stagger_ms) and interface == "socketcan"):
+                continue
+            hand = _hand(fullest, fd, stagger_ms, interface, channel, Path(folder), one_worker=apart)
+            plain = touched and not (fd or short or stagger_ms)
+            fewer = [buses for buses in (1, 2) if buses < fullest and plain]
+            core = cores[-1] if apart else None
+            with closing(Generator(hand, seconds, touched=touched, core=core)) as generator, short_pauses():
+                for buses in (*fewer, fullest):
+                    rows.append(_measure(_part(hand, buses), generator) | {"touched": touched})
+                    report(rows[-1])
+    road = "a CAN interface" if interface == "socketcan" else "UDP"
+    where = "the host on one core" if apart else "the host on all cores"
+    return {"machine": machine() | {"road": road, "": where}, "rows": rows, "must": _must(rows)}
+
+
+def _hand(
+    buses: int,
+    fd: bool,
+    stagger_ms: float,
+    interface: str,
+    channel: str,
+    folder: Path,
+    *,
+    one_worker: bool,
+) -> HandConfig:
+    listed = [
+        {
+            "name": f"can{i}",
+            "interface": interface,
+            "channel": channel if interface == "socketcan" else free_channel(),
+            "role": "guest",
+            "fd": fd,
+        }
+        for i in range(buses)
+    ]
+    layout = LayoutConfig().build()
+    baseline = folder / "baseline.txt"
+    np.savetxt(baseline, resistance_ohm(layout, layout.upper_m))
+    hand = parse_hand(
+        {
+            "buses": listed,
+            "patches": [
+                {
+                    "name": f"p{i}",
+                    "bus": f"can{i // PATCHES_A_BUS}",
+                    "node_id": 1 + i % PATCHES_A_BUS,
+                    "baseline": str(baseline),
+                }
+                for i in range(buses * PATCHES_A_BUS)
+            ],
+            "sync": {"period_ms": FD_MS if fd else CLASSIC_MS, "stagger_ms": stagger_ms},
+            "solver": {"deadline_us": DEADLINE_US} | ({"workers": 1} if one_worker else {}),
+            "stream": {"capacity_fields": 100_000},
+        }
+    )
+    # A bus this full is refused, and should be: every frame at its longest does not fit. Hence no validation.
+    full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
+    return hand.model_copy(update={"buses": full})
+
+
+def _part(hand: HandConfig, buses: int) -> HandConfig:
+    """The hand with the first of its buses only."""
+    kept = hand.buses[:buses]
+    patches = tuple(patch for patch in hand.patches if patch.bus in {bus.name for bus in kept})
+    return hand.model_copy(update={"buses": kept, "patches": patches})
+
+
+def _measure(hand: HandConfig, generator: Generator) -> Row:
+    names = [bus.name for bus in hand.buses]
+    open_port = CanPort if hand.buses[0].interface == "socketcan" else DatagramPort
+    generator.beat(names)
+    with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
+        begin_ns = generator.begin()
+        time.sleep(LEAD_S / 2)  # the last of the heartbeats before it have come
+        read_before = _read(host)
+        before, begin_s = _cpu_s(), time.monotonic()
+        sent = generator.wait()
+        _settle(host)
+        wall_s = time.monotonic() - begin_s
+        cpu_s = {group: used - before.get(group, 0.0) for group, used in _cpu_s().items()}
+        stats, read = host.stats(), _read(host) - read_before
+    published_ms, read_ms = reader.since(begin_ns)
+    lanes, buses = list(stats.patches.values()), list(stats.buses.values())
+    scans = sum(lane.offered + lane.withheld + lane.partial for lane in lanes)
+    seconds = hand.sync.period_s * scans / len(lanes)
+    return {
+        "buses": len(buses),
+        "patches": len(lanes),
+        "fd": hand.buses[0].fd,
+        "stagger_ms": hand.sync.stagger_ms,
+        "frames_hz": read / seconds,
+        "bus_load": max(sent.bus_load.values()),
+        "sent": sum(sent.frames.values()),
+        "received": read,
+        "kernel_dropped": sum(bus.kernel_dropped for bus in buses),
+        "queue_dropped": sum(bus.dropped for bus in buses),
+        "chunks_lost": sum(lane.assembler.chunks_lost for lane in lanes),
+        "scans": scans,
+        "scans_hz": scans / seconds,
+        "scans_torn": sum(lane.assembler.scans_torn for lane in lanes),
+        "scans_missed": sum(lane.assembler.scans_missed for lane in lanes),
+        "scans_skipped": sum(lane.skipped for lane in lanes),
+        "fields": sum(lane.solved for lane in lanes),
+        "fields_read": len(read_ms),
+        "untrusted": sum(lane.untrusted for lane in lanes),
+        "published_ms": _spread(published_ms),
+        "read_ms": _spread(read_ms),
+        "receive_us": 1e6 * (cpu_s["receive"] + cpu_s["mainline"]) / max(1, read),
+        "cpu": {group: used / wall_s for group, used in cpu_s.items()} | {"generator": sent.cpu_s / wall_s},
+        "generator_late_p99_ms": sent.late_p99_ms,
+        "generator_late_max_ms": sent.late_max_ms,
+        "discrepancies": discrepancies(stats),
+    }
+
+
+def _spread(late_ms: list[float]) -> dict[str, float | None]:
+    values = np.percentile(late_ms, (50, 99, 100)).tolist() if late_ms else [None] * 3
+    return dict(zip(("p50", "p99", "max"), values, strict=True))
+
+
+def lost(row: Row) -> int:
+    """Frames, chunks and scans that did not become fields, wherever they were lost."""
+    frames = row["sent"] - row["received"] + row["queue_dropped"]
+    return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
+
+
+def name_of(row: Row) -> str:
+    """What the hand of a row is, in a few words."""
+    kind = "CAN FD" if row["fd"] else "classic"
+    scene = "touched" if row["touched"] else "at rest"
+    apart = f", {row['stagger_ms']:g} ms apart" if row["stagger_ms"] else ""
+    return f"{kind}, {row['buses']} x {row['patches'] // row['buses']}, {scene}{apart}"
+
+
+def _must(rows: list[Row]) -> list[Row]:
+    """What is asked of the fullest hands whose patches are touched, and whether it is reached."""
+    must = []
+    for row in rows:
+        if row["buses"] < 4 or not row["touched"]:
+            continue
+        asked = [("lost", lost(row), 0.0), ("latency p99, ms", row["published_ms"]["p99"], LATENCY_MS)]
+        if not row["fd"]:
+            asked.append(("received to assembled, µs a frame", row["receive_us"], RECEIVE_US))
+        for what, got, most in asked:
+            reached = got is not None and got <= most
+            said = f"{name_of(row)}: {what}"
+            must.append({"what": said, "got": got, "asked": most, "reached": reached, "time": what != "lost"})
+    return must
+
+
+class _Reader:
+    """A program that reads fields, and when each came into its hands."""
+
+    def __init__(self, fields: Subscription) -> None:
+        self._stamps: list[tuple[ScanStamp, int]] = []
+        self._fields = fields
+        self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
+
+    def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
+        """Of the scans that ended later: ms from their last frame to the field, and until it was read."""
+        stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
+        published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
+        return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]
+
+    def _run(self) -> None:
+        for field in self._fields:
+            assert field.stamp is not None
+            self._stamps.append((field.stamp, time.monotonic_ns()))
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._fields.close()
+
+
+def _read(host: Host) -> int:
+    return sum(bus.read for bus in host.stats().buses.values())
+
+
+def _settle(host: Host) -> None:
+    """Wait until nothing changes any more."""
+    end_s, last = time.monotonic() + SETTLE_S, None
+    while time.monotonic() < end_s:
+        stats = host.stats()
+        now = ([bus.read for bus in stats.buses.values()], [lane.solved for lane in stats.patches.values()])
+        if now == last:
+            return
+        last = now
+        time.sleep(0.3)
+
+
+def _cpu_s() -> dict[str, float]:
+    """CPU time that each group of threads of this process has had."""
+    used: dict[str, float] = defaultdict(float)
+    names = {thread.native_id: thread.name.split()[0] for thread in threading.enumerate()}
+    for task in os.listdir("/proc/self/task"):
+        group = names.get(int(task), "other")
+        try:
+            text = Path(f"/proc/self/task/{task}/schedstat").read_text()
+        except OSError:  # it has ended
+            continue
+        used[group if group in _GROUPS else "other"] += int(text.split()[0]) * 1e-9
+    return used
+
+
+HEAD: Final = (
+    f"{'':39}{'frames/s':>9}{'load':>6}{'sent':>9}{'received':>9}{'lost':>6}{'scans/s':>8}{'skipped':>8}"
+    f"{'published, ms':>20}{'read, ms':>14}{'µs':>6}{'receive':>9}{'mainline':>9}{'solve':>7}{'load':>6}"
+    f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'share of a core':>24}"
+)
+LEGEND: Final = (
+    "lost: frames, chunks and scans, wherever. published, read: from the last frame of a scan, by kernel\n"
+    "time, to its field, and to its field in the hands of a program. µs: of threads receive and mainline,\n"
+    "their waking included. load: of the bus; of the process that replays. The scans of a SYNC end at the\n"
+    "same time on all patches, but where the SYNCs of the buses are some ms apart."
+)
+
+
+def line(row: Row) -> str:
+    """A row in a line."""
+
+    def ms(spread: dict[str, float | None], *names: str) -> str:
+        return "".join("     -" if spread[name] is None else f"{spread[name]:6.1f}" for name in names)
+
+    cpu = row["cpu"]
+    return (
+        f"{name_of(row):39}{row['frames_hz']:9.0f}{row['bus_load']:6.0%}{row['sent']:9}{row['received']:9}"
+        f"{lost(row):6}{row['scans_hz']:8.0f}{row['scans_skipped']:8}"
+        f"  {ms(row['published_ms'], 'p50', 'p99', 'max')}  {ms(row['read_ms'], 'p50', 'p99')}"
+        f"{row['receive_us']:6.1f}{cpu['receive']:9.0%}{cpu['mainline']:9.0%}{cpu['solve']:7.0%}"
+        f"{cpu['generator']:6.0%}"
+    )

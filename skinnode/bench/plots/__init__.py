@@ -1,0 +1,1 @@
+"""Plots of benchmarks, one module per benchmark. They need matplotlib."""

@@ -1,0 +1,406 @@
+"""Soak a hand under random faults: does the host survive, do all patches recover, are all sums exact?
+
+Simulated nodes with faults and the host share this process and two virtual buses. A round injects one to
+three faults into one patch or all, including drops of frames of every kind, clears them, and waits until
+every patch is operational and streaming again; subscribers come and go meanwhile. In some rounds other
+processes occupy the processor. Memory is compared between two idle instants, one after a warm-up and one
+at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would show a leak of one object
+a scan) and resident memory. This file may import the simulator, as the demo may, because it needs a source of
+faults.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import logging
+import os
+import random
+import threading
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from sys import getallocatedblocks
+from typing import Any, Final
+
+from skinnode.bench import soak_sums as sums
+from skinnode.bench.soak_starvation import starved_processor
+from skinnode.errors import BusError
+from skinnode.host import Condition, Host, HostStats
+from skinnode.host.accounting import discrepancies
+from skinnode.host.pipeline import check_solvable
+from skinnode.model.config import HandConfig, parse_hand
+from skinnode.model.frames import FieldFrame
+from skinnode.wire.codec import TIME_STEP_US
+from skinnode.wire.stuffing import load_kernels
+from skinnode.words import counted
+from vcan_sim.faults import NO_FAULTS, Faults, Injected
+from vcan_sim.fleet import Fleet
+from vcan_sim.sensor import REMEMBERED_READINGS
+
+WARM_UP: Final = 0.25
+"""Share of the time after which memory is looked at for the first time."""
+BLOCKS: Final = 2000
+"""Growth allowed: a few hundred come and go with what is under way; a leak of one a scan makes 10,000 in
+three minutes."""
+RESIDENT_MB: Final = 8.0
+"""Of the allocator of C, which gives memory back as it likes."""
+BACK_S: Final = 15.0
+"""A stream that is not back by then is lost. It should take one; a loaded machine may need more."""
+SLOW_S: Final = 1.0
+"""Rounds that took longer are told."""
+STARVED: Final = 0.1
+"""Share of the rounds in which other processes occupy the processor."""
+STARVED_S: Final = 3.0
+TARED: Final = 0.2
+"""Share of the rounds in which a patch is tared."""
+CALM_S: Final = 1.5
+_PATCHES: Final = 4
+_MANY: Final = 8
+"""Number of simultaneous faults from which a line gives their number, not their names."""
+
+_KINDS: Final[tuple[dict[str, Any], ...]] = (
+    {"lost": 0.05},
+    {"duplicated": 0.05},
+    {"reordered": 0.05},
+    {"late": 0.02},
+    {"short": 0.03},
+    {"remote": 0.03},
+    {"miscounted": 0.02},
+    {"torn": 0.1},
+    {"summary_lost": 0.1},
+    {"corrupted": 0.02},
+    {"displaced": 0.1},
+    {"understated": 0.1},
+    {"unchecked": 0.1},
+    {"reset": 0.05},
+    {"sync_lost": 0.1},
+    {"long": 0.5},
+    {"silent": True},
+    {"deaf": True},
+    {"frozen": True},
+    {"unplugged": True},
+    {"restart_every_s": 0.7},
+    {"emcy_per_s": 200.0},
+    {"babble_per_s": 500.0},
+    {"unplugged": True, "wrong_identity": True},
+    {"unplugged": True, "wrong_layout": True},
+    {"sdo_request_lost": 0.2},
+    {"sdo_response_lost": 0.2},
+    {"sdo_request_lost": 0.05, "sdo_response_lost": 0.05, "restart_every_s": 0.7},
+    {"sdo_response_lost": 1.0, "restart_every_s": 1.5},
+    {"lss_request_lost": 0.3, "lss_response_lost": 0.3, "sdo_response_lost": 1.0, "heartbeat_lost": 1.0},
+    {"lss_request_lost": 0.3, "sdo_request_lost": 1.0, "heartbeat_lost": 1.0},
+    {"nmt_lost": 0.5, "restart_every_s": 0.7},
+    {"heartbeat_lost": 0.3},
+    {"heartbeat_lost": 1.0},
+    {"boot_up_lost": 1.0, "restart_every_s": 0.7},
+    {"emcy_lost": 0.5, "emcy_per_s": 20.0},
+    {"command_lost": 0.5},
+    dict.fromkeys(
+        (
+            "lost",
+            "summary_lost",
+            "sync_lost",
+            "nmt_lost",
+            "sdo_request_lost",
+            "sdo_response_lost",
+            "lss_request_lost",
+            "lss_response_lost",
+            "heartbeat_lost",
+            "boot_up_lost",
+            "emcy_lost",
+            "command_lost",
+        ),
+        0.05,
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Size:
+    """What must not grow."""
+
+    blocks: int
+    resident_mb: float
+    threads: int
+    descriptors: int
+
+
+def warm_up() -> None:
+    """Compile the kernels that a soak needs."""
+    hand = _hand()
+    load_kernels()
+    for patch in hand.patches:
+        check_solvable(patch, hand.solver)
+
+
+def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
+    """Soak for ``minutes``; progress goes to ``report``. Raises as :meth:`Host.from_config`."""
+    chance = random.Random(seed)
+    hand = _hand()
+    counter = sums.FrameCounter([bus.name for bus in hand.buses])
+    kept = logging.getLogger("skinnode")
+    level = kept.level
+    kept.setLevel(logging.CRITICAL)  # injected faults log thousands of warnings
+    try:
+        fleet = Fleet(hand, faults=Faults(seed=seed))
+        for source in fleet.patches.values():
+            for k in range(REMEMBERED_READINGS):  # it grows up to that
+                source.read(-1000 * TIME_STEP_US * (k + 1))
+        with fleet:
+            before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}
+            with Host.from_config(hand, tap=counter) as host:
+                figures = _soak(host, fleet, chance, minutes * 60.0, report)
+                names = [patch.name for patch in hand.patches]
+                back_s, _ = _wait_for_patches(host, names)
+                figures["not_operational"] = _not_operational(host) if back_s >= BACK_S else []
+                fleet.inject(Faults(silent=True))
+                stats = _standing_still(host)
+                injected = {patch.name: fleet.injected(patch.name) for patch in hand.patches}
+                wrong = [
+                    *discrepancies(stats),
+                    *sums.injected_otherwise(stats, injected),
+                    *sums.received_otherwise(fleet, counter, before),
+                ]
+            time.sleep(CALM_S)  # lets the host's last frames reach the nodes
+        wrong += sums.sent_otherwise(fleet, counter)
+    finally:
+        kept.setLevel(level)
+    lanes = stats.patches.values()
+    figures["frames"] = sum(bus.received for bus in stats.buses.values())
+    figures["scans"] = sum(lane.offered + lane.withheld + lane.partial for lane in lanes)
+    figures["fields"] = sum(lane.solved for lane in lanes)
+    figures["rejoins"] = sum(node.rejoins for node in stats.nodes.values())
+    figures["defects"] = [
+        f"{name}: {each.newest}" for name, each in stats.defects.items() if each.newest is not None
+    ]
+    figures["discrepancies"] = wrong
+    figures["from_nodes"] = [asdict(each) for each in sums.of_nodes(fleet)]
+    figures["from_host"] = [asdict(each) for each in sums.of_host(fleet)]
+    figures["injected"] = {
+        name: sum(getattr(each, name) for each in injected.values()) for name in Injected.__dataclass_fields__
+    }
+    figures["must"] = _must(figures)
+    return figures
+
+
+def told(figures: dict[str, Any]) -> list[str]:
+    """Return the figures as readable lines."""
+    lines = [
+        f"{figures['rounds']} rounds, {figures['starved_rounds']} of them with a starved processor; "
+        f"{figures['frames']} frames received, {figures['scans']} scans, {figures['fields']} fields, "
+        f"{figures['rejoins']} bring-ups",
+        f"all patches back after {figures['slowest_back_s']:.2f} s at most, "
+        f"after more than {SLOW_S:g} s in {counted(figures['slow_rounds'], 'round')}",
+    ]
+    columns = f"{'sent':>9} {'dropped':>9} {'held back':>9} {'arrived':>9}"
+    for key, direction in (("from_nodes", "nodes to the host"), ("from_host", "host to the nodes")):
+        lines.append(f"frames from the {direction:<17}{columns}")
+        for row in figures[key]:
+            numbers = (row["wanted"], row["dropped"], row["held_back"], row["arrived"])
+            lines.append(f"  {row['kind']:<30} " + " ".join(f"{number:>9}" for number in numbers))
+    lines.append("dropped: lost on the way by a fault")
+    lines.append("held back: the node was silent, unplugged, deaf or off the bus, or the chunk was late")
+    for key in ("not_back", "not_operational", "defects", "discrepancies"):
+        lines += [f"  {line}" for line in figures[key]]
+    return lines
+
+
+def _hand() -> HandConfig:
+    small = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
+    buses = [
+        {"name": f"can{i}", "channel": f"soak-{uuid.uuid4().hex}", "heartbeat_node_id": 1} for i in range(2)
+    ]
+    patches = [
+        {"name": f"p{i}", "node_id": 5 + i, "serial": 1 + i, "bus": f"can{i % 2}", "layout": small}
+        for i in range(_PATCHES)
+    ]
+    beat = {"heartbeat_ms": 100}
+    return parse_hand({"buses": buses, "patches": patches, "sync": {"period_ms": 40}, "bring_up": beat})
+
+
+def _soak(
+    host: Host, fleet: Fleet, chance: random.Random, seconds: float, report: Callable[[str], None]
+) -> dict[str, Any]:
+    names = [patch.name for patch in host.hand.patches]
+    begin_s, rounds, starved, slow, slowest_s = time.monotonic(), 0, 0, 0, 0.0
+    lost: list[str] = []
+    first: _Size | None = None
+
+    def say(text: str) -> None:
+        report(f"{time.monotonic() - begin_s:6.0f} s: {text}")
+
+    while (passed_s := time.monotonic() - begin_s) < seconds:
+        if first is None and passed_s > WARM_UP * seconds:
+            _all_at_once(host, fleet, names)
+            first = _size()
+            say(_told(first))
+        hungry = chance.random() < STARVED
+        with ExitStack() as round_:
+            what = _inject(fleet, chance, names)
+            if chance.random() < TARED:
+                what += f"; {_tare(host, chance.choice(names))}"
+            if hungry:
+                what += f" with {round_.enter_context(starved_processor())} processes on the processor"
+            with host.fields(capacity=2) as abandoned:
+                callback = host.on_field(_broken if rounds % 2 else _patient, capacity=4)
+                abandoned.get(0.1)
+                time.sleep(STARVED_S if hungry else chance.uniform(0.3, 2.0))
+                callback.close()
+            _calm(fleet)
+        back_s, waited_for = _wait_for_patches(host, names)
+        rounds += 1
+        starved += hungry
+        slow += back_s >= SLOW_S
+        slowest_s = max(slowest_s, back_s)
+        if back_s >= BACK_S:
+            lost.append(f"round {rounds} ({what}): {waited_for}")
+        if rounds % 20 == 0 or back_s >= SLOW_S:
+            late = f"; waited longest for {waited_for}" if back_s >= SLOW_S else ""
+            say(f"round {rounds}, {what}: all patches back after {back_s:.2f} s{late}")
+    time.sleep(CALM_S)
+    last = _size()
+    say(_told(last))
+    first = first or last
+    return {
+        "seconds": time.monotonic() - begin_s,
+        "rounds": rounds,
+        "starved_rounds": starved,
+        "slow_rounds": slow,
+        "slowest_back_s": slowest_s,
+        "not_back": lost,
+        "grown_blocks": last.blocks - first.blocks,
+        "grown_mb": last.resident_mb - first.resident_mb,
+        "grown_threads": last.threads - first.threads,
+        "grown_descriptors": last.descriptors - first.descriptors,
+    }
+
+
+def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
+    """Every patch has to be brought up at the same time: as many threads as there will ever be."""
+    fleet.inject(Faults(unplugged=True))
+    time.sleep(CALM_S)
+    _calm(fleet)
+    _wait_for_patches(host, names)
+    time.sleep(CALM_S)
+
+
+def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
+    """The faults of a round; what they are."""
+    if chance.random() < 0.05:
+        bus = chance.choice(fleet.hand.buses).name
+        fleet.bus_off(bus, off=True)
+        return f"nodes of {bus} bus-off"
+    kinds: dict[str, Any] = {}
+    for kind in chance.sample(_KINDS, chance.choice((1, 2, 3))):
+        kinds |= kind
+    patch = None if chance.random() < 0.2 else chance.choice(names)
+    fleet.inject(Faults(**kinds), patch)
+    what = ", ".join(kinds) if len(kinds) < _MANY else f"{len(kinds)} kinds of fault"
+    return f"{what} of {patch or 'all patches'}"
+
+
+def _tare(host: Host, name: str) -> str:
+    """Tare a patch if it is running. Returns the outcome in words."""
+    try:
+        host.tare(name)
+    except BusError:  # includes NodeError, raised if the patch is not operational
+        return f"{name} could not be tared"
+    return f"{name} tared"
+
+
+def _calm(fleet: Fleet) -> None:
+    for bus in fleet.hand.buses:
+        fleet.bus_off(bus.name, off=False)
+    fleet.inject(NO_FAULTS)
+
+
+def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
+    """Wait until every patch is operational and has published a field of a SYNC sent after the call. Returns
+    the time in s, and the last patch waited for with the reason."""
+    begin_ns, waited_for = time.monotonic_ns(), ""
+
+    def waits_for(name: str) -> str:
+        health, field = host.health(name), host.latest(name)
+        if health.condition is not Condition.OPERATIONAL:
+            return f"{name}, {health.condition}: {health.reason}"
+        streams = field is not None and field.stamp is not None and field.stamp.t_sync_ns > begin_ns
+        return "" if streams else f"{name}, operational, no field yet"
+
+    while reasons := [reason for name in names if (reason := waits_for(name))]:
+        waited_for = reasons[0]
+        if time.monotonic_ns() > begin_ns + BACK_S * 1e9:
+            return BACK_S, waited_for
+        time.sleep(0.01)
+    return (time.monotonic_ns() - begin_ns) * 1e-9, waited_for
+
+
+def _not_operational(host: Host) -> list[str]:
+    """Return a line for each patch that is not operational, with the reason."""
+    healths = (host.health(patch.name) for patch in host.hand.patches)
+    return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
+
+
+def _broken(field: FieldFrame) -> None:
+    raise RuntimeError("a subscriber's own defect")
+
+
+def _patient(field: FieldFrame) -> None:
+    time.sleep(0.2)
+
+
+def _standing_still(host: Host) -> HostStats:
+    """Counters when nothing comes any more and everything has been worked off."""
+    last, stats = None, host.stats()
+    for _ in range(100):
+        now = (
+            [stats.buses[name].read for name in stats.buses],
+            [lane.solved for lane in stats.patches.values()],
+        )
+        if now == last:
+            break
+        last = now
+        time.sleep(0.3)
+        stats = host.stats()
+    return stats
+
+
+def _size() -> _Size:
+    for _ in range(3):
+        gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+    if trim is not None:
+        trim(0)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return _Size(
+        getallocatedblocks(),
+        pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        threading.active_count(),
+        len(os.listdir("/proc/self/fd")),
+    )
+
+
+def _told(size: _Size) -> str:
+    return (
+        f"{size.blocks} blocks, {size.resident_mb:.1f} MB resident, {size.threads} threads, "
+        f"{size.descriptors} file descriptors"
+    )
+
+
+def _must(figures: dict[str, Any]) -> list[dict[str, Any]]:
+    asked = (
+        ("growth: blocks of Python", figures["grown_blocks"], BLOCKS),
+        ("growth: resident memory, MB", figures["grown_mb"], RESIDENT_MB),
+        ("growth: threads", figures["grown_threads"], 0),
+        ("growth: file descriptors", figures["grown_descriptors"], 0),
+        (f"rounds after which a patch was not back within {BACK_S:g} s", len(figures["not_back"]), 0),
+        ("patches that are not operational at the end", len(figures["not_operational"]), 0),
+        ("defects of the host", len(figures["defects"]), 0),
+        ("sums that do not agree", len(figures["discrepancies"]), 0),
+    )
+    return [{"what": what, "got": got, "asked": most, "reached": got <= most} for what, got, most in asked]

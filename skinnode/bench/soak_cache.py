@@ -1,0 +1,56 @@
+"""A damaged copy of the kernel cache, for a soak to start with."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
+_DAMAGED: Final = 4
+"""Number of cache files to damage; each costs a compilation of up to a few seconds."""
+_COMPILE_S: Final = 600.0
+"""Maximum time to compile all kernels, on a slow machine."""
+
+
+def fill(folder: Path) -> None:
+    """Fill a cache below ``folder`` with the kernels that a soak needs: copied from the user's cache, or
+    compiled in a child process if the user has none. The user's cache is not changed.
+
+    Raises subprocess.SubprocessError if the child fails.
+    """
+    from skinnode.jit import cache_dir, is_cold
+
+    users = cache_dir()
+    if users is not None and not is_cold():
+        shutil.copytree(users, folder / "skinnode" / users.name)
+        return
+    code = "from skinnode.bench.soak import warm_up; warm_up()"
+    command = [sys.executable, "-c", code]
+    subprocess.run(command, env=environment(folder), check=True, timeout=_COMPILE_S)
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment of a process that keeps its kernels below ``folder``."""
+    return {**os.environ, CACHE_ENVIRONMENT: str(folder)}
+
+
+def damage(folder: Path, seed: int) -> list[str]:
+    """Damage files of the cache below ``folder``, alternately cut in half and overwritten with random bytes;
+    the same seed damages the same files. Returns a line for each file."""
+    chance = random.Random(seed)
+    files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)
+    lines = []
+    for i, file in enumerate(chance.sample(files, min(_DAMAGED, len(files)))):
+        data = file.read_bytes()
+        if i % 2:
+            file.write_bytes(chance.randbytes(len(data)))
+            lines.append(f"{file.name} filled with random bytes")
+        else:
+            file.write_bytes(data[: len(data) // 2])
+            lines.append(f"{file.name} cut in half")
+    return lines

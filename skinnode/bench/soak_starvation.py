@@ -1,0 +1,44 @@
+"""Starves a soak of processor time for a while, with child processes that spin."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Final
+
+_NICE: Final = -5
+"""Nice value of the children if this process may set it; otherwise they inherit that of the soak."""
+_CHILDREN_PER_PROCESSOR: Final = 3
+_LONGEST_S: Final = 30.0
+"""Maximum lifetime of a child, which also exits as soon as its parent has gone."""
+
+_BUSY: Final = """
+import os, sys, time
+parent, end_s = os.getppid(), time.monotonic() + float(sys.argv[1])
+while time.monotonic() < end_s and os.getppid() == parent:
+    for _ in range(100_000):
+        pass
+"""
+
+
+@contextlib.contextmanager
+def starved_processor() -> Iterator[int]:
+    """Keep every processor busy with child processes during the ``with`` block. Yields their number."""
+    count = _CHILDREN_PER_PROCESSOR * len(os.sched_getaffinity(0))
+    children: list[subprocess.Popen[bytes]] = []
+    try:
+        for _ in range(count):
+            command = [sys.executable, "-S", "-c", _BUSY, str(_LONGEST_S)]
+            child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+            children.append(child)
+            with contextlib.suppress(OSError):  # only root may raise a priority
+                os.setpriority(os.PRIO_PROCESS, child.pid, _NICE)
+        yield count
+    finally:
+        for child in children:
+            child.kill()
+        for child in children:
+            child.wait()

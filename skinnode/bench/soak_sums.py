@@ -1,0 +1,157 @@
+"""Sums of a soak: compares, kind by kind, the frames that simulated nodes sent and dropped with the host's
+counts."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from skinnode.host import HostStats
+from skinnode.host.pipeline import Solver
+from skinnode.transport import Frame
+from vcan_sim.faults import Injected
+from vcan_sim.fleet import Fleet
+from vcan_sim.tally import Kind, kind_of
+
+
+class FrameCounter:
+    """Counts the frames that a host receives and sends, by bus and kind; a
+    :class:`~skinnode.host.tap.HostTap`."""
+
+    def __init__(self, buses: Sequence[str]) -> None:
+        self.received_on: dict[str, Counter[Kind]] = {bus: Counter() for bus in buses}
+        self.sent_on: dict[str, Counter[Kind]] = {bus: Counter() for bus in buses}
+        self._counting = threading.Lock()  # several threads send
+
+    def received(self, bus: str, frames: Sequence[Frame]) -> None:
+        """Count a batch."""
+        counter = self.received_on[bus]
+        for frame in frames:
+            if not (frame.error or frame.extended):
+                counter[kind_of(frame.can_id, frame.data, frame.remote)] += 1
+
+    def sent(self, bus: str, frame: Frame) -> None:
+        """Count a frame."""
+        with self._counting:
+            self.sent_on[bus][kind_of(frame.can_id, frame.data, frame.remote)] += 1
+
+    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
+        """Nothing to count."""
+
+    def withheld(self, patch: str) -> None:
+        """Nothing to count."""
+
+    def polled(self, patch: str, t_ns: int) -> None:
+        """Nothing to count."""
+
+    def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
+        """Nothing to count."""
+
+
+@dataclass(frozen=True, slots=True)
+class KindSums:
+    """Counts of the frames of one kind over a whole soak."""
+
+    kind: str
+    wanted: int
+    """Frames that the senders wanted to send, including those added by faults."""
+    dropped: int
+    """Frames that a fault dropped on their way."""
+    held_back: int
+    """Frames that a node which was silent, unplugged, deaf or off the bus did not send or hear."""
+    arrived: int
+
+
+def of_nodes(fleet: Fleet) -> list[KindSums]:
+    """Return the sums of frames from the nodes to the host, by kind."""
+    sums = []
+    for kind in Kind:
+        tallies = [fleet.tally(patch.name) for patch in fleet.hand.patches]
+        wanted = sum(tally.handed[kind] for tally in tallies)
+        if wanted:
+            held = sum(tally.silenced[kind] + tally.refused[kind] + tally.waiting[kind] for tally in tallies)
+            dropped = sum(tally.lost[kind] for tally in tallies)
+            sums.append(KindSums(kind, wanted, dropped, held, sum(tally.emitted[kind] for tally in tallies)))
+    return sums
+
+
+def of_host(fleet: Fleet) -> list[KindSums]:
+    """Return the sums of frames from the host to the nodes, by kind; a frame counts once for each node that
+    could hear it."""
+    sums = []
+    for kind in Kind:
+        wanted = dropped = held = arrived = 0
+        for bus in fleet.hand.buses:
+            tallies = [fleet.tally(patch.name) for patch in fleet.hand.patches_on(bus.name)]
+            missed = len(tallies) * fleet.passed(bus.name).missed[kind]
+            wanted += missed + sum(tally.heard[kind] for tally in tallies)
+            dropped += sum(tally.lost_in[kind] for tally in tallies)
+            held += missed + sum(tally.unheard[kind] for tally in tallies)
+            arrived += sum(tally.taken[kind] for tally in tallies)
+        if wanted:
+            sums.append(KindSums(kind, wanted, dropped, held, arrived))
+    return sums
+
+
+def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
+    """Return a line for each sum of frames from nodes to host that does not add up. Call while the nodes are
+    silent. ``before``: frames that each bus carried before the host opened it."""
+    found = []
+    for bus in fleet.hand.buses:
+        tallies = [fleet.tally(patch.name) for patch in fleet.hand.patches_on(bus.name)]
+        for kind in Kind:
+            emitted = sum(tally.emitted[kind] for tally in tallies)
+            sent, received = fleet.passed(bus.name).sent[kind], counter.received_on[bus.name][kind]
+            if not emitted == sent == received + before[bus.name][kind]:
+                found.append(
+                    f"{bus.name}: {kind} frames: nodes sent {emitted}, the bus took {sent}, "
+                    f"the host received {received}"
+                )
+    return found
+
+
+def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
+    """Return a line for each sum of frames from host to nodes that does not add up, in total and for each
+    node. Call after the host has closed and the nodes have stopped."""
+    found = []
+    for bus in fleet.hand.buses:
+        passed = fleet.passed(bus.name)
+        for kind in Kind:
+            sent, heard = counter.sent_on[bus.name][kind], passed.heard[kind] + passed.missed[kind]
+            if sent != heard:
+                found.append(
+                    f"{bus.name}: {kind} frames: the host sent {sent}, the nodes' interface heard {heard}"
+                )
+            found += [
+                f"{patch.name}: {kind} frames: its interface heard {passed.heard[kind]}, the node {of_node}"
+                for patch in fleet.hand.patches_on(bus.name)
+                if (of_node := fleet.tally(patch.name).heard[kind]) != passed.heard[kind]
+            ]
+    for patch in fleet.hand.patches:
+        found += [f"{patch.name}: {text}" for text in fleet.tally(patch.name).discrepancies()]
+    return found
+
+
+def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
+    """Return a line for each counter of the host that differs from the injected faults."""
+    found = [
+        f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
+        for name, each in injected.items()
+        if stats.patches[name].frames != each.pdos
+    ]
+    lanes, buses = stats.patches.values(), stats.buses.values()
+    short = sum(lane.assembler.bad_length for lane in lanes)
+    unchecked = sum(lane.assembler.bad_form for lane in lanes)
+    for what, got, name in (
+        ("remote frames", sum(bus.ignored for bus in buses), "remote"),
+        ("short chunks", short, "short"),
+        ("long heartbeats", sum(bus.malformed for bus in buses) - short - unchecked, "long"),
+        ("frames of foreign COB-IDs", sum(bus.foreign for bus in buses), "babbled"),
+        ("frames lost to the host's own queue", sum(bus.dropped for bus in buses), None),
+    ):
+        must = sum(getattr(each, name) for each in injected.values()) if name else 0
+        if got != must:
+            found.append(f"{what}: the host counted {got}, {must} were injected")
+    return found

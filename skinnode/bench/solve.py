@@ -1,0 +1,206 @@
+"""One wire of the reference patch to 1e-9 from a near start: ours and its peers on the same compiled F and J.
+
+The start is the sample before the last of a ten-step path to a 10 % press. Every peer runs at the loosest
+tolerance that brings the displacement to 1e-9; one that no tolerance brings there is listed without a time.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench.timing import machine, take_turns
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.kernels import potential, potential_jacobian
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve import wires
+from skinnode.solve.operators import OPERATORS
+from skinnode.solve.patch_solver import PatchSolver
+from skinnode.solve.problem import PatchProblem
+from skinnode.solve.system import solve_system
+
+ACCURACY: Final = 1e-9
+"""Largest error of a coordinate, relative to the largest displacement of its wire."""
+TOLERANCES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-14, 1e-15)
+
+Solve = Callable[["Case", float], Float]
+
+
+class Case:
+    """One wire: r = a F − 1 and its Jacobian for anyone, its start and its truth."""
+
+    def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
+        self.wire, self.a, self.start, self.truth = wire, a, start, truth
+        self.size = float(np.abs(truth - problem.rest[wire]).max())
+        self._lower = problem.lower
+        unknowns, equations = truth.size, a.size
+        self._f, self._scratch = np.empty(equations), np.empty(equations)
+        self._jt = np.empty((unknowns, equations))
+
+    def residual(self, x: Float) -> Float:
+        potential(x, self._lower, self._f)
+        return np.asarray(self.a * self._f - 1.0)
+
+    def jacobian_transposed(self, x: Float) -> Float:
+        potential_jacobian(x, self._lower, self._scratch, self._jt)
+        return np.asarray(self._jt * self.a)
+
+    def residual_beside_jacobian(self) -> Float:
+        """r at the point of the last Jacobian, which came with it."""
+        return np.asarray(self.a * self._scratch - 1.0)
+
+    def jacobian(self, x: Float) -> Float:
+        return self.jacobian_transposed(x).T
+
+    def error(self, x: Float) -> float:
+        return float(np.abs(x - self.truth).max()) / self.size
+
+
+def press(layout: PatchLayout, depth: float) -> Float:
+    """A smooth dent with shear, deepest ``depth`` heights, (U, N, 3) metres."""
+    middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
+    away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
+    dent = depth * layout.height_m / (1.0 + away)
+    return np.stack([0.3 * dent, -0.15 * dent, -dent], axis=-1)
+
+
+def peers(problem: PatchProblem) -> dict[str, Solve]:
+    """Every solver by name: (case, tolerance) to x. Ours come first."""
+    from scipy import optimize
+
+    solver = PatchSolver(problem, 0)
+    weight = np.ones_like(solver.a_solved)
+    frame = np.ones_like(weight)
+    todo = np.zeros(len(frame), np.uint8)
+
+    def ours(code: int) -> Solve:
+        def solve(case: Case, tolerance: float) -> Float:
+            todo[:] = wires.LEAVE
+            todo[case.wire] = wires.SOLVE
+            frame[case.wire] = case.a
+            solver.x[case.wire] = case.start
+            solver.solve(todo, frame, weight, 0, tolerance, tolerance, 50, operator=code)
+            return np.asarray(solver.x[case.wire])
+
+        return solve
+
+    def python_callables(case: Case, tolerance: float) -> Float:
+        return solve_system(case.residual, case.jacobian, case.start, tol_f=tolerance, tol_x=tolerance).x
+
+    def root(method: str) -> Solve:
+        def solve(case: Case, tolerance: float) -> Float:
+            options = {"col_deriv": True}
+            found = optimize.root(
+                case.residual,
+                case.start,
+                jac=case.jacobian_transposed,
+                method=method,
+                tol=tolerance,
+                options=options,
+            )
+            return np.asarray(found.x)
+
+        return solve
+
+    def least_squares(method: str) -> Solve:
+        def solve(case: Case, tolerance: float) -> Float:
+            tolerance = max(tolerance, 2.3e-16)
+            found = optimize.least_squares(
+                case.residual,
+                case.start,
+                jac=case.jacobian,
+                method=method,
+                ftol=tolerance,
+                xtol=tolerance,
+                gtol=tolerance,
+            )
+            return np.asarray(found.x)
+
+        return solve
+
+    solvers = {f"skinnode {name}": ours(code) for name, code in OPERATORS.items()}
+    solvers["skinnode solve_system, Python callables"] = python_callables
+    solvers |= {f"SciPy root {method}": root(method) for method in ("hybr", "lm")}
+    solvers |= {f"SciPy least_squares {m}": least_squares(m) for m in ("trf", "dogbox", "lm")}
+    if importlib.util.find_spec("pyceres") is not None:
+        solvers["Ceres dogleg (pyceres)"] = ceres()
+    return solvers
+
+
+def ceres() -> Solve:
+    """Ceres with its dense QR and traditional dogleg, without a line of output."""
+    pyceres = importlib.import_module("pyceres")
+    options = pyceres.SolverOptions()
+    options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_QR
+    options.logging_type = pyceres.LoggingType.SILENT
+    options.minimizer_progress_to_stdout = False
+    options.num_threads = 1
+
+    class Cost(pyceres.CostFunction):  # type: ignore[misc, name-defined]  # pyceres has no type information
+        def __init__(self, case: Case) -> None:
+            super().__init__()
+            self._case = case
+            self.set_num_residuals(case.a.size)
+            self.set_parameter_block_sizes([case.start.size])
+
+        def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+            x = np.ascontiguousarray(parameters[0])
+            if jacobians is None:
+                residuals[:] = self._case.residual(x)
+            else:
+                jacobians[0][:] = self._case.jacobian(x).ravel()
+                residuals[:] = self._case.residual_beside_jacobian()
+            return True
+
+    def solve(case: Case, tolerance: float) -> Float:
+        x = case.start.copy()
+        options.function_tolerance = tolerance**2  # of the sum of squares
+        options.gradient_tolerance = tolerance
+        options.parameter_tolerance = tolerance
+        problem = pyceres.Problem()
+        problem.add_residual_block(Cost(case), None, [x])
+        summary = pyceres.SolverSummary()
+        pyceres.solve(options, problem, summary)
+        return x
+
+    return solve
+
+
+def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
+    for case in cases:
+        solve(case, tolerance)
+
+
+def run(rounds: int) -> dict[str, Any]:
+    """The figures of the benchmark: µs a wire, ratio to our dogleg, error."""
+    layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
+    problem = PatchProblem.of(layout)
+    cases = []
+    for wire in range(layout.shape[0]):
+        moved, before = (layout.upper_m + press(layout, 0.1 * part) for part in (1.0, 0.9))
+        a = np.ascontiguousarray((resistance_ohm(layout, moved) * problem.gain)[wire])
+        ends = [np.ascontiguousarray(x[wire].ravel() / layout.pitch_m) for x in (before, moved)]
+        cases.append(Case(problem, wire, a, *ends))
+    rows: list[dict[str, Any]] = []
+    timed: dict[str, Callable[[], object]] = {}
+    for name, solve in peers(problem).items():
+        for tolerance in TOLERANCES:
+            error = max(case.error(solve(case, tolerance)) for case in cases)
+            if error <= ACCURACY:
+                break
+        rows.append({"who": name, "tolerance": tolerance, "error": error, "us": None, "ratio": None})
+        if error <= ACCURACY:
+            timed[name] = functools.partial(_solve_all, solve, cases, tolerance)
+    order = ["skinnode dogleg", *(name for name in timed if name != "skinnode dogleg")]
+    times = take_turns({name: timed[name] for name in order}, rounds=rounds)
+    for row in rows:
+        if row["who"] in times:
+            row["us"] = times[row["who"]].call_us / len(cases)
+            row["ratio"] = times[row["who"]].ratio
+    return {"benchmark": "solve", "machine": machine(), "accuracy": ACCURACY, "rows": rows}

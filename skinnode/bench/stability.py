@@ -1,0 +1,138 @@
+"""Every hard case over many seeds: error, reported deviation, status and verdict of each method."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import multiprocessing
+import time
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.bench import methods
+from skinnode.bench.cases import Case, all_cases
+from skinnode.bench.timing import machine
+from skinnode.bench.verdict import Solved, Tally
+from skinnode.child_processes import starting_children
+from skinnode.json_values import plain
+
+TWIN_SEEDS: Final = 2
+"""Where ``auto`` gave the same bits as the method it chose on so many streams, it is not run again."""
+
+
+@contextlib.contextmanager
+def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of ``jobs`` processes, which end at once if the ``with`` block is left by an exception."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, spawn) as pool:
+        try:
+            yield pool
+        except (
+            BaseException
+        ):  # nothing is cancelled: Python 3.11 prints a traceback about it when a process dies
+            for process in multiprocessing.active_children():
+                process.kill()
+            raise
+
+
+def run(
+    seeds: int,
+    *,
+    cases: Sequence[Case] | None = None,
+    only: Sequence[str] | None = None,
+    jobs: int = 1,
+    report: Callable[[dict[str, Any]], object] = lambda row: None,
+) -> dict[str, Any]:
+    """The figures; ``report`` gets each row when it is ready. ``only``: the methods to run.
+
+    Where no ``cases`` are given all of them are shared out to so many processes, ``jobs``; the streams of a
+    case, and so its rows, do not depend on that.
+    """
+    rows: list[dict[str, Any]] = []
+    with contextlib.ExitStack() as stack:
+        found: Iterable[list[dict[str, Any]]]
+        if cases is None and jobs > 1:
+            with starting_children():
+                pool = stack.enter_context(_processes(jobs))
+                shares = [pool.submit(_numbered, seeds, only, i) for i in range(len(all_cases()))]
+            found = (each.result() for each in shares)
+        else:
+            found = (_rows(case, only, seeds) for case in (all_cases() if cases is None else cases))
+        for row in itertools.chain.from_iterable(found):
+            rows.append(row)
+            report(row)
+    return {
+        "benchmark": "stability",
+        "machine": machine(),
+        "seeds": seeds,
+        "rows": plain(rows),
+        "wrong": sum(row["wrong"] for row in rows),
+    }
+
+
+def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
+    """The rows of one of all cases, in a process of its own: a case has closures, which do not travel."""
+    return _rows(all_cases()[number], only, seeds)
+
+
+def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
+    """One row a method; all of them get the same streams."""
+    chosen = [name for name in case.methods if only is None or name in only]
+    solvers = {name: methods.of(case, name) for name in chosen}
+    tallies = {name: Tally(case.converter.exact) for name in chosen}
+    twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
+    name_code = zlib.crc32(case.name.encode())  # a case added or moved leaves the streams of the others
+    for seed in range(seeds):
+        stream = case.make(np.random.default_rng([seed, name_code]))
+        tracked = stream.every(case.stride)
+        found: dict[str, Solved] = {}
+        for name, solve in solvers.items():
+            start = time.perf_counter()
+            path = methods.last_only(name)
+            known = name == "auto" and seed >= TWIN_SEEDS and twins
+            found[name] = found[twins[0]] if known else solve(stream if path else tracked)
+            tallies[name].time_s += time.perf_counter() - start
+            tallies[name].add(seed, found[name], stream.truth_m[-1:] if path else tracked.truth_m)
+        twins = [other for other in twins if found["auto"].equals(found[other])]
+    head = {"number": case.number, "case": case.name}
+    same = {"auto": twins[0]} if twins and seeds > TWIN_SEEDS else {}
+    return [
+        head | {"method": name, "same_as": same.get(name)} | tally.row() for name, tally in tallies.items()
+    ]
+
+
+HEAD = (
+    f"{'':49}{'':22}{'error, share of the displacement':>32}{'wires':>18}\n"
+    f" # {'case':46}{'method':22}{'median':>11}{'worst':>10}{'reported':>11}{'conv.':>8}"
+    f"{'accurate':>9}{'flagged':>9}{'wrong':>7}"
+)
+
+
+LEGEND = (
+    "# is the number of the hard case; error and reported deviation are shares of the displacement of the\n"
+    "CONVERGED wires in the deepest frame, the worst that of any frame. Wires of all frames are accurate,\n"
+    "flagged (not CONVERGED), or wrong: CONVERGED and off by more than chance and the deviation allow."
+)
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table."""
+    method = row["method"] if row["same_as"] is None else f"{row['method']} = {row['same_as']}"
+    return (
+        f"{row['number']:2} {row['case']:46}{method:22}{share(row['median_error']):>11}"
+        f"{share(row['worst_error']):>10}{share(row['reported']):>11}{row['converged']:8.1%}"
+        f"{row['accurate']:9}{row['flagged']:9}{row['wrong']:7}"
+    )
+
+
+def share(value: float) -> str:
+    """As a percentage where that can be read, else by its power of ten; a dash where there is none."""
+    if not np.isfinite(value):
+        return "-" if np.isnan(value) else "inf"
+    if 1e-4 <= value < 1:
+        return f"{value:.2%}"
+    return f"{value:.0%}" if 1 <= value < 100 else f"{value:.0e}"

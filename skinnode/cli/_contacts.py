@@ -1,0 +1,34 @@
+"""Contacts of a field, as JSON."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from skinnode.json_values import plain
+
+if TYPE_CHECKING:
+    from skinnode.model.frames import FieldFrame
+
+
+def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
+    """Return the contacts, strongest first, in m, m² and N, each value with its standard deviation.
+
+    Returns None if there is no field yet, or if the posterior did not produce it.
+    """
+    if field is None or field.method != "posterior":
+        return None
+    return [
+        plain(
+            {
+                "centroid_m": contact.centroid_m.tolist(),
+                "centroid_std_m": contact.centroid_std_m.tolist(),
+                "area_m2": float(contact.area_m2),
+                "area_std_m2": float(contact.area_std_m2),
+                "normal_force_n": float(contact.normal_force_n),
+                "normal_force_std_n": float(contact.normal_force_std_n),
+                "shear_force_n": contact.shear_force_n.tolist(),
+                "shear_force_std_n": contact.shear_force_std_n.tolist(),
+            }
+        )
+        for contact in field.contacts
+    ]

@@ -1,0 +1,110 @@
+"""Exit statuses, signals and closed pipes of every command.
+
+======  ==============================================================================================
+status  meaning
+======  ==============================================================================================
+0       success; also a command that runs until stopped (host, node, record, replay, monitor, vcan-sim), when
+        SIGINT (Ctrl-C), SIGTERM or SIGHUP stops it
+1       a fault was found
+2       could not run; one line on stderr says why
+128+n   ended by signal n before its work was done: 129 SIGHUP, 130 SIGINT, 143 SIGTERM; 141 if the
+        reader of its output closed the pipe (SIGPIPE)
+======  ==============================================================================================
+
+Nothing is printed about a signal, because its sender knows. Open resources are closed first. SIGHUP stays
+ignored if it was ignored at the start, as under nohup. The module imports nothing slow, so that its handlers
+are installed before anything else is loaded.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from types import FrameType
+from typing import Final, NoReturn
+
+FINE: Final = 0
+FAULT: Final = 1
+COULD_NOT_RUN: Final = 2
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def status_of(number: int) -> int:
+    """Return the exit status after signal ``number``, as shells count it."""
+    return 128 + number
+
+
+class Stopped(SystemExit):
+    """A signal stopped the command."""
+
+
+def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
+    """Run the typer application ``app`` of ``module`` and exit with its status. From here on, signals end it
+    as the table says."""
+    _handle(_exit_at_once)
+    run: Callable[..., int] = import_module("skinnode.cli._usage").run
+    app = import_module(module).app
+    _handle(_stop)
+    try:
+        status = run(app, argv)
+        status = _flush(status)
+    except Stopped as stopped:
+        status = int(stopped.code or 0)
+        _flush(status)
+    _handle(_exit_at_once)  # Python now waits for threads; a signal would print a traceback
+    sys.exit(status)
+
+
+def _handle(handler: Callable[[int, FrameType | None], object]) -> None:
+    """Install ``handler`` for the signals. Call on the main thread; Python allows no other."""
+    import threading
+
+    if threading.current_thread() is threading.main_thread():
+        for number in _SIGNALS:
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, handler)
+
+
+def _exit_at_once(number: int, _frame: FrameType | None) -> None:
+    os._exit(status_of(number))
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """Unwind the stack. During an import, some of Python's callbacks would lose the exception or print it.
+    While there is no other thread, nothing is open, so the process can exit at once."""
+    import threading
+
+    if threading.active_count() == 1 and _imports(frame):
+        _exit_at_once(number, frame)
+    raise Stopped(status_of(number))
+
+
+def _imports(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _flush(status: int) -> int:
+    """Flush the output. Returns ``status``, or that of SIGPIPE if the reader has closed the pipe."""
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+    except BrokenPipeError:
+        return closed_pipe()
+    return status
+
+
+def closed_pipe() -> int:
+    """Discard what stdout and stderr still buffer, and return the status for a reader that has gone."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in (1, 2):
+        os.dup2(nowhere, descriptor)
+    os.close(nowhere)
+    return status_of(signal.SIGPIPE)

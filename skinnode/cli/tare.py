@@ -1,0 +1,119 @@
+"""``skinnode tare [PATCH…]``: makes the present resistances of patches their baseline."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from skinnode.cli._bus import Place
+    from skinnode.technician.tare import Tared
+
+
+def tare(
+    patches: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Names of patches of --hand, or node-IDs; default: all patches of --hand.",
+            metavar="[PATCH]...",
+            autocompletion=nodes,
+            show_default=False,
+        ),
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    fd: Fd = False,
+    hand: Hand = None,
+    bus: Bus = None,
+    as_json: Json = False,
+) -> None:
+    """Make the present resistances the baseline R0 of patches, and read it back. Leave the skin alone.
+
+    Taring works by SDO, with or without a host on the bus: a running host reads the
+    new baselines and continues. A patch loses them at power-off unless they are stored
+    (0x1010). A patch whose baseline hand.toml keeps in a file is refused. Exit
+    status 0 if every patch was tared, 1 if one was not, 2 if it could not run.
+    """
+    from skinnode.cli._bus import find_buses, node_among
+    from skinnode.cli._console import print_json, progress
+    from skinnode.errors import NOTHING, ConfigError
+
+    places = find_buses(interface, channel, bitrate, fd, hand, bus)
+    if patches:
+        found = [node_among(patch, places, "PATCH") for patch in patches]
+    elif hand is not None:
+        found = [(place, patch.node_id) for place in places for patch in place.patches]
+    else:
+        raise ConfigError("PATCH", NOTHING, "names of patches or node-IDs, or --hand for all its patches")
+    wanted = list(dict.fromkeys((place.bus.name, node_id) for place, node_id in found))
+    with progress(as_json) as tell:
+        done = [
+            result
+            for place in places
+            for result in _tare_on(
+                place, [node_id for name, node_id in wanted if name == place.bus.name], tell
+            )
+        ]
+    if as_json:
+        from dataclasses import asdict
+
+        print_json(
+            [{**asdict(result), "problem": result.problem or None, "tared": result.done} for result in done]
+        )
+    else:
+        _print(done)
+    if not all(result.done for result in done):
+        raise typer.Exit(1)
+
+
+def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
+    """Tare the nodes of one bus. Opens it only if at least one of them may be tared. Raises BusError if the
+    bus fails."""
+    from skinnode.technician.line import Line
+    from skinnode.technician.tare import Tared, refusal, tare
+
+    named = {patch.node_id: patch for patch in place.patches}
+    refused = {
+        node_id: why
+        for node_id in node_ids
+        if node_id in named and (why := refusal(named[node_id], place.bus))
+    }
+    done = {
+        node_id: Tared(place.patch_name(node_id), node_id, place.bus.name, why)
+        for node_id, why in refused.items()
+    }
+    if len(refused) < len(node_ids):
+        with Line(place.bus) as line:
+            for node_id in node_ids:
+                if node_id not in refused:
+                    period_s = 0.0 if place.hand is None else place.hand.sync.period_s
+                    done[node_id] = tare(
+                        line,
+                        node_id,
+                        place.patch_name(node_id),
+                        sync_period_s=period_s,
+                        progress=tell,
+                    )
+    return [done[node_id] for node_id in node_ids]
+
+
+def _print(done: list[Tared]) -> None:
+    from skinnode.cli._console import console, table
+
+    listed = table("patch", "node", "bus", "result", right=("node",))
+    for item in done:
+        listed.add_row(item.patch, str(item.node_id), item.bus, _result(item))
+    console().print(listed)
+
+
+def _result(item: Tared) -> str:
+    if not item.done:
+        return f"NOT TARED: {item.problem}"
+    change = "" if item.median_change is None else f", median change {100 * item.median_change:+.3f} %"
+    return f"tared: {item.crossings} crossings, median R0 {item.median_ohm:.4g} ohm{change}"

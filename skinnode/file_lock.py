@@ -1,0 +1,93 @@
+"""A lock file that names its owner, cannot become stale, and is removed on release."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+_TRIES: Final = 100
+"""Maximum attempts to lock; each failed attempt means that another owner released the lock in between."""
+
+
+class FileInUse(BlockingIOError):
+    """The lock has an owner; ``process`` is its process ID, or None if unknown."""
+
+    def __init__(self, path: Path, process: int | None) -> None:
+        self.process = process
+        who = "another process" if process is None else f"process {process}"
+        super().__init__(errno.EWOULDBLOCK, f"in use by {who}", str(path))
+
+
+class NotARegularFile(OSError):
+    """``path`` is a symbolic link, a folder, a pipe or a device; such files are not locked."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        allowed = "allowed: a regular file, or a name that does not exist"
+        super().__init__(errno.EINVAL, f"its lock file {path.name} {what}; {allowed}", str(path))
+
+
+@dataclass(frozen=True, slots=True)
+class FileLock:
+    """A held lock. The kernel releases it when the process ends, even if it is killed."""
+
+    path: Path
+    descriptor: int
+    process: int
+
+    def release(self) -> None:
+        """Release the lock. Call only once; a forked child that inherited the lock keeps it locked."""
+        if self.process == os.getpid():
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+        os.close(self.descriptor)
+
+
+def lock_file(path: Path) -> FileLock:
+    """Create and lock ``path``. Raises FileInUse if this or another process owns the lock, NotARegularFile if
+    it is anything but a regular file, and OSError if the file cannot be created."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
+    for _ in range(_TRIES):
+        try:
+            descriptor = os.open(path, flags, 0o600)
+        except OSError as error:
+            if path.is_symlink():
+                raise NotARegularFile(path, "is a symbolic link, which is not followed") from error
+            if path.exists() and not path.is_file():
+                raise NotARegularFile(path, "is not a regular file") from error
+            raise
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise NotARegularFile(path, "is not a regular file")
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(path, descriptor):
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, b"%d\n" % os.getpid(), 0)
+                return FileLock(path, descriptor, os.getpid())
+        except BlockingIOError:
+            process = _owner(descriptor)
+            os.close(descriptor)
+            raise FileInUse(path, process) from None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)  # the previous owner removed the name after it was opened here
+    raise FileInUse(path, None)
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Return whether ``path`` still names the open file."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _owner(descriptor: int) -> int | None:
+    text = os.pread(descriptor, 20, 0).strip()
+    return int(text) if text.isdigit() else None

@@ -1,0 +1,127 @@
+"""Contains exceptions in the host's threads: one rule, and the tools for it.
+
+An exception raised while serving one subject (a patch, a bus, a subscriber) is reported to the
+:class:`Defects` of that subject and affects no other; the operation is then retried. :mod:`skinnode.host` has
+the table.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.errors import SkinError
+
+_log = logging.getLogger(__name__)
+
+FIRST_PAUSE_S: Final = 0.1
+LONGEST_PAUSE_S: Final = 1.0
+"""First and longest pause before a failed operation is retried, in s; each pause is twice the one before."""
+
+_BRIEF_S: Final = 0.001
+_LONGEST_BRIEF_S: Final = 0.02
+"""First and longest pause, in s, in a loop that serves several subjects: a failed turn must not delay the
+others."""
+
+_COMPLAINTS: Final = 64
+"""Maximum distinct complaints of a subject remembered as logged; beyond it, complaints are logged again."""
+
+
+def one_line(error: BaseException | None) -> str:
+    """Return the type and text of an exception in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+class Pause:
+    """Pauses of an operation that is retried repeatedly, in seconds. After the operation has worked for as
+    long as the longest pause, they start over with the first."""
+
+    def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
+        self._first_s, self._longest_s = first_s, longest_s
+        self._pause_s = 0.0
+        self._end_s = -math.inf
+
+    def next_s(self) -> float:
+        """Return the pause before the next attempt, which is due now."""
+        now_s = time.monotonic()
+        again = now_s <= self._end_s + self._longest_s
+        self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s
+        self._end_s = now_s + self._pause_s
+        return self._pause_s
+
+
+@dataclass(frozen=True, slots=True)
+class DefectStats:
+    """Statistics of the exceptions raised while serving one subject."""
+
+    count: int
+    newest: str | None
+    """Operation and exception in one line; None before the first exception."""
+
+
+class Defects:
+    """Collects the exceptions raised while serving ``subject``; thread-safe.
+
+    The first occurrence of each complaint is passed to ``on_new`` and logged: one line at level warning, the
+    traceback at level debug.
+    """
+
+    def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
+        self.subject, self._on_new = subject, on_new
+        self._lock = threading.Lock()
+        self._count = 0
+        self._newest: str | None = None
+        self._logged: set[str] = set()
+
+    @property
+    def count(self) -> int:
+        """Number of exceptions so far."""
+        return self._count
+
+    @property
+    def newest(self) -> str | None:
+        """Newest exception, in one line."""
+        return self._newest
+
+    def stats(self) -> DefectStats:
+        return DefectStats(self._count, self._newest)
+
+    def report(self, doing: str, error: Exception) -> None:
+        """Count ``error``, raised while ``doing`` something. Never raises."""
+        text = f"{doing}: {one_line(error)}"
+        with self._lock:
+            self._count += 1
+            self._newest = text
+            known = text in self._logged
+            if len(self._logged) >= _COMPLAINTS:
+                self._logged.clear()
+            self._logged.add(text)
+        if known:
+            return
+        with contextlib.suppress(Exception):  # a log handler of the program may raise
+            _log.warning("%s: %s; retrying", self.subject, text)
+            _log.debug("%s: %s", self.subject, text, exc_info=error)
+        failure = SkinError(f"{self.subject}: {text}")
+        failure.__cause__ = error
+        with contextlib.suppress(Exception):
+            self._on_new(failure)
+
+
+def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
+    """Call ``turn`` until it returns False. An exception ends that turn and is followed by a pause of 1 to
+    20 ms."""
+    pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
+    while True:
+        try:
+            if not turn():
+                return
+        except Exception as error:
+            defects.report(doing, error)
+            time.sleep(pause.next_s())

@@ -1,0 +1,163 @@
+"""Streams of one SDO transfer: those of canopen 2.4, with fixes for lost frames.
+
+==================  =========================================================  ==============================
+stream              canopen 2.4.1                                              here
+==================  =========================================================  ==============================
+block upload        calls its own ``abort``, which it does not have, if the    has one
+                    end of the transfer does not arrive
+block upload        requests a segment that is late twice                      requests it once
+block download      raises RuntimeError if a segment of the last block must    sends it again
+                    be sent again; its CRC then counts segments twice
+both downloads      closing a failed transfer continues it, and waits for      closing sends nothing
+                    responses, even in a destructor
+all streams         the abort names no object                                  :meth:`Client.give_up` sends it
+all streams         takes a late frame of the previous transfer for the first  waits for a response that names
+                    response                                                   the object
+==================  =========================================================  ==============================
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import queue
+import struct
+import time
+from typing import Any, Final
+
+import canopen
+from canopen.objectdictionary import ObjectDictionary
+from canopen.sdo.client import BlockDownloadStream, BlockUploadStream, SdoClient, WritableStream
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from skinnode.wire.indices import sdo_request_cob_id, sdo_response_cob_id
+
+SEGMENT_BYTES: Final = 7
+
+ABORT: Final = 0x80
+"""Command specifier of an abort, in the first byte."""
+
+TIMED_OUT: Final = 0x0504_0000
+"""Abort code: SDO protocol timed out (CiA 301, 7.2.4.3.17)."""
+
+_QUIET_S: Final = 0.02
+"""Silence after an abort, in s, that shows that no response to the old transfer is still to come."""
+
+_SETTLE_S: Final = 0.1
+"""Maximum wait for that silence, in s: another SDO client may keep the node busy."""
+
+_RETRANSMISSIONS: Final = 20
+"""Maximum retransmitted blocks in one transfer; a node that needs more accepts none."""
+
+
+class Client(SdoClient):
+    """canopen's SDO client for the server of ``node_id``, without an object dictionary."""
+
+    def __init__(self, network: canopen.Network, node_id: int) -> None:
+        empty: Any = ObjectDictionary  # its constructor is not typed
+        cob_ids = sdo_request_cob_id(node_id), sdo_response_cob_id(node_id)
+        super().__init__(*cob_ids, empty())  # type: ignore[no-untyped-call]  # as all of canopen
+        self.network = network
+        network.subscribe(self.tx_cobid, self.on_response)
+        self._abort_code = TIMED_OUT
+
+    def abort(self, abort_code: int = TIMED_OUT) -> None:
+        """Remember the code for :meth:`give_up`, which knows the object."""
+        self._abort_code = abort_code
+
+    def request_response(self, sdo_request: bytes) -> bytes:
+        """Send a request and return the response. For a request that begins a transfer, that is the first
+        response that names its object: a slow node may still send frames of the previous transfer. Raises
+        SdoError if there is no response, or an abort."""
+        begins = sdo_request[0] >> 5 in (1, 2) or (sdo_request[0] >> 5, sdo_request[0] & 1) in (
+            (5, 0),
+            (6, 0),
+        )
+        objects = (bytes(sdo_request[1:4]), bytes(3))
+        self.responses = queue.Queue()
+        self.send_request(sdo_request)  # type: ignore[no-untyped-call]
+        end_s = time.monotonic() + self.RESPONSE_TIMEOUT
+        late: bytes | None = None
+        while True:
+            try:
+                response: bytes = self.responses.get(timeout=max(0.0, end_s - time.monotonic()))
+            except queue.Empty:
+                if late is None:
+                    raise SdoCommunicationError("No SDO response received") from None
+                response = late
+            is_abort = response[0] == ABORT
+            if response is late or not begins or response[1:4] in (objects if is_abort else objects[:1]):
+                if is_abort:
+                    raise SdoAbortedError(int.from_bytes(response[4:8], "little"))
+                return response
+            late = response
+
+    def give_up(self, index: int, subindex: int) -> None:
+        """Abort the transfer of this object at the node, and discard late responses. Raises BusError if the
+        abort cannot be sent."""
+        code, self._abort_code = self._abort_code, TIMED_OUT
+        self.send_request(struct.pack("<BHBI", ABORT, index, subindex, code))  # type: ignore[no-untyped-call]
+        end_s = time.monotonic() + _SETTLE_S
+        with contextlib.suppress(queue.Empty):
+            while time.monotonic() < end_s:
+                self.responses.get(timeout=_QUIET_S)
+
+
+class BlockUpload(BlockUploadStream):
+    """A block upload. canopen 2.4 requests a late segment twice and drops the first response, so every pause
+    longer than its time-out ended in a wrong CRC. It requests a segment that is out of order only once, so a
+    late segment is made to look out of order."""
+
+    def read(self, size: int = -1) -> bytes:
+        """Read one segment, as canopen does."""
+        if size >= 0 and not self._done:
+            try:
+                response = self.sdo_client.read_response()
+            except SdoCommunicationError:
+                response = bytes(8)  # no segment has number 0
+            self.sdo_client.responses.queue.appendleft(response)
+        return bytes(super().read(size))  # type: ignore[no-untyped-call]  # as all of canopen
+
+    def abort(self, abort_code: int) -> None:
+        """Remember the code. canopen calls this if the end of the transfer does not arrive."""
+        self._error = True
+        self.sdo_client.abort(abort_code)
+
+
+class Download(WritableStream):
+    """An expedited or segmented download."""
+
+    def close(self) -> None:
+        """Send nothing: the last segment was marked as the last."""
+        io.RawIOBase.close(self)
+
+
+class BlockDownload(BlockDownloadStream):
+    """A block download of ``data``, ended by :meth:`finish`."""
+
+    def __init__(self, client: Client, index: int, data: bytes) -> None:
+        super().__init__(client, index, 0, len(data))  # type: ignore[no-untyped-call]
+        self._crc.process(data)
+        self._retransmitting = True  # canopen then does not update the CRC
+        self._left = _RETRANSMISSIONS
+
+    def close(self) -> None:
+        """Send nothing: a failed transfer has been aborted."""
+        io.RawIOBase.close(self)
+
+    def finish(self) -> None:
+        """Send the CRC and wait for the end of the transfer. Raises SdoError if the node does not confirm
+        it."""
+        super().close()  # type: ignore[no-untyped-call]
+
+    def _retransmit(self, ackseq: int, blksize: int) -> None:
+        """Send the segments after number ``ackseq`` of the block again."""
+        self._left -= 1
+        if self._left < 0:
+            raise SdoCommunicationError("the node acknowledges no segment")
+        again = self._current_block[ackseq:]
+        self.pos -= sum(len(segment) for segment in again)
+        self._done = False
+        self._current_block, self._seqno, self._blksize = [], 0, blksize
+        for segment in again:
+            self.write(segment)  # type: ignore[no-untyped-call]

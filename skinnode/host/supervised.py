@@ -1,0 +1,86 @@
+"""State that the supervisor keeps for each node."""
+
+from __future__ import annotations
+
+import enum
+import threading
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from skinnode.host.containment import Pause
+from skinnode.host.pipeline import Solver
+from skinnode.host.station import Station
+from skinnode.model.layout import Float
+
+
+class Phase(enum.StrEnum):
+    """Phase of a node in the supervisor."""
+
+    AWAITED = "awaited"
+    JOINING = "joining"
+    STARTING = "starting"
+    RUNNING = "running"
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStats:
+    """Statistics of the supervisor for a node."""
+
+    phase: Phase
+    rejoins: int
+    """Bring-ups after the start that ended with the node running."""
+    failures: int
+    """Bring-ups after the start that failed."""
+    baselines: int
+    """Number of new baselines in use."""
+    complaint: str | None
+    """Why the last bring-up failed; None if it succeeded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """Result of a job."""
+
+    solver: Solver | None
+    withholdings: int
+
+
+@dataclass(slots=True)
+class Supervised:
+    """State of one node. Only the supervisor's thread uses it."""
+
+    station: Station
+    phase: Phase
+    since_ns: int
+    read_ns: int
+    """Earliest time of the next reading of its baseline."""
+    job: Future[Joined | None] | None = None
+    """Job that communicates with the node; its result is None if it only reads the error register."""
+    searching: Future[bool] | None = None
+    abandon: threading.Event = field(default_factory=threading.Event)
+    """Set to stop the job."""
+    pause: Pause = field(default_factory=Pause)
+    not_before_ns: int = 0
+    """End of the pause after a failed bring-up or a defect."""
+    was_silent: bool = True
+    """Whether the node was silent, so that any frame from it ends the pause."""
+    begun_ns: int = 0
+    """Start time of the newest bring-up."""
+    defects: int = 0
+    """Number of reported defects already handled."""
+    upset: bool = False
+    """Whether supervising the node had a defect, so that its state is unknown."""
+    probe_ns: int = 0
+    search_ns: int = 0
+    register_ns: int = 0
+    mute_ns: int = 0
+    unconfigured: bool = False
+    """Set by a job that found that the node lost its configuration."""
+    rejoins: int = 0
+    failures: int = 0
+    baseline_ohm: Float | None = None
+    """Baseline with which its scans are solved; None before its first bring-up."""
+    announced: bool = False
+    """Whether the node announced a new baseline that is not in use yet."""
+    baselines: int = 0
+    complaint: str | None = None

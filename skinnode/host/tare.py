@@ -1,0 +1,45 @@
+"""Tares a patch and waits: the node takes a new baseline, the host reads it and solves with it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from skinnode.errors import NodeTimeout
+from skinnode.host.health import PatchHealth
+from skinnode.host.station import Station
+
+TARE_DEADLINE_S: Final = 5.0
+"""Default deadline of a tare, in s, in addition to the SYNC periods below: 16 readings take milliseconds,
+reading a baseline 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
+
+TARE_DEADLINE_SYNCS: Final = 3
+"""SYNC periods added to the deadline, because the summary of the next scan announces the new baseline."""
+
+_POLL_S: Final = 0.005
+
+
+def tare(
+    station: Station, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
+) -> None:
+    """Tare a patch and return once its scans are solved with the new baseline.
+
+    ``baselines`` returns how many baselines have been read. Raises NodeTimeout after ``deadline_s``, and
+    whatever :meth:`Station.tare` raises.
+    """
+    before, emergencies = baselines(), health().emergencies
+    station.tare()
+    end_s = time.monotonic() + deadline_s
+    while baselines() == before or station.lane.withholding:
+        if time.monotonic() > end_s:
+            raise NodeTimeout(station.patch.node_id, _why(station, health(), emergencies, deadline_s))
+        time.sleep(_POLL_S)
+
+
+def _why(station: Station, now: PatchHealth, emergencies: int, deadline_s: float) -> str:
+    said = f"the patch is {now.condition}"
+    if now.emergencies > emergencies and now.emergency_text:
+        said += f" and reported {now.emergency_text}"
+    where = f"patch {station.patch.name!r} on {station.patch.bus}"
+    return f"{where}: tare commanded, but no new baseline came within {deadline_s:g} s; {said}"

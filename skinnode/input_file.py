@@ -1,0 +1,34 @@
+"""Reads files named by the user whole, without blocking forever and up to a size limit."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import Final
+
+from skinnode.errors import ConfigError
+
+MOST_BYTES: Final = 1 << 20
+"""Maximum size of a text file: ten times the largest known hand file, layout or baseline. Parsers take some
+hundred times the memory of the text."""
+
+
+def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
+    """Read all of ``path``, which the user gave as ``key``. A pipe is read if it has a writer, as in
+    ``<(command)``. Raises ConfigError if ``path`` is not a file, cannot be read, or is larger than
+    ``most_bytes``."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+        with open(descriptor, "rb") as file:
+            if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+                raise ConfigError(key, str(path), "a file that can be read (Is a directory)")
+            os.set_blocking(descriptor, True)  # only open() must not wait for a writer
+            data = file.read(most_bytes + 1)
+    except OSError as error:
+        raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None
+    except ValueError as error:  # a NUL in its name
+        raise ConfigError(key, str(path), f"a file that can be read ({error})") from None
+    if len(data) > most_bytes:
+        raise ConfigError(key, str(path), f"a file of at most {most_bytes >> 20} MiB")
+    return data

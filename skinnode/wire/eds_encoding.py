@@ -1,0 +1,93 @@
+"""Reads the text of an EDS or DCF file in any encoding.
+
+CiA 306 requires ASCII; tools also write other encodings. A file is read without loss: each non-ASCII byte
+becomes a lone surrogate (PEP 383), so that the bytes of a value can be recovered, and :func:`for_people`
+decodes text for display.
+"""
+
+from __future__ import annotations
+
+import codecs
+from typing import Final, NamedTuple
+
+ASCII: Final = "ASCII"
+
+MOST_EDS_BYTES: Final = 2 << 20
+"""Maximum size of a file: twenty times that of a patch, and more than any known device needs."""
+
+_UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
+_CODECS: Final = {
+    ASCII: "utf-8",
+    "UTF-8": "utf-8",
+    "UTF-8 with BOM": "utf-8",
+    "UTF-16 with BOM": "utf-8",
+    "Windows-1252": "cp1252",
+    "Latin-1": "latin-1",
+}
+"""Codec, by Python's name, of the bytes that :class:`EdsText` holds for each encoding."""
+
+
+class EdsText(NamedTuple):
+    """Text of a file and the encoding that was assumed."""
+
+    text: str
+    """ASCII, with lone surrogates for other bytes; lines end in ``\\n``."""
+    encoding: str
+    """Human-readable name of the encoding."""
+
+    @property
+    def codec(self) -> str:
+        """Codec of the bytes behind the surrogates; bytes of UTF-16 have been converted to UTF-8."""
+        return _CODECS[self.encoding]
+
+    @property
+    def readable(self) -> str:
+        """Decoded text."""
+        return for_people(self.text, self.codec)
+
+    @property
+    def note(self) -> str:
+        """One line for the user; empty for an ASCII file."""
+        return "" if self.encoding == ASCII else f"read as {self.encoding}: an EDS should be ASCII"
+
+
+def read_eds_text(data: bytes) -> EdsText:
+    """Return the text of a file and its encoding: that of its byte order mark, or the first of ASCII, UTF-8,
+    Windows-1252 and Latin-1 that fits. Loses nothing but the mark. Raises UnicodeDecodeError if UTF-16 is
+    malformed."""
+    bom = data[:2]
+    if bom in _UTF_16:
+        data, encoding = data[2:].decode(_UTF_16[bom]).encode("utf-8"), "UTF-16 with BOM"
+    elif data.startswith(codecs.BOM_UTF8) and _is(data, "utf-8"):
+        data, encoding = data.removeprefix(codecs.BOM_UTF8), "UTF-8 with BOM"
+    elif data.isascii():
+        encoding = ASCII
+    elif _is(data, "utf-8"):
+        encoding = "UTF-8"
+    else:
+        encoding = "Windows-1252" if _is(data, "cp1252") else "Latin-1"
+    text = octets_text(data).replace("\r\n", "\n").replace("\r", "\n")
+    return EdsText(text, encoding)
+
+
+def octets_text(data: bytes) -> str:
+    """Return bytes as text, from which :func:`octets` recovers them."""
+    return data.decode("ascii", "surrogateescape")
+
+
+def octets(text: str) -> bytes:
+    """Return the bytes behind the text of a file; other text is encoded as UTF-8."""
+    return text.encode("utf-8", "surrogateescape")
+
+
+def for_people(text: str, codec: str) -> str:
+    """Decode the text of a file for display: bytes that the codec cannot decode become U+FFFD."""
+    return octets(text).decode(codec, "replace")
+
+
+def _is(data: bytes, codec: str) -> bool:
+    try:
+        data.decode(codec)
+    except UnicodeDecodeError:
+        return False
+    return True

@@ -1,0 +1,262 @@
+"""Exit statuses after signals and closed pipes, of every command, whenever they come: never a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+PROGRAMS = {"skinnode": "skinnode.cli.main", "vcan-sim": "vcan_sim.cli"}
+
+HOOKED = """
+import os, sys
+
+class Hook:
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), {number})
+
+sys.meta_path.insert(0, Hook())
+sys.argv = {arguments!r}
+from {program} import main
+main()
+"""
+
+
+def start(arguments: Sequence[str], folder: Path, **options: object) -> subprocess.Popen[str]:
+    """``skinnode`` or ``vcan-sim``; SIGHUP and SIGINT as a terminal leaves them."""
+    command = [str(Path(sys.executable).with_name(arguments[0])), *arguments[1:]]
+    return subprocess.Popen(
+        command,
+        **{
+            "stdout": subprocess.PIPE,
+            "stderr": subprocess.PIPE,
+            "text": True,
+            "cwd": folder,
+            "env": {**os.environ, "PYTHONUNBUFFERED": "1"},
+            "start_new_session": True,
+            "preexec_fn": lambda: [signal.signal(number, signal.SIG_DFL) for number in SIGNALS],
+            **options,
+        },
+    )
+
+
+def handles_signals(process: subprocess.Popen[str]) -> None:
+    """Wait until the program handles signals: before that, they end Python while it starts."""
+    caught = re.compile(r"(?m)^SigCgt:\s*([0-9a-f]+)$")
+    end_s = time.monotonic() + 20.0
+    while process.poll() is None and time.monotonic() < end_s:
+        found = caught.search(Path(f"/proc/{process.pid}/status").read_text())
+        if found and int(found[1], 16) >> (signal.SIGTERM - 1) & 1:
+            return
+        time.sleep(0.01)
+    pytest.fail("the program never handled signals")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, multicast_group: str) -> Path:
+    """A hand of one small patch on a bus that processes share, which nobody else uses."""
+    sizes = "upper_wires = 2, upper_electrodes = 2, lower_wires = 6, lower_electrodes = 2"
+    (tmp_path / "hand.toml").write_text(
+        f'[[buses]]\nname = "can0"\ninterface = "udp_multicast"\nchannel = "{multicast_group}"\n'
+        f'[sync]\nperiod_ms = 50\n[[patches]]\nname = "thumb"\nnode_id = 5\n'
+        f'layout = {{ preset = "staggered", {sizes} }}\n'
+    )
+    return tmp_path
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [
+        ("typer", ["skinnode", "scan"]),
+        ("skinnode.cli._usage", ["skinnode", "--help"]),
+        ("skinnode.cli.lss", ["skinnode", "--help"]),
+        ("pydantic", ["skinnode", "hand", "check", "hand.toml"]),
+        ("numpy", ["skinnode", "hand", "check", "hand.toml"]),
+        ("numba", ["skinnode", "hand", "check", "hand.toml"]),
+        ("can", ["skinnode", "scan"]),
+        ("typer", ["vcan-sim", "hand.toml"]),
+        ("skinnode.node", ["vcan-sim", "hand.toml"]),
+    ],
+)
+def test_a_signal_during_imports(folder: Path, module: str, arguments: list[str], number: int) -> None:
+    program = PROGRAMS[arguments[0]]
+    code = HOOKED.format(module=module, number=int(number), arguments=arguments, program=program)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        timeout=60,
+        check=False,
+        preexec_fn=lambda: [signal.signal(each, signal.SIG_DFL) for each in SIGNALS],
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "")
+
+
+@contextlib.contextmanager
+def simulated(folder: Path) -> Iterator[None]:
+    with start(["vcan-sim", "hand.toml"], folder) as simulator:
+        assert simulator.stdout is not None
+        assert "1 patch" in simulator.stdout.readline()
+        yield
+        simulator.terminate()
+        simulator.communicate(timeout=20)
+
+
+BUS = ["--hand", "hand.toml"]
+UNTIL_TOLD = {
+    "host": ["skinnode", "host", "hand.toml"],
+    "record": ["skinnode", "record", "hand.toml", "-o", ".", "--listen"],
+    "monitor": ["skinnode", "monitor", "hand.toml", "--json"],
+    "vcan-sim": ["vcan-sim", "hand.toml"],
+    "node": [
+        *["skinnode", "node", "--source", "simulated", "--node-id", "9", "--interface", "udp_multicast"],
+        *["--channel", "239.74.1.1"],
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [(command, number) for command in UNTIL_TOLD for number in SIGNALS[: 2 if command == "monitor" else 3]],
+)
+def test_what_runs_until_it_is_told_has_done_its_work(folder: Path, command: str, number: int) -> None:
+    with contextlib.ExitStack() as stack:
+        if command in ("host", "monitor"):
+            stack.enter_context(simulated(folder))
+        process = stack.enter_context(start(UNTIL_TOLD[command], folder))
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.stdout.readline()
+        process.send_signal(number)
+        _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (0, "")
+
+
+WITH_AN_END = {
+    "demo": ["skinnode", "demo", "--patches", "1", "--seconds", "60"],
+    "scan": ["skinnode", "scan", *BUS],
+    "lss list": ["skinnode", "lss", "list", *BUS],
+    "doctor": ["skinnode", "doctor", "hand.toml"],
+    "conformance": [
+        *[
+            "skinnode",
+            "conformance",
+            "--node-id",
+            "5",
+            "--interface",
+            "udp_multicast",
+            "--channel",
+            "{group}",
+        ],
+    ],
+    "bench path": ["skinnode", "bench", "path"],
+    "bench stability": ["skinnode", "bench", "stability", "--seeds", "50", "--jobs", "2"],
+    "bench node": ["skinnode", "bench", "node"],
+    "bench soak": ["skinnode", "bench", "soak", "--minutes", "5"],
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [(command, SIGNALS[turn % 3]) for turn, command in enumerate(WITH_AN_END)]
+    + [("scan", number) for number in SIGNALS if number != SIGNALS[1]],
+)
+def test_what_has_an_end_did_not_come_to_it(
+    folder: Path, command: str, number: int, multicast_group: str
+) -> None:
+    arguments = [argument.replace("{group}", multicast_group) for argument in WITH_AN_END[command]]
+    with contextlib.ExitStack() as stack:
+        if command == "conformance":
+            stack.enter_context(simulated(folder))
+        process = stack.enter_context(start(arguments, folder))
+        handles_signals(process)
+        time.sleep(0.4)  # the shortest of them takes about a second
+        if process.poll() is None:
+            os.killpg(process.pid, number)  # as a terminal does: its children too
+        begun_s = time.monotonic()
+        _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (128 + number, "")
+    assert time.monotonic() - begun_s < 10.0
+
+
+STARTING = """
+import os, sys
+from multiprocessing import util
+
+real, turn = util.spawnv_passfds, 0
+
+def spawned(*arguments):
+    global turn
+    child, turn = real(*arguments), turn + 1
+    if turn == {turn}:
+        os.killpg(0, {number})
+    return child
+
+util.spawnv_passfds = spawned
+sys.argv = ["skinnode", "bench", "stability", "--seeds", "50", "--jobs", "2"]
+from skinnode.cli.main import main
+main()
+"""
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("turn", [1, 2, 3], ids=["resource tracker", "first process", "second process"])
+def test_a_signal_while_child_processes_start(tmp_path: Path, turn: int, number: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STARTING.format(turn=turn, number=int(number))],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=30,
+        check=False,
+        start_new_session=True,
+        preexec_fn=lambda: [signal.signal(each, signal.SIG_DFL) for each in SIGNALS],
+    )
+    assert (done.returncode, done.stderr) == (128 + number, "")
+
+
+def test_a_second_one_does_not_matter(folder: Path) -> None:
+    with start(["skinnode", "scan", *BUS], folder) as process:
+        handles_signals(process)
+        time.sleep(0.3)
+        for _ in range(5):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.02)
+        _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (130, "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["skinnode", "hand", "check", "hand.toml"],
+        ["skinnode", "hand", "new"],
+        ["skinnode", "eds"],
+        ["skinnode", "--help"],
+        ["skinnode", "conformance", "--list"],
+        ["skinnode", "scan", *BUS, "--json"],
+        ["skinnode", "record", "hand.toml", "-o", ".", "--listen"],
+        ["vcan-sim", "hand.toml"],
+    ],
+)
+def test_who_reads_may_go(folder: Path, arguments: list[str]) -> None:
+    """As in ``skinnode eds | head -1``."""
+    with start(arguments, folder) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        err = process.stderr.read()
+        process.wait(timeout=30)
+    assert (process.returncode, err) == (141, "")

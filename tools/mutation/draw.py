@@ -1,0 +1,283 @@
+"""Draw mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
+
+The operators are those of cosmic-ray. A draw picks places in the source, each equally likely, and then one
+mutation at each place: drawn by mutation instead, a ``+`` would weigh eleven times as much as a ``not``.
+
+A mutant is identified by its change (file, function, operator, text before and after), never by a line
+number, and is drawn by a digest of its place and the seed. A list therefore stays valid when code moves, and
+an edit elsewhere does not change which mutants are drawn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import difflib
+import hashlib
+import json
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import cosmic_ray.plugins
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+
+ROOT: Final = Path(__file__).parents[2]
+LIST: Final = Path(__file__).with_name("mutants.json")
+PACKAGES: Final = ("wire", "node", "solve", "host")
+SEED: Final = 20260
+PER_PACKAGE: Final = 50
+
+_NEED_ARGUMENTS: Final = ("core/VariableReplacer", "core/VariableInserter")
+_DECORATORS_FOR_SPEED: Final = ("njit", "njit_part", "njit_body", "njit_brief", "cache", "lru_cache")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change to one file."""
+
+    file: str
+    """Path from the root of the repository."""
+    function: str
+    """Qualified name of the innermost function or class around the change, or ``<module>``."""
+    operator: str
+    """cosmic-ray's name of the operator."""
+    before: str
+    """Lines that the change removes."""
+    after: str
+    """Lines that the change adds."""
+    nth: int
+    """Number of earlier mutants in this file with equal fields."""
+
+    @property
+    def name(self) -> str:
+        """Ten hexadecimal digits derived from the fields."""
+        return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
+
+    @property
+    def package(self) -> str:
+        return Path(self.file).parts[1]
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    operator: str
+    occurrence: int
+    line: int
+    column: int
+
+
+class _OnlyBehaviour(ast.NodeTransformer):
+    """Remove what tests need not check: annotations, texts, and decorators that only speed a function up."""
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
+        node.annotation = ast.Constant(0)
+        return self.generic_visit(node)
+
+    def visit_arg(self, node: ast.arg) -> Any:
+        node.annotation = None
+        return node
+
+    def visit_arguments(self, node: ast.arguments) -> Any:
+        node.args = [*node.posonlyargs, *node.args, *node.kwonlyargs]  # mypy checks keyword-only arguments
+        node.defaults += [each for each in node.kw_defaults if each is not None]
+        node.posonlyargs, node.kwonlyargs, node.kw_defaults = [], [], []
+        return self.generic_visit(node)
+
+    def _function(self, node: Any) -> Any:
+        node.returns = None
+        return self._decorated(node)
+
+    def _decorated(self, node: Any) -> Any:
+        node.decorator_list = [each for each in node.decorator_list if not _for_speed(each)]
+        return self.generic_visit(node)
+
+    visit_FunctionDef = visit_AsyncFunctionDef = _function
+    visit_ClassDef = _decorated
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> Any:
+        return ast.Constant("")
+
+    def visit_Call(self, node: ast.Call) -> Any:
+        if isinstance(node.func, ast.Name) and node.func.id == "dataclass":
+            node.keywords = []  # frozen and slots guard against mistakes that mypy reports first
+        return self.generic_visit(node)
+
+    def visit_If(self, node: ast.If) -> Any:
+        if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            return None
+        return self.generic_visit(node)
+
+
+def _for_speed(decorator: ast.expr) -> bool:
+    while isinstance(decorator, ast.Call):
+        decorator = decorator.func
+    name = decorator.attr if isinstance(decorator, ast.Attribute) else getattr(decorator, "id", "")
+    return name in _DECORATORS_FOR_SPEED
+
+
+def _behaviour(source: str) -> str | None:
+    """Return the observable behaviour of ``source`` as text; None if Python cannot compile it."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # such as "is" with a literal
+            compile(source, "mutant", "exec")
+    except (SyntaxError, ValueError):
+        return None
+    return ast.dump(_OnlyBehaviour().visit(ast.parse(source)))
+
+
+def _functions(source: str) -> dict[int, str]:
+    """Return the qualified name of the innermost function or class at each line that has one."""
+    names: dict[int, str] = {}
+
+    def walk(node: ast.AST, prefix: str) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                first = min([child.lineno, *(each.lineno for each in child.decorator_list)])
+                for line in range(first, (child.end_lineno or first) + 1):
+                    names[line] = prefix + child.name
+                walk(child, f"{prefix}{child.name}.")
+            else:
+                walk(child, prefix)
+
+    walk(ast.parse(source), "")
+    return names
+
+
+@cache
+def _operators() -> dict[str, Any]:
+    names = [name for name in cosmic_ray.plugins.operator_names() if name not in _NEED_ARGUMENTS]
+    return {name: cosmic_ray.plugins.get_operator(name)() for name in names}
+
+
+def _candidates(source: str, operators: dict[str, Any]) -> Iterator[_Candidate]:
+    nodes = list(ast_nodes(get_ast(source)))
+    for name, operator in operators.items():
+        occurrence = 0
+        for node in nodes:
+            for (line, column), _ in operator.mutation_positions(node):
+                yield _Candidate(name, occurrence, line, column)
+                occurrence += 1
+
+
+def mutated(source: str, operator: str, occurrence: int) -> str:
+    """Return ``source`` with one mutation. Raises LookupError if there is no such place."""
+    code = mutate_code(source, _operators()[operator], occurrence)
+    if code is None:
+        raise LookupError(f"{operator}: no occurrence {occurrence}")
+    return str(code)
+
+
+def _changed_lines(source: str, other: str) -> tuple[str, str]:
+    lines = list(difflib.unified_diff(source.splitlines(), other.splitlines(), lineterm="", n=0))[2:]
+    removed = [line[1:].strip() for line in lines if line.startswith("-")]
+    added = [line[1:].strip() for line in lines if line.startswith("+")]
+    return "\n".join(removed), "\n".join(added)
+
+
+def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
+    """Identify a mutation as a mutant; counts the equal mutations before it."""
+    functions = _functions(source)
+    function = functions.get(wanted.line, "<module>")
+    before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
+    line = source.splitlines()[wanted.line - 1]
+    nth = 0
+    for each in _candidates(source, {wanted.operator: _operators()[wanted.operator]}):
+        if each.occurrence >= wanted.occurrence:
+            break
+        if functions.get(each.line, "<module>") == function and source.splitlines()[each.line - 1] == line:
+            same = _changed_lines(source, mutated(source, each.operator, each.occurrence))
+            nth += same == (before, after)
+    return Mutant(file, function, wanted.operator, before, after, nth)
+
+
+def find(mutant: Mutant, source: str) -> str:
+    """Return ``source`` with ``mutant`` applied. Raises LookupError if the code it changes has gone."""
+    functions = _functions(source)
+    nth = 0
+    for each in _candidates(source, {mutant.operator: _operators()[mutant.operator]}):
+        if functions.get(each.line, "<module>") != mutant.function:
+            continue
+        other = mutated(source, each.operator, each.occurrence)
+        if _changed_lines(source, other) == (mutant.before, mutant.after):
+            if nth == mutant.nth:
+                return other
+            nth += 1
+    raise LookupError(f"{mutant.name}: {mutant.file}, {mutant.function}: no longer has {mutant.before!r}")
+
+
+def draw(package: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
+    """Draw ``count`` mutants of ``skinnode/<package>``, at as many places."""
+    sources: dict[str, str] = {}
+    places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
+    for path in sorted((root / "skinnode" / package).glob("*.py")):
+        file, source = str(path.relative_to(root)), path.read_text("utf-8")
+        sources[file] = source
+        functions, lines = _functions(source), source.splitlines()
+        seen: Counter[tuple[str, ...]] = Counter()
+        names: dict[tuple[int, int], str] = {}
+        for each in sorted(_candidates(source, _operators()), key=lambda found: (found.line, found.column)):
+            at = each.line, each.column
+            if at not in names:
+                text = lines[each.line - 1]
+                column = each.column - (len(text) - len(text.lstrip()))
+                place = (file, functions.get(each.line, "<module>"), text.strip(), str(column))
+                names[at] = _digest(seed, *place, seen[place])
+                seen[place] += 1
+            places[names[at]].append((file, each))
+    drawn: list[Mutant] = []
+    for place_name in sorted(places):
+        if len(drawn) == count:
+            break
+        of_operator: Counter[str] = Counter()
+        ranked: list[tuple[str, str, _Candidate]] = []
+        for file, each in places[place_name]:
+            ranked.append((_digest(place_name, each.operator, of_operator[each.operator]), file, each))
+            of_operator[each.operator] += 1
+        for _, file, each in sorted(ranked, key=lambda entry: entry[0]):
+            behaviour = _behaviour(mutated(sources[file], each.operator, each.occurrence))
+            if behaviour is not None and behaviour != _behaviour(sources[file]):
+                drawn.append(_name(file, sources[file], each))
+                break
+    return drawn
+
+
+def read() -> list[Mutant]:
+    """Read the stored list."""
+    return [Mutant(**entry) for entry in json.loads(LIST.read_text("utf-8"))["mutants"]]
+
+
+def write(mutants: list[Mutant]) -> None:
+    """Store ``mutants``, in the order of packages and files."""
+    mutants = sorted(
+        mutants, key=lambda each: (PACKAGES.index(each.package), each.file, each.function, each.name)
+    )
+    entries = [asdict(each) for each in mutants]
+    LIST.write_text(
+        json.dumps({"seed": SEED, "mutants": entries}, indent=1, ensure_ascii=False) + "\n", "utf-8"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Draw mutants again; those of other packages are kept.")
+    parser.add_argument("--package", choices=PACKAGES, action="append")
+    packages = parser.parse_args().package or list(PACKAGES)
+    kept = [each for each in read() if each.package not in packages] if LIST.exists() else []
+    for package in packages:
+        drawn = draw(package, PER_PACKAGE, SEED)
+        print(f"{package}: {len(drawn)} mutants in {len({each.file for each in drawn})} files")
+        kept += drawn
+    write(kept)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Counts of frames by kind, so that what simulated nodes sent can be compared with what a host received."""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter
+from typing import Final
+
+from skinnode.wire import indices as od
+
+_BOOT_UP_DATA: Final = b"\0"
+
+
+class Kind(enum.StrEnum):
+    """Kind of a frame, by its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
+
+    NMT = "NMT"
+    SYNC = "SYNC"
+    EMCY = "EMCY"
+    CHUNK = "chunk"
+    SUMMARY = "summary"
+    COMMAND = "command"
+    SDO_REQUEST = "SDO request"
+    SDO_RESPONSE = "SDO response"
+    HEARTBEAT = "heartbeat"
+    BOOT_UP = "boot-up"
+    LSS_REQUEST = "LSS request"
+    LSS_RESPONSE = "LSS response"
+    REMOTE = "remote"
+    OTHER = "foreign"
+
+
+_SINGLE: Final = {
+    od.NMT_COB_ID: Kind.NMT,
+    od.SYNC_COB_ID: Kind.SYNC,
+    od.LSS_REQUEST_COB_ID: Kind.LSS_REQUEST,
+    od.LSS_RESPONSE_COB_ID: Kind.LSS_RESPONSE,
+}
+_BY_FUNCTION: Final = {
+    od.emcy_cob_id(0): Kind.EMCY,
+    od.chunk_cob_id(0): Kind.CHUNK,
+    od.summary_cob_id(0): Kind.SUMMARY,
+    od.command_cob_id(0): Kind.COMMAND,
+    od.sdo_request_cob_id(0): Kind.SDO_REQUEST,
+    od.sdo_response_cob_id(0): Kind.SDO_RESPONSE,
+}
+_FUNCTION_CODE: Final = 0x780
+_HEARTBEAT: Final = od.heartbeat_cob_id(0)
+
+
+def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
+    """Return the kind of a frame with an 11-bit identifier. Remote frames are a kind of their own; a frame of
+    wrong length has the kind of its COB-ID."""
+    if remote:
+        return Kind.REMOTE
+    if (single := _SINGLE.get(can_id)) is not None:
+        return single
+    function = can_id & _FUNCTION_CODE
+    if function == _HEARTBEAT:
+        return Kind.BOOT_UP if data.startswith(_BOOT_UP_DATA) else Kind.HEARTBEAT
+    return _BY_FUNCTION.get(function, Kind.OTHER)
+
+
+class Tally:
+    """Frames of one node by kind. Sent frames: ``handed = emitted + lost + silenced + refused + waiting``;
+    received frames: ``heard = taken + lost_in + unheard``."""
+
+    def __init__(self) -> None:
+        self.handed: Counter[Kind] = Counter()
+        """Frames that the node, or a fault that adds frames, wanted to send."""
+        self.emitted: Counter[Kind] = Counter()
+        """Frames put on the bus."""
+        self.lost: Counter[Kind] = Counter()
+        """Frames dropped by a fault on their way to the bus."""
+        self.silenced: Counter[Kind] = Counter()
+        """Frames held back while the node was silent, unplugged or being reset."""
+        self.refused: Counter[Kind] = Counter()
+        """Frames that the bus refused."""
+        self.waiting: Counter[Kind] = Counter()
+        """Frames held back to be sent later: chunks that are late or change places."""
+        self.heard: Counter[Kind] = Counter()
+        """Frames that reached the node's controller."""
+        self.taken: Counter[Kind] = Counter()
+        """Frames passed to the node."""
+        self.lost_in: Counter[Kind] = Counter()
+        """Frames dropped by a fault on their way to the node."""
+        self.unheard: Counter[Kind] = Counter()
+        """Frames missed while the node was deaf or unplugged."""
+
+    def discrepancies(self) -> list[str]:
+        """Return a line for each sum that does not agree; empty if all do. Call when the node is at rest."""
+        out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
+        into = self.taken + self.lost_in + self.unheard
+        found = [
+            f"{kind} frames: {self.handed[kind]} handed over, {out[kind]} accounted for"
+            for kind in Kind
+            if self.handed[kind] != out[kind]
+        ]
+        return found + [
+            f"{kind} frames: {self.heard[kind]} heard, {into[kind]} accounted for"
+            for kind in Kind
+            if self.heard[kind] != into[kind]
+        ]

@@ -1,16 +1,16 @@
-"""Fills the tables of docs/solver.md, and docs/img/, from what ``skinnode bench`` wrote.
+"""Fill the tables of the solver's pages, and docs/img/, from the output of ``skinnode bench``.
 
     .venv/bin/skinnode bench path --json out/path.json --plot out/path.png
     .venv/bin/python docs/figures.py out
 
-A folder has some of {kernel,solve,path,accuracy,stability}.json and .png; tables without a file stay as they
-are. ``wrong_models.txt`` is what docs/wrong_models.py printed.
+The folder holds some of {kernel,solve,path,accuracy,stability}.json and .png; a table without a file stays as
+it is. ``wrong_models.txt`` is the output of docs/wrong_models.py.
 """
 
 from __future__ import annotations
 
 import json
-import re
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +19,12 @@ from typing import Any
 from skinnode.bench.accuracy import best_of_each
 
 DOCS = Path(__file__).parent
-PAGE = DOCS / "solver.md"
+PAGES = (DOCS / "solver.md", DOCS / "solver-figures.md")
 COLOURS = 256
-"""Of the pictures: they look the same, at a quarter of the bytes."""
+"""Colours of a picture: it looks the same as with all of them, at a quarter of the bytes."""
 MOST_BYTES = 200_000
+SHORT_NOISE = 1e-5
+"""Relative noise of the short table of ``accuracy``."""
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -63,9 +65,9 @@ def path(figures: dict[str, Any]) -> str:
     calls, errors = paper["table2_function_calls_per_step"], paper["table3_accuracy_percent"]
     parts = [
         f"{machine(figures)} {figures['experiments']} random presses a setting, one wire, 30 unknowns. "
-        "*Walk*: as in the paper, `Uniform(plain=True)`; *ours*: `Uniform()`. Calls are of F with J, a step; "
-        "the paper counts 31 for each, by finite differences. *lost*: wires not CONVERGED; the error is the "
-        "mean of the others."
+        "*Plain*: as in the paper, `Uniform(plain=True)`; *ours*: `Uniform()`. A call evaluates F with J; "
+        "calls are per step, and the paper counts 31 for each, by finite differences. *Lost*: wires not "
+        "CONVERGED; the error is the mean of the others."
     ]
     for setting in figures["settings"]:
         rows = []
@@ -84,35 +86,8 @@ def path(figures: dict[str, Any]) -> str:
                     ]
                 )
         parts.append(f"**{_place(setting)}**")
-        head = ["operator", "samples", "calls, walk", "ours", "paper / 31", "error, walk", "ours", "paper"]
+        head = ["operator", "samples", "calls, plain", "ours", "paper / 31", "error, plain", "ours", "paper"]
         parts.append(table(head, rows))
-    parts.append("The whole path by dogleg, and what the schedules make of it (means a wire):")
-    rows = []
-    for setting in figures["settings"]:
-        walked, own, adaptive = setting["dogleg"], setting["ours"], setting["adaptive"]
-        many = setting["periodic"][-1]
-        for name, row in (
-            ("walk, 10 samples", walked[1]),
-            ("`Uniform()`, 10 samples", own[1]),
-            ("walk, 100 samples", walked[4]),
-            ("`Uniform()`, 100 samples", own[4]),
-            ("`Periodic()`, 100 samples", many),
-            ("`Adaptive()`, the last sample", adaptive),
-        ):
-            searched = f" + {row['search_iterations']:.0f}" if row["cycle"] else ""
-            cycle = f", T = {row['cycle']:g}" if row["cycle"] else ""
-            rows.append(
-                [
-                    _place(setting),
-                    name + cycle,
-                    f"{row['iterations']:.1f}{searched}",
-                    f"{row['evaluations']:.0f}",
-                    f"{row['runtime_ms']:.2f}",
-                    _reached(row),
-                ]
-            )
-    head = ["setting", "schedule", "steps (+ search)", "evaluations, all", "ms", "error"]
-    parts.append(table(head, rows))
     ten = "; ".join(f"{row['what']}: {row['ms']:.2f} ms" for row in figures["ten_steps"])
     worst = max(row["error"] for row in figures["ten_steps"])
     parts.append(
@@ -122,6 +97,36 @@ def path(figures: dict[str, Any]) -> str:
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _all_rows(setting))
     parts.append(f"Converged and wrong, all settings and schedules: {wrong}.")
     return "\n\n".join(parts)
+
+
+def step_control(figures: dict[str, Any]) -> str:
+    """The whole path by dogleg with each schedule, means a wire; the first and the last setting."""
+    rows = []
+    for setting in (figures["settings"][0], figures["settings"][-1]):
+        plain, own, adaptive = setting["dogleg"], setting["ours"], setting["adaptive"]
+        many = setting["periodic"][-1]
+        for name, row in (
+            ("plain, 100 samples", plain[4]),
+            ("`Uniform()`, 100 samples", own[4]),
+            ("`Periodic()`, 100 samples", many),
+            ("plain, 10 samples", plain[1]),
+            ("`Uniform()`, 10 samples", own[1]),
+            ("`Adaptive()`, the last sample", adaptive),
+        ):
+            searched = f" + {row['search_iterations']:.0f}" if row["cycle"] else ""
+            cycle = f", T = {row['cycle']:g}" if row["cycle"] else ""
+            rows.append(
+                [
+                    _place(setting) if row is plain[4] else "",
+                    name + cycle,
+                    f"{row['iterations']:.1f}{searched}",
+                    f"{row['evaluations']:.0f}",
+                    f"{row['runtime_ms']:.2f}",
+                    _reached(row),
+                ]
+            )
+    head = ["layout, h, press", "schedule", "steps (+ search)", "evaluations, all", "ms", "error"]
+    return table(head, rows)
 
 
 def _place(setting: dict[str, Any]) -> str:
@@ -138,11 +143,8 @@ def _all_rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
     return [*found, *setting["dogleg"], *setting["ours"], *setting["periodic"], setting["adaptive"]]
 
 
-def accuracy(figures: dict[str, Any]) -> str:
-    parts = [
-        f"{machine(figures)} {figures['scenes']} random scenes for each line of the coverage.",
-        "Four wires, no noise: each solver's fastest way to 1e-9. **Bold**: on the Pareto front of all rows.",
-    ]
+def front(figures: dict[str, Any]) -> str:
+    """Error against time: each solver's fastest way."""
     rows = []
     for panel in figures["front"]:
         for i, row in enumerate(best_of_each(panel["rows"])):
@@ -152,12 +154,11 @@ def accuracy(figures: dict[str, Any]) -> str:
             rows.append(
                 [f"`{panel['scene']}`" if i == 0 else "", name, row["how"], f"{row['us']:.0f}", error]
             )
-    parts.append(table(["scene", "who", "how", "µs a wire", "error"], rows))
-    parts.append(
-        "A 10 % press: RMS error (reported deviation) of the wires CONVERGED, shares of the displacement. "
-        "*Bound*: Cramér-Rao without a prior. *exact* is `Tracker(method='exact')` with its referee: where "
-        "it is better than the bound, wires were taken from the posterior."
-    )
+    found = table(["scene", "who", "how", "µs a wire", "error"], rows)
+    return f"{machine(figures)} **Bold**: on the Pareto front of all rows.\n\n{found}"
+
+
+def noise(figures: dict[str, Any], only: float | None = None) -> str:
     rows = [
         [
             f"`{exact['layout']}` {exact['height']:g}",
@@ -167,14 +168,24 @@ def accuracy(figures: dict[str, Any]) -> str:
             percent(exact["bound"]),
         ]
         for exact, own in _by_method(figures["noise"])
+        if only is None or math.isclose(exact["sigma"], only)
     ]
-    parts.append(table(["layout, h", "noise", "exact", "posterior", "bound"], rows))
+    return table(["layout, h", "noise", "exact", "posterior", "bound"], rows)
+
+
+def short_noise(figures: dict[str, Any]) -> str:
+    return noise(figures, SHORT_NOISE)
+
+
+def codes(figures: dict[str, Any]) -> str:
     rows = [
         [f"`{exact['layout']}` {exact['height']:g}", str(exact["bits"]), _pair(exact), _pair(own)]
         for exact, own in _by_method(figures["codes"])
     ]
-    parts.append(table(["layout, h", "bits", "exact", "posterior"], rows))
-    parts.append("Random scenes: one body or two, sharp or blunt, 5 to 30 % deep.")
+    return table(["layout, h", "bits", "exact", "posterior"], rows)
+
+
+def coverage(figures: dict[str, Any]) -> str:
     rows = [
         [
             f"`{row['layout']}` {row['height']:g}",
@@ -188,12 +199,10 @@ def accuracy(figures: dict[str, Any]) -> str:
         for row in figures["coverage"]
     ]
     head = ["layout, h", "noise", "method", "CONVERGED", "error (reported)", "error / reported", "in 95 %"]
-    parts.append(table(head, rows))
-    parts.append(
-        "Errors of the posterior in these scenes over √(n + b), by the share of b in it (n by the noise, b "
-        "left open by the prior, section 2.7). *By noise*: the RMS if b were not in the errors at all; *b in "
-        "it*: how much of b is. A normal variable has 1.96, 3.29 and 3.0 in the last three columns."
-    )
+    return table(head, rows)
+
+
+def parts_of_errors(figures: dict[str, Any]) -> str:
     rows = [
         [
             f"{row['from']:.0%} to {row['to']:.0%}",
@@ -217,7 +226,10 @@ def accuracy(figures: dict[str, Any]) -> str:
         "99.9 % below",
         "kurtosis",
     ]
-    parts.append(table(head, rows))
+    return table(head, rows)
+
+
+def limits(figures: dict[str, Any]) -> str:
     rows = [
         [
             row["what"],
@@ -226,9 +238,9 @@ def accuracy(figures: dict[str, Any]) -> str:
             "yes" if row["reached"] else "**no**",
         ]
         for row in figures["must"]
+        if not row["what"].startswith(("coverage", "error / own bound"))  # the table of coverage shows them
     ]
-    parts.append(table(["must be reached", "figure", "limit", "reached"], rows))
-    return "\n\n".join(parts)
+    return table(["must be reached", "figure", "limit", "reached"], rows)
 
 
 def _by_method(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -244,8 +256,8 @@ def stability(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['seeds']} seeds a row, {len(figures['rows'])} rows, "
         f"**{figures['wrong']} wires CONVERGED and wrong**. Wrong is an error above 5 deviations and beyond "
-        "chance, with exact data above 1e-6 (`bench/verdict.py`). Below: the rows with noise, by `auto` (by "
-        "the method it chose); errors and deviations in the deepest frame, median over the seeds."
+        "chance, with exact data above 1e-6. Below: the rows with noise, by `auto` (by the method it chose); "
+        "errors and standard deviations in the deepest frame, median over the seeds."
     ]
     rows = [
         [
@@ -262,11 +274,14 @@ def stability(figures: dict[str, Any]) -> str:
     ]
     head = ["#", "case", "by", "error", "reported", "CONVERGED", "wrong"]
     parts.append(table(head, rows))
+    return "\n\n".join(parts)
+
+
+def exact_data(figures: dict[str, Any]) -> str:
     exact = [row for row in figures["rows"] if "exact data" in row["case"] or "samples" in row["case"]]
     totals: dict[str, list[dict[str, Any]]] = {}
     for row in exact:
         totals.setdefault(row["method"], []).append(row)
-    parts.append("Exact data, all hard cases together:")
     rows = [
         [
             name,
@@ -277,35 +292,56 @@ def stability(figures: dict[str, Any]) -> str:
         ]
         for name, some in totals.items()
     ]
-    parts.append(table(["method", "wires", "accurate", "flagged", "wrong"], rows))
-    return "\n\n".join(parts)
+    summary = (
+        f"{figures['seeds']} seeds a row, {len(figures['rows'])} rows: **{figures['wrong']} wires CONVERGED "
+        "and wrong**. With exact data, all hard cases together:"
+    )
+    return f"{summary}\n\n" + table(["method", "wires", "accurate", "flagged", "wrong"], rows)
 
 
-MADE: dict[str, Callable[[dict[str, Any]], str]] = {
-    "kernel": kernel,
-    "solve": solve,
-    "path": path,
-    "accuracy": accuracy,
-    "stability": stability,
+MADE: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
+    "kernel": {"kernel": kernel},
+    "solve": {"solve": solve},
+    "path": {"path": path, "step control": step_control},
+    "accuracy": {
+        "front": front,
+        "noise": noise,
+        "noise in short": short_noise,
+        "codes": codes,
+        "coverage": coverage,
+        "parts": parts_of_errors,
+        "limits": limits,
+    },
+    "stability": {"stability": stability, "exact data": exact_data},
 }
+"""Tables by the benchmark that measures them, and by their markers."""
 
 
-def fill(page: str, name: str, text: str) -> str:
-    """``page`` with ``text`` between the markers of ``name``."""
+def fill(name: str, text: str) -> None:
+    """Write ``text`` between the markers of ``name``, on the page that has them.
+
+    Raises:
+        ValueError: No page has the markers.
+    """
     start, end = f"<!-- FIGURES: {name} -->", f"<!-- END: {name} -->"
-    if start not in page or end not in page:
-        raise ValueError(f"{PAGE.name}: has no markers {start} and {end}")
-    before, rest = page.split(start, 1)
-    return f"{before}{start}\n\n{text}\n\n{end}{rest.split(end, 1)[1]}"
+    for file in PAGES:
+        page = file.read_text(encoding="utf-8")
+        if start in page and end in page:
+            before, rest = page.split(start, 1)
+            after = rest.split(end, 1)[1]
+            file.write_text(f"{before}{start}\n\n{text}\n\n{end}{after}", encoding="utf-8")
+            print(f"{file.name}: {name}")
+            return
+    raise ValueError(f"got no page with {start} and {end}, expected one of {[file.name for file in PAGES]}")
 
 
 def shrink(source: Path, target: Path) -> None:
-    """A picture with few colours, and no more bytes than a repository should carry."""
+    """Save a picture with few colours, in at most ``MOST_BYTES``."""
     from PIL import Image  # comes with matplotlib
 
     picture = Image.open(source).convert("RGB")
     while True:
-        # of the ways to choose colours the one that keeps a thin red line red
+        # this way to choose colours keeps a thin red line red
         few = picture.quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         few.save(target, optimize=True)
         if target.stat().st_size <= MOST_BYTES:
@@ -315,21 +351,16 @@ def shrink(source: Path, target: Path) -> None:
 
 def main() -> None:
     folder = Path(sys.argv[1])
-    page = PAGE.read_text(encoding="utf-8")
-    for name, make in MADE.items():
-        if (folder / f"{name}.json").exists():
-            text = make(json.loads((folder / f"{name}.json").read_text(encoding="utf-8")))
-            if (folder / f"{name}.png").exists():
-                shrink(folder / f"{name}.png", DOCS / "img" / f"{name}.png")
-            if (DOCS / "img" / f"{name}.png").exists():
-                text += f"\n\n![skinnode bench {name} --plot](img/{name}.png)"
-            page = fill(page, name, text)
-            print(f"{name}: filled")
+    for bench, tables in MADE.items():
+        if (folder / f"{bench}.json").exists():
+            figures = json.loads((folder / f"{bench}.json").read_text(encoding="utf-8"))
+            for name, make in tables.items():
+                fill(name, make(figures))
+            if (folder / f"{bench}.png").exists():
+                shrink(folder / f"{bench}.png", DOCS / "img" / f"{bench}.png")
     printed = folder / "wrong_models.txt"
     if printed.exists():
-        page = fill(page, "wrong models", "```\n" + printed.read_text(encoding="utf-8").rstrip() + "\n```")
-        print("wrong models: filled")
-    PAGE.write_text(re.sub(r"\n{3,}", "\n\n", page), encoding="utf-8")
+        fill("wrong models", "```text\n" + printed.read_text(encoding="utf-8").rstrip() + "\n```")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a wrong model costs: the measurements of docs/solver.md, section 5.
+"""Measure what a wrong model costs, for the section "Limits" of docs/solver.md.
 
     .venv/bin/python docs/wrong_models.py [SEEDS]
 

@@ -106,6 +106,15 @@ def test_generated_tables_have_what_they_are_made_of(site: Path) -> None:
     assert not re.search("generated:", hand + wire)
 
 
+def test_constants_of_the_solver_are_on_their_page_with_value_and_origin(site: Path) -> None:
+    page = (site / "solver-derivations.html").read_text(encoding="utf-8")
+    rows = re.findall(r"<td><code>[\w.]*?([A-Z_0-9]+)</code></td>\s*<td>([^<]+)</td>\s*<td>(.+)</td>", page)
+    assert len(rows) > 70
+    values = {name: float(value) for name, value, _ in rows}
+    assert values.items() >= {("PRIOR_DOUBT", 3.0), ("FOLDED", 250.0), ("FRAME_STEPS", 12.0)}
+    assert min(len(origin) for _, _, origin in rows) > 10
+
+
 def test_the_python_reference_has_every_public_name(site: Path) -> None:
     page = (site / "python.html").read_text(encoding="utf-8")
     for name in skinnode.__all__:

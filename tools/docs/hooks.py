@@ -1,5 +1,5 @@
-"""Hooks of the documentation: a line `<!-- generated: NAME -->` of a page becomes what TABLES says of NAME,
-made from the code when the site is built. A name that is not there, or that no page uses, ends the build."""
+"""Hooks of the documentation: replace a line `<!-- generated: NAME -->` by the table of that name, made from
+the code when the site is built. A name that no table has, or that no page uses, ends the build."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import command_pages
 import hand_keys
 import health_tables
+import solver_constants
 import wire_tables
 from mkdocs.exceptions import PluginError
 
@@ -18,6 +19,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **wire_tables.TABLES,
     **health_tables.TABLES,
     **command_pages.TABLES,
+    **solver_constants.TABLES,
 }
 _MARK = re.compile(r"^<!-- generated: ([\w-]+) -->$", flags=re.MULTILINE)
 _used: set[str] = set()

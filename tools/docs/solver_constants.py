@@ -1,0 +1,58 @@
+"""Table of the solver's tuning constants, made from the modules of ``skinnode.solve``."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import itertools
+import pkgutil
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Final
+
+import markdown_text as md
+
+import skinnode.solve
+
+_NOT_TUNED: Final = {
+    *("DECODE", "TAKE", "CHOOSE", "SOLVE", "REACH", "FINISH", "ALL_GOOD", "INCOMPLETE"),
+    *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
+    *("ROWS", "TILE", "REST", "TINY", "A_MIN", "A_MAX", "NOISE_MAX"),
+}
+"""Names of task flags, tile sizes and overflow limits: no result depends on their values."""
+
+
+def constants() -> str:
+    """Make one row for each numeric constant that has a docstring."""
+    rows = [
+        (md.code(f"{module.__name__.rpartition('.')[2]}.{name}"), f"{value:g}", text)
+        for module in _modules()
+        for name, value, text in _documented(module)
+    ]
+    return md.table(("constant", "value", "meaning and origin"), rows)
+
+
+def _modules() -> Iterator[ModuleType]:
+    for found in pkgutil.walk_packages(skinnode.solve.__path__, "skinnode.solve."):
+        if not found.ispkg:
+            yield importlib.import_module(found.name)
+
+
+def _documented(module: ModuleType) -> Iterator[tuple[str, float, str]]:
+    assert module.__file__ is not None
+    with open(module.__file__, encoding="utf-8") as source:
+        body = ast.parse(source.read()).body
+    for line, below in itertools.pairwise(body):
+        if (
+            isinstance(line, ast.AnnAssign)
+            and isinstance(line.target, ast.Name)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+        ):
+            name, value = line.target.id, getattr(module, line.target.id)
+            tuned = name.isupper() and not name.startswith("_") and name not in _NOT_TUNED
+            if tuned and type(value) in (int, float):
+                yield name, value, md.prose(str(below.value.value))
+
+
+TABLES: Final[dict[str, Callable[[], str]]] = {"solver-constants": constants}

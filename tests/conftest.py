@@ -13,57 +13,26 @@ from typing import Any
 
 import can
 import pytest
-from _pytest.runner import runtestprotocol
 
 from skinnode.errors import BusError
 from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort
 
-from .stalls import STALL_S, TRIES, StallWatch
+from . import stalls
 
 REQUIRE_VCAN = "SKINNODE_REQUIRE_VCAN"
 
 
 FUZZ_FRAMES = 20_000
-AGAIN = pytest.StashKey[list[str]]()
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser: pytest.Parser, pluginmanager: pytest.PytestPluginManager) -> None:
+    pluginmanager.register(stalls, "stalls")
     parser.addoption("--frames", type=int, default=FUZZ_FRAMES, help="frames that a node is fuzzed with")
     parser.addoption(
         "--all-injections", action="store_true", help="an exception at every call of a thread of the host"
     )
     parser.addoption("--injection-seed", type=int, default=0, help="which calls, where not every one")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Tests marked ``real_time`` that fail are run again if the machine stood still meanwhile; the summary
-    says which."""
-    if item.get_closest_marker("real_time") is None:
-        return None
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for left in reversed(range(TRIES)):
-        with StallWatch() as watch:
-            reports = runtestprotocol(item, log=False, nextitem=nextitem)
-        if not left or watch.worst_s < STALL_S or not any(report.failed for report in reports):
-            break
-        item.config.stash[AGAIN].append(f"{item.nodeid}: nothing ran for {1e3 * watch.worst_s:.0f} ms")
-    for report in reports:
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    config.stash[AGAIN] = []
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    if config.stash[AGAIN]:
-        terminalreporter.section("failed while the machine stood still, and run again")
-        for line in config.stash[AGAIN]:
-            terminalreporter.line(line)
 
 
 @pytest.fixture

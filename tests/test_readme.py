@@ -1,4 +1,4 @@
-"""What the README says runs."""
+"""The README's programs run, and the page of commands lists every command."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
+COMMANDS = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
 
 
 def python_blocks() -> list[str]:
@@ -24,8 +25,15 @@ def test_the_first_example_prints_what_it_claims() -> None:
     assert done.stdout.splitlines()[1].endswith("True")
 
 
+def test_pages_and_pictures_of_the_front_page_are_there() -> None:
+    linked = re.findall(r"\]\(([\w./-]+)\)", README)
+    assert {"docs/img/hand.png", "docs/commands.md", "CONTRIBUTING.md"} <= set(linked)
+    for name in linked:
+        assert (Path(__file__).parents[1] / name).is_file(), name
+
+
 def test_commands_of_the_table_exist() -> None:
-    commands = set(re.findall(r"\| `(skinnode|vcan-sim)(?: (\w+))?", README))
+    commands = set(re.findall(r"\| `(skinnode|vcan-sim)(?: (\w+))?", COMMANDS))
     assert ("skinnode", "demo") in commands
     for program, command in commands:
         arguments = [str(Path(sys.executable).with_name(program)), *filter(None, [command]), "--help"]
@@ -40,7 +48,7 @@ def test_the_table_has_every_command() -> None:
 
     from skinnode.cli.main import app
 
-    rows = [line for line in README.splitlines() if line.startswith("| `")]
+    rows = [line for line in COMMANDS.splitlines() if line.startswith("| `")]
     for name, command in get_command(app).commands.items():
         words = [f"{name} {inner}" for inner in getattr(command, "commands", {})] or [name]
         for word in words:

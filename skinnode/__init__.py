@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from skinnode.model.layout import PatchLayout
     from skinnode.model.status import Status
     from skinnode.record import Recorder, replay
-    from skinnode.solve.homotopy import PathResult, solve_path
-    from skinnode.solve.posterior import Posterior
-    from skinnode.solve.schedule import Adaptive, Periodic, Uniform
-    from skinnode.solve.system import solve_system
+    from skinnode.solve.operators.system import solve_system
+    from skinnode.solve.paths.path import PathResult, solve_path
+    from skinnode.solve.paths.step_control import Adaptive, Periodic, Uniform
+    from skinnode.solve.posterior.posterior import Posterior
     from skinnode.solve.tracker import Tracker
 
 _HOME = {
@@ -37,15 +37,15 @@ _HOME = {
     "ScanStamp": "skinnode.model.frames",
     "SolveStats": "skinnode.model.frames",
     "Status": "skinnode.model.status",
-    "Adaptive": "skinnode.solve.schedule",
-    "Periodic": "skinnode.solve.schedule",
-    "Uniform": "skinnode.solve.schedule",
+    "Adaptive": "skinnode.solve.paths.step_control",
+    "Periodic": "skinnode.solve.paths.step_control",
+    "Uniform": "skinnode.solve.paths.step_control",
     "Recorder": "skinnode.record",
     "replay": "skinnode.record",
-    "PathResult": "skinnode.solve.homotopy",
-    "solve_path": "skinnode.solve.homotopy",
-    "Posterior": "skinnode.solve.posterior",
-    "solve_system": "skinnode.solve.system",
+    "PathResult": "skinnode.solve.paths.path",
+    "solve_path": "skinnode.solve.paths.path",
+    "Posterior": "skinnode.solve.posterior.posterior",
+    "solve_system": "skinnode.solve.operators.system",
     "Tracker": "skinnode.solve.tracker",
 }
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 
 class SkinError(Exception):

@@ -14,8 +14,8 @@ from typing import Any
 import can
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort
 
 from . import stalls

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from skinnode import kernel_cache
+from skinnode.compiled import kernel_cache
 
 PROGRAM = """
-from skinnode.jit import njit
+from skinnode.compiled.jit import njit
 
 @njit
 def mean(a, b):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 
-from skinnode.pauses import short_pauses
+from skinnode.process.garbage_collection import short_pauses
 
 
 class Link:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from skinnode.errors import ConfigError
-from skinnode.whole_file import discard_leftovers, replace_file
+from skinnode.files.whole_file import discard_leftovers, replace_file
 
 SKINNODE = Path(sys.executable).with_name("skinnode")
 
@@ -84,7 +84,7 @@ def test_a_plot_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
     pytest.importorskip("matplotlib")
     from matplotlib.figure import Figure
 
-    from skinnode.plot_file import save_figure
+    from skinnode.files.plot_file import save_figure
 
     figure, file = Figure(), tmp_path / "plot.PNG"
     save_figure("--plot", file, figure, 20)

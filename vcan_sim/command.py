@@ -13,7 +13,7 @@ import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
 from skinnode.cli._usage import Seconds
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from skinnode.node import NmtState
@@ -47,9 +47,9 @@ def simulate(
 
     Bring them up with `skinnode host` and the same file in another terminal.
     """
-    from skinnode.model.config import load_hand
-    from skinnode.pauses import short_pauses
-    from skinnode.signals import until_told
+    from skinnode.config import load_hand
+    from skinnode.process.garbage_collection import short_pauses
+    from skinnode.process.signals import until_told
     from vcan_sim.faults import faults_of
     from vcan_sim.fleet import Fleet
 

@@ -11,14 +11,14 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtCommand
 from skinnode.errors import BusError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, PatchNode
 from skinnode.node.clock import THRIFTY, Pacing
-from skinnode.node.nmt import NmtCommand
 from skinnode.node.source import ResistanceSource
-from skinnode.wire import indices as od
-from skinnode.wire.codec import (
+from skinnode.protocol.codec import (
     SummaryFlag,
     chunk_indexer,
     pack_checked_summary,
@@ -26,7 +26,7 @@ from skinnode.wire.codec import (
     unpack_scan_with_check,
     unpack_summary,
 )
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import LOST_IN, LOST_OUT, NO_FAULTS, OF_CHUNKS, OF_SCANS, OF_WIRES, Faults, Injected
 from vcan_sim.tally import Kind, Tally, kind_of
 

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
+from skinnode.canopen.indices import chunk_cob_id, summary_cob_id
+from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import BusError, ConfigError
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner
 from skinnode.node.source import ResistanceSource
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort, Frame
-from skinnode.wire.indices import chunk_cob_id, summary_cob_id
-from skinnode.wire.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected
 from vcan_sim.faulty_node import Emit, FaultyNode
 from vcan_sim.scene import Scene

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from skinnode.model.config import SimulationConfig
+from skinnode.config import SimulationConfig
 from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
 

@@ -6,7 +6,7 @@ import enum
 from collections import Counter
 from typing import Final
 
-from skinnode.wire import indices as od
+from skinnode.canopen import indices as od
 
 _BOOT_UP_DATA: Final = b"\0"
 

@@ -10,7 +10,7 @@ from skinnode.bench import accuracy_noise as noise
 from skinnode.bench import accuracy_time as times
 from skinnode.bench.solve import ACCURACY
 from skinnode.bench.timing import machine
-from skinnode.json_values import plain
+from skinnode.text.json_values import plain
 
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)

@@ -21,10 +21,10 @@ from skinnode.bench.solve import Case, Solve, peers
 from skinnode.bench.truth import Press, Skin
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.homotopy import solve_path
-from skinnode.solve.operators import OPERATORS
-from skinnode.solve.problem import PatchProblem
-from skinnode.solve.schedule import Adaptive, Periodic, Schedule, Uniform
+from skinnode.solve.operators.steps import OPERATORS
+from skinnode.solve.paths.path import solve_path
+from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform
+from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
 """Preset, height in pitches, depth in heights: one that all solve from rest, one that needs the samples, and

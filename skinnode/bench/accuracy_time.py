@@ -12,7 +12,7 @@ from skinnode.bench.cases import preset
 from skinnode.bench.timing import take_turns
 from skinnode.bench.truth import Converter, Press, Skin, stream
 from skinnode.model.layout import Float
-from skinnode.solve.posterior import Posterior
+from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.tracker import Tracker
 
 FRAMES: Final = 12

@@ -17,7 +17,7 @@ import numpy as np
 
 from skinnode.bench.timing import take_turns
 from skinnode.model.layout import Float
-from skinnode.solve import dense
+from skinnode.solve.linalg import cholesky as dense
 
 ONE_THREAD: Final = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "MKL", "BLIS", "VECLIB", "OMP", "NUMBA")

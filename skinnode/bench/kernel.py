@@ -10,11 +10,11 @@ import numpy as np
 
 from skinnode.bench import dense as _bench_dense
 from skinnode.bench.timing import machine, take_turns
-from skinnode.jit import njit, njit_part
+from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.kernels import lower_rows, potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.operators import (
+from skinnode.solve.operators.steps import (
     LIMIT,
     OPERATORS,
     OUTSIDE,
@@ -25,7 +25,7 @@ from skinnode.solve.operators import (
     shorten,
     workspace,
 )
-from skinnode.solve.problem import PatchProblem
+from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
 """Trust radius, pitches a coordinate: well within Newton's step here, so that every operator has to work."""

@@ -22,17 +22,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinnode.child_processes import starting_children
+from skinnode.bus_load.plan import inhibit_time_100us
+from skinnode.bus_load.timing import exact_bits_batch, fd_bits
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.node import EXACT, PatchNode
-from skinnode.pauses import short_pauses
+from skinnode.process.child_processes import starting_children
+from skinnode.process.garbage_collection import short_pauses
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport.datagram import LOOPBACK, datagram
-from skinnode.wire import indices as od
-from skinnode.wire.plan import inhibit_time_100us
-from skinnode.wire.profile import PatchProfile
-from skinnode.wire.timing import exact_bits_batch, fd_bits
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 

@@ -15,9 +15,9 @@ from skinnode.bench.verdict import LIMIT, Solved
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
-from skinnode.solve.homotopy import solve_path
-from skinnode.solve.posterior import Posterior
-from skinnode.solve.schedule import Adaptive, Uniform
+from skinnode.solve.paths.path import solve_path
+from skinnode.solve.paths.step_control import Adaptive, Uniform
+from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.tracker import Tracker
 
 Method = Callable[[Stream], Solved]

@@ -18,13 +18,13 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench.timing import machine, take_turns
-from skinnode.model.config import BusConfig
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import EXACT, THRIFTY, NodeRunner, Pacing, PatchNode
-from skinnode.pauses import short_pauses
+from skinnode.process.garbage_collection import short_pauses
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000

@@ -1,4 +1,4 @@
-"""The paper's experiments on the path, in its protocol, beside what it prints (``_paper.toml``).
+"""The paper's experiments on the path, in its protocol, beside what it prints (``paper.toml``).
 
 One upper wire of 10 electrodes, 30 unknowns; the other wires of the patch are left out. An experiment is a
 smooth press at random: a sphere of 6 to 12 mm on rubber, by Hertz's closed form with friction, somewhere in
@@ -33,9 +33,9 @@ from skinnode.bench.truth import Press
 from skinnode.model.forward import jacobian, potential_per_m, resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.homotopy import PathResult, solve_path
-from skinnode.solve.operators import OPERATORS
-from skinnode.solve.schedule import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
+from skinnode.solve.operators.steps import OPERATORS
+from skinnode.solve.paths.path import PathResult, solve_path
+from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
 
 SETTINGS: Final = (("staggered", 0.5, 0.1), ("aligned", 1.0, 0.1), ("aligned", 0.7, 0.3))
 """Preset, height in pitches, depth of the press in heights."""
@@ -62,7 +62,7 @@ WRONG: Final = 1e-4
 
 def printed() -> dict[str, Any]:
     """The figures of the paper."""
-    text = resources.files("skinnode.cli").joinpath("_paper.toml").read_text(encoding="utf-8")
+    text = resources.files("skinnode.bench").joinpath("paper.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 

@@ -23,12 +23,12 @@ import numpy as np
 
 from skinnode.bench.load import LEAD_S, Generator
 from skinnode.bench.timing import machine
+from skinnode.config import HandConfig, LayoutConfig, parse_hand
 from skinnode.host import Host, Subscription
 from skinnode.host.accounting import discrepancies
-from skinnode.model.config import HandConfig, LayoutConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import ScanStamp
-from skinnode.pauses import short_pauses
+from skinnode.process.garbage_collection import short_pauses
 from skinnode.transport import CanPort
 from skinnode.transport.datagram import DatagramPort, free_channel
 

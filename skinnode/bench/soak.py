@@ -29,15 +29,15 @@ from typing import Any, Final
 
 from skinnode.bench import soak_sums as sums
 from skinnode.bench.soak_starvation import starved_processor
+from skinnode.bus_load.stuffing import load_kernels
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError
 from skinnode.host import Condition, Host, HostStats
 from skinnode.host.accounting import discrepancies
 from skinnode.host.pipeline import check_solvable
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.frames import FieldFrame
-from skinnode.wire.codec import TIME_STEP_US
-from skinnode.wire.stuffing import load_kernels
-from skinnode.words import counted
+from skinnode.protocol.codec import TIME_STEP_US
+from skinnode.text.words import counted
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import REMEMBERED_READINGS

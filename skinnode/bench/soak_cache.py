@@ -23,7 +23,7 @@ def fill(folder: Path) -> None:
 
     Raises subprocess.SubprocessError if the child fails.
     """
-    from skinnode.jit import cache_dir, is_cold
+    from skinnode.compiled.jit import cache_dir, is_cold
 
     users = cache_dir()
     if users is not None and not is_cold():

@@ -18,11 +18,11 @@ from skinnode.bench.timing import machine, take_turns
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.kernels import potential, potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve import wires
-from skinnode.solve.operators import OPERATORS
-from skinnode.solve.patch_solver import PatchSolver
-from skinnode.solve.problem import PatchProblem
-from skinnode.solve.system import solve_system
+from skinnode.solve.operators.steps import OPERATORS
+from skinnode.solve.operators.system import solve_system
+from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires.patch_solver import PatchSolver
+from skinnode.solve.wires.problem import PatchProblem
 
 ACCURACY: Final = 1e-9
 """Largest error of a coordinate, relative to the largest displacement of its wire."""

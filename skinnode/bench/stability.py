@@ -17,8 +17,8 @@ from skinnode.bench import methods
 from skinnode.bench.cases import Case, all_cases
 from skinnode.bench.timing import machine
 from skinnode.bench.verdict import Solved, Tally
-from skinnode.child_processes import starting_children
-from skinnode.json_values import plain
+from skinnode.process.child_processes import starting_children
+from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
 """Where ``auto`` gave the same bits as the method it chose on so many streams, it is not run again."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from skinnode.output_file import write_text
+from skinnode.files.output_file import write_text
 
 ROUNDS: Final = 31
 """Odd, so that the median is a time that was measured."""

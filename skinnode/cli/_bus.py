@@ -10,7 +10,7 @@ import typer
 from skinnode.errors import SkinError
 
 if TYPE_CHECKING:
-    from skinnode.model.config import BusConfig, HandConfig, PatchConfig
+    from skinnode.config import BusConfig, HandConfig, PatchConfig
 
 
 def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
@@ -28,7 +28,7 @@ def nodes(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
 
 
 def _patches(ctx: typer.Context) -> list[PatchConfig]:
-    from skinnode.model.config import load_hand
+    from skinnode.config import load_hand
 
     bus = ctx.params.get("bus")
     try:
@@ -96,8 +96,8 @@ def find_buses(
     the options are not valid."""
     from pydantic import ValidationError
 
+    from skinnode.config import BusConfig
     from skinnode.errors import ConfigError
-    from skinnode.model.config import BusConfig
 
     if hand is None:
         if bus is not None:
@@ -155,8 +155,8 @@ def _of_one_bus(plan: HandConfig, bus: str | None) -> HandConfig:
 def _load(hand: Path, bitrate: int | None, fd: bool) -> HandConfig:
     """Load a hand file. Raises ConfigError if the file is not valid, or if an option is given that cannot be
     combined with a hand file."""
+    from skinnode.config import load_hand
     from skinnode.errors import ConfigError, Shown
-    from skinnode.model.config import load_hand
 
     for option, value in (("--bitrate", bitrate), ("--fd", Shown("yes") if fd else None)):
         if value is not None:

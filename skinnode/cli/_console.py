@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import typer
 
-from skinnode.printable import printable_lines
+from skinnode.text.printable import printable_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,7 +25,7 @@ UNBOUNDED: Final = 10_000
 
 def print_json(value: Any) -> None:
     """One JSON document."""
-    from skinnode.json_values import plain
+    from skinnode.text.json_values import plain
 
     typer.echo(json.dumps(plain(value), indent=2))
 
@@ -59,7 +59,7 @@ def _console_type() -> type[Console]:
     from rich.text import Text
 
     class PrintableConsole(Console):
-        """Console that escapes control characters; see :mod:`skinnode.printable`."""
+        """Console that escapes control characters; see :mod:`skinnode.text.printable`."""
 
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(printable_lines(text), **options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from skinnode.json_values import plain
+from skinnode.text.json_values import plain
 
 if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame

@@ -25,7 +25,7 @@ def find_layout(text: str) -> PatchLayout:
 
     Raises ConfigError where there is none.
     """
-    from skinnode.model.config import load_layout
+    from skinnode.config import load_layout
     from skinnode.model.layout import PRESETS, PatchLayout
     from skinnode.node.find_source import load
 

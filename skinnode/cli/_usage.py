@@ -11,7 +11,7 @@ import typer
 
 from skinnode.cli._ending import COULD_NOT_RUN, FINE, closed_pipe
 from skinnode.errors import ConfigError, SkinError
-from skinnode.printable import PrintableStream
+from skinnode.text.printable import PrintableStream
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # of click, or of typer's own copy of it
 

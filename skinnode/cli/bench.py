@@ -127,7 +127,7 @@ def path(
 ) -> None:
     """The paper's tables 2, 3 and 4 and figures 8 to 13, beside its printed values."""
     from skinnode.bench import path as bench
-    from skinnode.json_values import plain
+    from skinnode.text.json_values import plain
 
     _prepare(json, plot)
     figures = bench.run(experiments)
@@ -271,9 +271,9 @@ def _print_must(must: list[dict[str, Any]]) -> None:
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
     """Refuse what could not be written, before the work; say why the first run takes longer."""
-    from skinnode.jit import is_cold
-    from skinnode.output_file import require_writable
-    from skinnode.plot_file import require_matplotlib
+    from skinnode.compiled.jit import is_cold
+    from skinnode.files.output_file import require_writable
+    from skinnode.files.plot_file import require_matplotlib
 
     if json is not None:
         require_writable("--json", json)

@@ -52,7 +52,7 @@ def conformance(
     from skinnode.conformance import connect, run_cases, select
     from skinnode.conformance.report import list_lines, result_line, summary_line
     from skinnode.errors import ConfigError
-    from skinnode.output_file import require_writable
+    from skinnode.files.output_file import require_writable
     from skinnode.transport import CanPort
 
     cases = select(only.split(",") if only else ())
@@ -89,7 +89,7 @@ def _write(report: Report, title: str, junit: Path | None, html: Path | None, js
 
     from skinnode.conformance.html import as_html
     from skinnode.conformance.report import as_json, as_junit
-    from skinnode.output_file import write_text
+    from skinnode.files.output_file import write_text
 
     if junit is not None:
         write_text("--junit", junit, as_junit(report))

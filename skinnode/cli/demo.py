@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from skinnode.model.config import HandConfig
+    from skinnode.config import HandConfig
 
 MAX_PATCHES = 16
 _NAMES = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
@@ -46,8 +46,8 @@ def demo(
     from skinnode.cli._console import console
     from skinnode.demo import plot as demo_plot
     from skinnode.demo import run as demo_run
-    from skinnode.output_file import require_writable, write_text
-    from skinnode.plot_file import require_matplotlib
+    from skinnode.files.output_file import require_writable, write_text
+    from skinnode.files.plot_file import require_matplotlib
 
     for option, file in (("--json", json_file), ("--plot", plot)):
         if file is not None:
@@ -73,7 +73,7 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
     """The hand of the demo: ``patches`` reference patches on one virtual bus of its own."""
     import uuid
 
-    from skinnode.model.config import parse_hand
+    from skinnode.config import parse_hand
 
     names = [_NAMES[i] if i < len(_NAMES) else f"patch{i + 1}" for i in range(patches)]
     return parse_hand(

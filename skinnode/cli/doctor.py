@@ -45,10 +45,10 @@ def doctor(
     from skinnode.cli._console import print_json, progress
     from skinnode.doctor.causes import grouped
     from skinnode.doctor.gather import gather
-    from skinnode.output_file import require_writable, write_text
+    from skinnode.files.output_file import require_writable, write_text
 
     if html is not None:
-        from skinnode.plot_file import require_matplotlib
+        from skinnode.files.plot_file import require_matplotlib
 
         require_writable("--html", html)
         require_matplotlib(Path("report.svg"))
@@ -110,7 +110,7 @@ def _print(facts: list[BusFacts], groups: list[Group]) -> None:
     from skinnode.cli._console import console, indented
     from skinnode.doctor.causes import merged
     from skinnode.doctor.checks import not_judged, others
-    from skinnode.words import counted
+    from skinnode.text.words import counted
 
     out = console()
     for known in facts:
@@ -147,7 +147,7 @@ def _print(facts: list[BusFacts], groups: list[Group]) -> None:
 
 
 def _summary(groups: list[Group]) -> str:
-    from skinnode.words import counted
+    from skinnode.text.words import counted
 
     if not groups:
         return "no fault found in what was checked"

@@ -10,7 +10,7 @@ import typer
 from skinnode.cli._layouts import HELP as LAYOUT_HELP
 
 if TYPE_CHECKING:
-    from skinnode.wire.profile import PatchProfile
+    from skinnode.protocol.profile import PatchProfile
 
 _DEFAULT_SIZES = {
     "--upper-wires": 10,
@@ -57,8 +57,8 @@ def eds(
     of the reference patches are in eds/.
     """
     from skinnode.errors import ConfigError
-    from skinnode.output_file import require_writable, write_text
-    from skinnode.wire.profile import dcf_text, eds_text
+    from skinnode.files.output_file import require_writable, write_text
+    from skinnode.protocol.profile import dcf_text, eds_text
 
     sizes = {
         "--upper-wires": upper_wires,
@@ -87,7 +87,7 @@ def eds(
 def _profile(sizes: dict[str, int], layout: str | None, code_bits: int, fd: bool) -> PatchProfile:
     from skinnode.cli._layouts import find_layout, import_from_here
     from skinnode.errors import ConfigError
-    from skinnode.wire.profile import PatchProfile
+    from skinnode.protocol.profile import PatchProfile
 
     if layout is None:
         rows, columns, upper, lower = (_DEFAULT_SIZES | sizes).values()

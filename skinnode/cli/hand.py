@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from skinnode.model.config import HandConfig
-    from skinnode.wire.plan import BusPlan
+    from skinnode.bus_load.plan import BusPlan
+    from skinnode.config import HandConfig
 
 app = typer.Typer(
     help="Check a hand file and the load of its buses; its JSON Schema; begin one.", no_args_is_help=True
@@ -33,11 +33,11 @@ def check(
     frame of `others` waits at worst. Nothing is opened.
     Exit status 1 if a bus needs more than its max_load, 2 if the file cannot be used.
     """
+    from skinnode.bus_load.plan import plan_of, require_room
+    from skinnode.config import load_hand
     from skinnode.errors import BusLoadError, ConfigError
     from skinnode.host.hand_files import check_files
-    from skinnode.model.config import load_hand
     from skinnode.transport.port import allowed_interfaces, is_interface
-    from skinnode.wire.plan import plan_of, require_room
 
     config = load_hand(hand)
     for number, bus in enumerate(config.buses):
@@ -180,9 +180,9 @@ def schema() -> None:
     """Print the JSON Schema of a hand file, for editors that complete and check TOML.
 
     A file whose first line is `#:schema PATH` names it; the schema of this version is
-    skinnode/model/hand.schema.json.
+    skinnode/config/hand.schema.json.
     """
-    from skinnode.model.config.schema import schema_text
+    from skinnode.config.schema import schema_text
 
     typer.echo(schema_text(), nl=False)
 
@@ -198,9 +198,9 @@ def new(
 
     The patches are divided evenly among the buses, in order.
     """
+    from skinnode.bus_load.plan import plan_of
+    from skinnode.config import parse_hand
     from skinnode.errors import ConfigError
-    from skinnode.model.config import parse_hand
-    from skinnode.wire.plan import plan_of
 
     if buses > patches:
         raise ConfigError("--buses", buses, f"at most {patches}, a bus for each patch of --patches")

@@ -14,12 +14,12 @@ import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
 from skinnode.cli._usage import Seconds
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
+    from skinnode.config import HandConfig
     from skinnode.host import Host, HostStats
     from skinnode.host.health import PatchHealth
-    from skinnode.model.config import HandConfig
     from skinnode.model.frames import FieldFrame
 
 _LONGEST_WAIT_S = 0.1
@@ -50,10 +50,10 @@ def host(
     interface failed or reported errors, or a guest heard no SYNC; 2 if the hand could not be run, or if a
     node sent frames whose content does not match their identifier.
     """
+    from skinnode.compiled.jit import is_cold
+    from skinnode.config import load_hand
     from skinnode.host.pipeline import check_solvable
-    from skinnode.jit import is_cold
-    from skinnode.model.config import load_hand
-    from skinnode.signals import until_told
+    from skinnode.process.signals import until_told
 
     plan = load_hand(hand).on(interface, channel)
     report = _JsonReport() if as_json else _TextReport()
@@ -71,7 +71,7 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
     """Run the hand until told to end or time is up; the exit status. Of a frame that was not what its
     identifier promises the host has said so in the log, which Python writes to stderr."""
     from skinnode.host import BringUpCancelled, Host
-    from skinnode.pauses import short_pauses
+    from skinnode.process.garbage_collection import short_pauses
 
     try:
         with short_pauses(), Host.from_config(plan, cancelled=told.is_set) as running:
@@ -126,8 +126,8 @@ def verdict(running: Host) -> tuple[list[str], list[str]]:
     A node that skips scans because its own computer is too slow sends EMCY 0x8110. What is missing of it, or
     came too late, is then a note, and so is that emergency at the end. Frames that were wrong stay a fault.
     """
+    from skinnode.canopen.emergency import OVERRUN
     from skinnode.host.accounting import losses_of_bus, losses_of_lane
-    from skinnode.wire.emergency import OVERRUN
 
     _let_overruns_end(running)
     stats, notes = running.stats(), list[str]()
@@ -179,7 +179,7 @@ def reason(health: PatchHealth, before: str = "") -> str:
     if health.condition == "faulty" and health.defect is not None:
         return f"{before}{health.defect}"
     if health.condition == "faulty":
-        from skinnode.wire.emergency import register_text
+        from skinnode.canopen.emergency import register_text
 
         if health.last_emergency is None:  # the fault is older than the host
             text = register_text(health.error_register)

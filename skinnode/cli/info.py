@@ -57,8 +57,8 @@ def info(
 
 
 def _print(found: NodeInfo, patch_name: str) -> None:
+    from skinnode.canopen.emergency import register_text
     from skinnode.cli._console import console, table
-    from skinnode.wire.emergency import register_text
 
     out = console()
     title = f"node {found.node_id}" + (f" ({patch_name})" if patch_name else "")
@@ -90,7 +90,7 @@ def _print(found: NodeInfo, patch_name: str) -> None:
 
 
 def _identity(found: NodeInfo) -> str:
-    from skinnode.words import known
+    from skinnode.text.words import known
 
     vendor, product, revision = (
         value or 0 for value in (found.vendor_id, found.product_code, found.revision)

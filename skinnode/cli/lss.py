@@ -9,9 +9,9 @@ import typer
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, node_ids
 
 if TYPE_CHECKING:
+    from skinnode.canopen.lss import LssAddress
     from skinnode.cli._bus import Place
     from skinnode.technician.commission import Commissioned
-    from skinnode.wire.lss import LssAddress
 
 app = typer.Typer(help="Layer setting services: give nodes their node-ID and bit rate.", no_args_is_help=True)
 
@@ -31,7 +31,7 @@ def list_nodes(
     from skinnode.cli._console import console, print_json, progress, table
     from skinnode.technician.line import Line
     from skinnode.technician.survey import find_unconfigured
-    from skinnode.words import counted
+    from skinnode.text.words import counted
 
     found: list[tuple[str, LssAddress]] = []
     more = False
@@ -99,13 +99,13 @@ def set_node(
     A node that has a node-ID is reset to take the new one. Exit status 0 if all
     was done, 1 if the node did not store or boot, 2 if it could not be done.
     """
+    from skinnode.canopen import indices as od
+    from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
     from skinnode.errors import ConfigError, Shown
     from skinnode.technician.commission import commission, only_unconfigured
     from skinnode.technician.line import Line
-    from skinnode.wire import indices as od
-    from skinnode.wire.lss import BIT_RATES_BPS, LssAddress
 
     if node_id is None and bit_rate is None:
         raise ConfigError("--node-id, --bit-rate", None, "at least one of them")

@@ -14,7 +14,7 @@ import typer
 if TYPE_CHECKING:
     import threading
 
-    from skinnode.model.config import HandConfig
+    from skinnode.config import HandConfig
     from skinnode.monitor.source import Source
 
 _SIMULATED = 4
@@ -74,7 +74,7 @@ def monitor(
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise ConfigError("--output", output, "a folder; the first recording creates it")
     from skinnode.host import BringUpCancelled
-    from skinnode.signals import until_told
+    from skinnode.process.signals import until_told
 
     with until_told() as told, ExitStack() as stack:
         try:
@@ -122,7 +122,7 @@ def _require_screen() -> None:
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
     """The hand to run, missing patches waited for."""
     from skinnode.cli.demo import demo_hand
-    from skinnode.model.config import load_hand
+    from skinnode.config import load_hand
 
     if hand is not None:
         plan = load_hand(hand).on(interface, channel)
@@ -144,12 +144,12 @@ def _running(
 ) -> Source:
     """A host of that hand; ``stack`` ends it. Raises as :meth:`Host.from_config`."""
     from skinnode.cli._console import progress
+    from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
     from skinnode.host.pipeline import check_solvable
-    from skinnode.jit import is_cold
     from skinnode.monitor.source import HostSource
-    from skinnode.pauses import responsive_threads, short_pauses
-    from skinnode.words import counted
+    from skinnode.process.garbage_collection import responsive_threads, short_pauses
+    from skinnode.text.words import counted
 
     if not quiet:
         import skinnode.monitor.app  # noqa: F401  # while nothing has a deadline yet
@@ -196,8 +196,8 @@ def _show(source: Source, told: threading.Event, seconds: float | None, output: 
 
 def _print(source: Source, told: threading.Event, seconds: float | None) -> list[str]:
     """A line of JSON a second; what was wrong meanwhile. Raises the SkinError that ended the source."""
-    from skinnode.json_values import plain
     from skinnode.monitor.report import FaultBook, watch
+    from skinnode.text.json_values import plain
 
     faults = FaultBook()
     for line in watch(source, told, seconds, faults):

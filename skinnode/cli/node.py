@@ -16,7 +16,7 @@ import typer
 
 from skinnode.cli._layouts import HELP as LAYOUT_HELP
 from skinnode.cli._usage import Seconds
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from skinnode.node import FileMemory, NodeRunner
@@ -64,18 +64,18 @@ def node(
     failed, scans were skipped, frames not sent, another node had its node-ID or
     what --store names was of no use; 2 if it could not run.
     """
+    from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layouts import find_layout, import_from_here
+    from skinnode.config import BusConfig
     from skinnode.errors import ConfigError
-    from skinnode.model.config import BusConfig
+    from skinnode.files.output_file import require_writable
     from skinnode.node import NodeRunner, PatchNode
     from skinnode.node.clock import EXACT, THRIFTY
     from skinnode.node.find_source import make_source
-    from skinnode.output_file import require_writable
-    from skinnode.pauses import short_pauses
-    from skinnode.signals import until_told
+    from skinnode.process.garbage_collection import short_pauses
+    from skinnode.process.signals import until_told
+    from skinnode.protocol.profile import PatchProfile
     from skinnode.transport import CanPort
-    from skinnode.wire.lss import NOT_CONFIGURED
-    from skinnode.wire.profile import PatchProfile
 
     if node_id is None and store is None:
         raise ConfigError("--node-id", None, "1 to 127, or --store FILE and a node-ID that LSS stores there")
@@ -122,7 +122,7 @@ def node(
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
     """Yield the memory in ``store``, claimed for this process. Raises ConfigError if it cannot be claimed."""
     from skinnode.errors import ConfigError
-    from skinnode.file_lock import FileInUse, NotARegularFile
+    from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory import FileMemory
 
     if store is None:
@@ -148,7 +148,7 @@ def _memory(store: Path | None) -> Iterator[FileMemory | None]:
 
 def _who(node_id: int, given: int | None) -> str:
     """The node-ID in use: one that LSS has stored counts, not the one of --node-id."""
-    from skinnode.wire.lss import NOT_CONFIGURED
+    from skinnode.canopen.lss import NOT_CONFIGURED
 
     who = "node without a node-ID" if node_id == NOT_CONFIGURED else f"node {node_id}"
     return who if node_id == given or given is None else f"{who} (LSS stored it; not {given})"
@@ -174,7 +174,7 @@ class _Progress:
 
 
 def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
-    from skinnode.wire.lss import NOT_CONFIGURED
+    from skinnode.canopen.lss import NOT_CONFIGURED
 
     (board,) = runner.nodes
     return _Progress(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from skinnode.conformance.eds import EdsEntry
@@ -54,7 +54,7 @@ def od(
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
     from skinnode.errors import ConfigError
-    from skinnode.output_file import require_writable
+    from skinnode.files.output_file import require_writable
     from skinnode.technician.dcf import expected
     from skinnode.technician.dictionary import (
         compare,
@@ -167,9 +167,9 @@ def _write(remote: RemoteOd, entries: list[EdsEntry], text: str, as_hex: bool, n
 def _write_dcf(
     file: Path, readings: list[Reading], sheet: Sheet, node_id: int, bitrate: int, name: str
 ) -> None:
-    from skinnode.output_file import write_text
+    from skinnode.files.output_file import write_text
     from skinnode.technician.dcf import as_dcf
-    from skinnode.words import counted
+    from skinnode.text.words import counted
 
     made = as_dcf(sheet, readings, node_id, bitrate, name or f"node {node_id}")
     write_text("--dcf", file, made.text)

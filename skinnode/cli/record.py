@@ -14,10 +14,10 @@ import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
 from skinnode.cli._usage import Seconds
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 if TYPE_CHECKING:
-    from skinnode.model.config import HandConfig
+    from skinnode.config import HandConfig
     from skinnode.record import Recorder
 
 
@@ -52,9 +52,9 @@ def record(
     candump's tools. Exit status 1 if frames could not be written, or for what is a fault of `skinnode host`;
     2 if it could not run.
     """
-    from skinnode.model.config import load_hand
+    from skinnode.config import load_hand
+    from skinnode.process.signals import until_told
     from skinnode.record import Recorder
-    from skinnode.signals import until_told
 
     plan = load_hand(hand).on(interface, channel)
     with until_told() as told, Recorder(plan, output, kind) as recorder:

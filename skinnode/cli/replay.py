@@ -31,8 +31,8 @@ def replay(
     Exit status 1 if the recording is damaged, was not ended or lacks frames, or if what it holds lacks some:
     a scan torn or missed, a chunk or a summary lost; or has error frames. 2 if it cannot be read at all.
     """
+    from skinnode.process.signals import until_told
     from skinnode.record import replay as play
-    from skinnode.signals import until_told
 
     with until_told() as told:
         run = play(recording, speed=None if fast else speed, cancelled=told.is_set)

@@ -56,7 +56,7 @@ def scan(
 def _faults(found: Survey, place: Place) -> list[str]:
     """What is not as it should be, one line each."""
     from skinnode.technician.line import no_answer
-    from skinnode.words import known
+    from skinnode.text.words import known
 
     faults = [
         f"node {node.node_id}: two nodes have this node-ID: {node.duplicate}"
@@ -127,7 +127,7 @@ def _print(scans: list[tuple[Place, Survey]], faults: list[str]) -> None:
 
 def _print_bus(found: Survey, place: Place) -> None:
     from skinnode.cli._console import console, table
-    from skinnode.words import counted
+    from skinnode.text.words import counted
 
     out = console()
     if found.nodes:

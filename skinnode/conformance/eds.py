@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from skinnode.canopen.eds_encoding import MOST_EDS_BYTES, EdsText, for_people, octets, read_eds_text
+from skinnode.canopen.eds_form import check_form, no_eds
 from skinnode.errors import ProfileError, Shown
-from skinnode.input_file import read_input
-from skinnode.printable import printable
-from skinnode.wire.eds_encoding import MOST_EDS_BYTES, EdsText, for_people, octets, read_eds_text
-from skinnode.wire.eds_form import check_form, no_eds
+from skinnode.files.input_file import read_input
+from skinnode.text.printable import printable
 
 SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,

@@ -9,7 +9,7 @@ from typing import Final
 from skinnode.conformance.case import Result, Verdict
 from skinnode.conformance.report import summary_line
 from skinnode.conformance.run import Report
-from skinnode.printable import printable_lines
+from skinnode.text.printable import printable_lines
 
 AREA_NAMES: Final = {
     "EDS": "Data sheet",

@@ -11,8 +11,8 @@ from skinnode.conformance.bus import Failed, describe
 from skinnode.conformance.case import NotApplicable
 from skinnode.conformance.dut import Dut
 from skinnode.conformance.sdo import Aborted
+from skinnode.text.words import counted
 from skinnode.transport import Frame
-from skinnode.words import counted
 
 INVALID: Final = 1 << 31
 NO_REMOTE: Final = 1 << 30

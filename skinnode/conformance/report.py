@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 from skinnode.conformance.case import Case, Result, Verdict
 from skinnode.conformance.run import Report
-from skinnode.printable import printable_lines
-from skinnode.words import counted
+from skinnode.text.printable import printable_lines
+from skinnode.text.words import counted
 
 _ID_WIDTH = 9
 _VERDICT_WIDTH = 15

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.canopen import indices as od
 from skinnode.conformance.bus import Failed, Tester
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict, Warned
 from skinnode.conformance.configuration import read_configuration, write_back
@@ -14,9 +15,8 @@ from skinnode.conformance.dut import Dut
 from skinnode.conformance.eds import Eds, parse_eds
 from skinnode.conformance.sdo import SdoClient
 from skinnode.errors import BusError, ConfigError, NodeTimeout
+from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
-from skinnode.wire.profile import BusType, PatchProfile, eds_name, eds_text
 
 SILENT_CASES: Final = 3
 """Cases in a row before which the node does not come up; the others are then not run."""

@@ -11,8 +11,8 @@ from collections.abc import Collection
 from typing import Final
 
 from skinnode.conformance.bus import ANSWER_S, Failed, Tester, describe
+from skinnode.text.words import counted
 from skinnode.transport import Frame
-from skinnode.words import counted
 
 GENERAL_ERROR: Final = 0x0800_0000
 """A device may answer this in place of any more telling code."""

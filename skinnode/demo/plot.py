@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from skinnode.files.plot_file import save_figure
 from skinnode.model.layout import Float
-from skinnode.plot_file import save_figure
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,18 +16,18 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from skinnode import jit
 from skinnode.bench.score import EXCESS_LIMIT, Score, Scorer
+from skinnode.compiled import jit
+from skinnode.config import HandConfig, PatchConfig
 from skinnode.demo.plot import PatchTrace
 from skinnode.demo.view import BusView, PatchView, panels_in, render
 from skinnode.host import Host
 from skinnode.host.pipeline import LaneStats
-from skinnode.json_values import plain
-from skinnode.model.config import HandConfig, PatchConfig
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
-from skinnode.pauses import responsive_threads, short_pauses
-from skinnode.wire.codec import CodeScale
+from skinnode.process.garbage_collection import responsive_threads, short_pauses
+from skinnode.protocol.codec import CodeScale
+from skinnode.text.json_values import plain
 from vcan_sim.fleet import Fleet
 
 BITRATE_BPS: Final = 1_000_000

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
-from skinnode.child_processes import starting_children
+from skinnode.config import HandConfig
 from skinnode.errors import SkinError
-from skinnode.model.config import HandConfig
+from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
+from skinnode.config import MAX_BUS_LOAD
 from skinnode.doctor.facts import BusFacts, Finding, Sure
-from skinnode.model.config import MAX_BUS_LOAD
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
+from skinnode.canopen import indices as od
 from skinnode.doctor.facts import ScanFacts
+from skinnode.protocol.assembler import Scan, ScanAssembler
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import Frame
-from skinnode.wire import indices as od
-from skinnode.wire.assembler import Scan, ScanAssembler
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.profile import PatchProfile
 
 _MOST_SCANS: Final = 1000
 _MOST_SYNCS: Final = 100_000

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from skinnode.canopen.emergency import register_text
 from skinnode.doctor import bus, configuration, nodes, skin, timing
 from skinnode.doctor.facts import BusFacts, Finding, Sure
 from skinnode.doctor.quiet import LEAST_SCANS
 from skinnode.technician.line import no_answer
-from skinnode.wire.emergency import register_text
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 

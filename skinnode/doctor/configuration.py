@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from skinnode.canopen import indices as od
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
+from skinnode.protocol.profile import PatchProfile
 from skinnode.technician.pdo import Pdo
-from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile
 
 
 def check_configuration(bus: BusFacts) -> Iterator[Finding]:

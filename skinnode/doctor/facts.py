@@ -9,13 +9,13 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.model.config import PatchConfig
+from skinnode.canopen.lss import LssAddress
+from skinnode.config import PatchConfig
 from skinnode.model.layout import Float
+from skinnode.protocol.assembler import AssemblerStats
 from skinnode.technician.heard import Emergency
 from skinnode.technician.info import NodeInfo
 from skinnode.technician.survey import FoundNode
-from skinnode.wire.assembler import AssemblerStats
-from skinnode.wire.lss import LssAddress
 
 Counts = NDArray[np.int64]
 

@@ -13,20 +13,20 @@ from typing import Final, TypeVar
 
 import numpy as np
 
+from skinnode.bus_load.plan import SCAN_SHARE, inhibit_time_100us
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.doctor.capture import Capture
 from skinnode.doctor.facts import BusFacts, PatchFacts
 from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 from skinnode.technician.heard import Heard
 from skinnode.technician.info import read_info
 from skinnode.technician.line import Line
 from skinnode.technician.sheet import read_profile
 from skinnode.technician.survey import survey
-from skinnode.wire import indices as od
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.plan import SCAN_SHARE, inhibit_time_100us
-from skinnode.wire.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
 """Scans that noise is judged from: a standard deviation is then known to a tenth."""

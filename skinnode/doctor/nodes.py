@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
+from skinnode.canopen.emergency import error_text, register_text
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.technician.line import no_answer
-from skinnode.wire.emergency import error_text, register_text
-from skinnode.words import counted, known
+from skinnode.text.words import counted, known
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:

@@ -15,8 +15,8 @@ from skinnode.doctor.checks import not_judged, others
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts
 from skinnode.doctor.quiet import LEAST_SCANS, analyse
 from skinnode.model.layout import Float
-from skinnode.printable import printable_lines
-from skinnode.words import counted, known
+from skinnode.text.printable import printable_lines
+from skinnode.text.words import counted, known
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;

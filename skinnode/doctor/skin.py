@@ -13,8 +13,8 @@ import numpy as np
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, ScanFacts, Sure
 from skinnode.doctor.quiet import LEAST_SCANS, Mask, Quiet, analyse
 from skinnode.model.layout import Float
-from skinnode.wire.codec import TIME_WRAP_US
-from skinnode.words import counted
+from skinnode.protocol.codec import TIME_WRAP_US
+from skinnode.text.words import counted
 
 NOISY: Final = 5.0
 """Times the noise told above which a crossing is noisy: far beyond what 20 scans leave open."""

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from skinnode.doctor.facts import BusFacts, Finding, Sure
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 _JITTER: Final = 0.1
 """Share of the period that a SYNC may come early or late before somebody should know."""

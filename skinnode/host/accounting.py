@@ -6,8 +6,8 @@ from __future__ import annotations
 from skinnode.host.dealer import BusStats
 from skinnode.host.facade import HostStats
 from skinnode.host.pipeline import LaneStats
-from skinnode.wire.assembler import AssemblerStats
-from skinnode.words import counted
+from skinnode.protocol.assembler import AssemblerStats
+from skinnode.text.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:

@@ -14,17 +14,17 @@ from typing import Final
 
 import numpy as np
 
+from skinnode.bus_load.plan import inhibit_time_100us
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
 from skinnode.host.hand_files import load_baseline
 from skinnode.host.network import Abandoned, RemoteOd
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.wire import indices as od
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.coordinates import unpack_coordinates
-from skinnode.wire.plan import inhibit_time_100us
-from skinnode.wire.profile import PatchProfile
-from skinnode.words import counted
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.coordinates import unpack_coordinates
+from skinnode.protocol.profile import PatchProfile
+from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
 """How long a node may take to answer for the first time; controllers boot and tare within a second."""

@@ -30,8 +30,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.wire.assembler import Scan
-from skinnode.wire.codec import Codes, CodeScale, SummaryFlag
+from skinnode.protocol.assembler import Scan
+from skinnode.protocol.codec import Codes, CodeScale, SummaryFlag
 
 _CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 

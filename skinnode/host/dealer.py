@@ -11,13 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.bus_load.stuffing import load_kernels
+from skinnode.bus_load.timing import BusLoad
+from skinnode.config import BusConfig
 from skinnode.errors import CodecError
 from skinnode.host.containment import Defects
-from skinnode.model.config import BusConfig
 from skinnode.transport import Frame
 from skinnode.transport.bus_state import BusState, bus_state
-from skinnode.wire.stuffing import load_kernels
-from skinnode.wire.timing import BusLoad
 
 _log = logging.getLogger(__name__)
 

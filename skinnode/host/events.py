@@ -15,7 +15,7 @@ from typing import Final, Self
 from skinnode.host.containment import Defects, DefectStats, keep_on
 from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.host.publish import check_capacity
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 _log = logging.getLogger(__name__)
 

@@ -11,6 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from skinnode.bus_load.plan import check_plan
+from skinnode.bus_load.stuffing import load_kernels
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.errors import BusError, CodecError
 from skinnode.host import bringup
 from skinnode.host.callback import Callbacks, FieldCallback
@@ -35,12 +39,8 @@ from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
 from skinnode.host.tap import ContainedTap, HostTap, tap_bus, tap_link
 from skinnode.host.tare import TARE_DEADLINE_S, TARE_DEADLINE_SYNCS, tare
 from skinnode.host.workers import Workers
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
-from skinnode.wire.plan import check_plan
-from skinnode.wire.stuffing import load_kernels
 
 _log = logging.getLogger(__name__)
 

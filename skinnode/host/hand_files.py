@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.eds_encoding import MOST_EDS_BYTES, read_eds_text
+from skinnode.canopen.eds_form import check_form, no_eds
+from skinnode.config import HandConfig
 from skinnode.errors import ConfigError, ProfileError, Shown
-from skinnode.input_file import read_input
-from skinnode.model.config import HandConfig
+from skinnode.files.input_file import read_input
 from skinnode.model.layout import Float
-from skinnode.wire import indices as od
-from skinnode.wire.eds_encoding import MOST_EDS_BYTES, read_eds_text
-from skinnode.wire.eds_form import check_form, no_eds
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.profile import PatchProfile
 
 _LONGEST_SHOWN = 40
 

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.canopen.emergency import error_text, register_text, says_too_slow
+from skinnode.canopen.indices import emcy_cob_id, heartbeat_cob_id
 from skinnode.errors import CodecError
 from skinnode.host.code_watch import CodeWatch, WireFault
 from skinnode.transport.bus_state import BusState
-from skinnode.wire.emergency import error_text, register_text, says_too_slow
-from skinnode.wire.indices import emcy_cob_id, heartbeat_cob_id
 
 _log = logging.getLogger(__name__)
 

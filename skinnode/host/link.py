@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Final, Self
 
+from skinnode.canopen.indices import SYNC_COB_ID, sdo_response_cob_id
+from skinnode.config import BusConfig
 from skinnode.errors import BusError, CodecError, SkinError
 from skinnode.host.containment import Defects, Pause, keep_on, one_line
 from skinnode.host.dealer import BusStats, Dealer, Handler
 from skinnode.host.network import RemoteOd, SkinNetwork
-from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Intake
-from skinnode.wire.indices import SYNC_COB_ID, sdo_response_cob_id
 
 _log = logging.getLogger(__name__)
 

@@ -16,9 +16,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from skinnode.errors import BusError
-from skinnode.wire import indices as od
-from skinnode.wire.lss import (
+from skinnode.canopen import indices as od
+from skinnode.canopen.lss import (
     BIT_RATES_BPS,
     LSS_DONE,
     NOT_CONFIGURED,
@@ -27,6 +26,7 @@ from skinnode.wire.lss import (
     LssCommand,
     LssState,
 )
+from skinnode.errors import BusError
 
 ANSWER_S: Final = 0.1
 """How long an answer may take; the frame has the lowest priority but for heartbeats."""

@@ -17,11 +17,11 @@ import canopen
 from canopen.sdo.client import ReadableStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
+from skinnode.canopen.indices import DEVICE_TYPE
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host.containment import one_line
 from skinnode.host.sdo_streams import SEGMENT_BYTES, BlockDownload, BlockUpload, Client, Download
-from skinnode.wire.indices import DEVICE_TYPE
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
 """Tries of a transfer that was not answered or whose answer belongs to an earlier one."""

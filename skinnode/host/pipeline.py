@@ -18,19 +18,19 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from skinnode.config import Partial, PatchConfig, SolverConfig
 from skinnode.errors import ConfigError, SkinError
 from skinnode.host.bringup import NodeFacts
 from skinnode.host.containment import Defects, one_line
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
 from skinnode.host.workers import Inline, Workers
-from skinnode.model.config import Partial, PatchConfig, SolverConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
+from skinnode.protocol.assembler import AssemblerStats, Scan, ScanAssembler
+from skinnode.protocol.codec import Decoder, SummaryFlag, as_baseline
 from skinnode.solve.inputs import CodeMap
 from skinnode.solve.tracker import Tracker
-from skinnode.wire.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.wire.codec import Decoder, SummaryFlag, as_baseline
 
 _log = logging.getLogger(__name__)
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.config import HandConfig, PatchConfig
 from skinnode.host.code_watch import CodeWatch
 from skinnode.host.containment import Defects
 from skinnode.host.dealer import Dealer
@@ -16,11 +18,9 @@ from skinnode.host.rhythm import Rhythm
 from skinnode.host.rivals import Rivals
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline, Workers
-from skinnode.model.config import HandConfig, PatchConfig
-from skinnode.wire import indices as od
-from skinnode.wire.assembler import Scan, ScanAssembler
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.assembler import Scan, ScanAssembler
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import PatchProfile
 
 LEAST_GRACE_NS: Final = 5_000_000
 """How long a summary is waited for at least, when all chunks are there; half a period where that is longer.

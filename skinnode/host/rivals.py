@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.model.config import BusConfig
-from skinnode.wire import indices as od
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 
 _log = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import BlockDownloadStream, BlockUploadStream, SdoClient, WritableStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from skinnode.wire.indices import sdo_request_cob_id, sdo_response_cob_id
+from skinnode.canopen.indices import sdo_request_cob_id, sdo_response_cob_id
 
 SEGMENT_BYTES: Final = 7
 

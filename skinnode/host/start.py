@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from typing import Final
 
+from skinnode.config import Missing, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
 from skinnode.host import bringup
 from skinnode.host.health import OPERATIONAL
@@ -16,8 +17,7 @@ from skinnode.host.network import Abandoned
 from skinnode.host.pipeline import Solver
 from skinnode.host.station import Station
 from skinnode.host.supervisor import START_DEADLINE_S
-from skinnode.model.config import Missing, PatchConfig
-from skinnode.words import known
+from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
 """Nodes brought up at the same time; more would only queue for the bus."""

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.config import HandConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.bringup import Bringer, NodeFacts
@@ -16,10 +18,8 @@ from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.pipeline import Solver
 from skinnode.host.reception import PatchReception
-from skinnode.model.config import HandConfig, PatchConfig
-from skinnode.wire import indices as od
-from skinnode.wire.codec import pack_command
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.codec import pack_command
+from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
 """How long the mainline may take to do a small job; it turns fifty times a second unless its bus is away."""

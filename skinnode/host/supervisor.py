@@ -34,6 +34,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from skinnode.canopen import indices as od
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.containment import Defects, keep_on
@@ -41,8 +42,7 @@ from skinnode.host.health import HEARTBEATS_MISSED, OPERATIONAL, STOPPED
 from skinnode.host.network import Abandoned
 from skinnode.host.station import Station
 from skinnode.host.supervised import Joined, NodeStats, Phase, Supervised
-from skinnode.wire import indices as od
-from skinnode.words import known
+from skinnode.text.words import known
 
 _log = logging.getLogger(__name__)
 

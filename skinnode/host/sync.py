@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
+from skinnode.canopen.indices import SYNC_COB_ID
 from skinnode.errors import BusError
 from skinnode.host.containment import Defects, keep_on
-from skinnode.wire.indices import SYNC_COB_ID
 
 
 class Tick(NamedTuple):

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from skinnode.jit import njit, njit_part
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.compiled.simd import LANES, Lanes, fma, load, rough_inverse_root, splat, store
 from skinnode.model.layout import Float
-from skinnode.simd import LANES, Lanes, fma, load, rough_inverse_root, splat, store
 
 
 def lower_rows(lower: Float) -> Float:

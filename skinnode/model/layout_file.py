@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.errors import NOTHING, ConfigError, Shown
-from skinnode.input_file import read_input
+from skinnode.files.input_file import read_input
 from skinnode.model.layout import MOST_ELECTRODES, MOST_PAIRS, PatchLayout
 
 _ARRAYS = ("upper_m", "lower_m")

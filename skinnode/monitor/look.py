@@ -12,7 +12,7 @@ from rich.style import Style
 from skinnode.monitor.maps import Colours, Line
 from skinnode.monitor.source import Recording
 from skinnode.monitor.state import Level
-from skinnode.printable import printable
+from skinnode.text.printable import printable
 
 
 @dataclass(frozen=True, slots=True)

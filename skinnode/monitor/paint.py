@@ -13,7 +13,7 @@ from skinnode.monitor.maps import Line
 from skinnode.monitor.paint_patch import GONE, alone, facts, tiles
 from skinnode.monitor.state import BusView, LogLine, PatchView, View
 from skinnode.monitor.touches import Touch
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16

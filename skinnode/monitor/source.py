@@ -12,13 +12,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Protocol, Self
 
+from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.host import Host, PatchHealth
 from skinnode.host.dealer import BusStats
 from skinnode.host.events import Events, EventSubscription, HealthEvent, HealthWatch
 from skinnode.host.health import BusHealth
 from skinnode.host.pipeline import LaneStats
-from skinnode.model.config import HandConfig
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, Replay
 

@@ -11,17 +11,17 @@ from typing import Final, Literal
 
 import numpy as np
 
+from skinnode.canopen.emergency import register_text
+from skinnode.config import HandConfig, PatchConfig
+from skinnode.config.patches import LayoutConfig
 from skinnode.host.dealer import BusStats
 from skinnode.host.events import HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 from skinnode.host.pipeline import LaneStats
-from skinnode.model.config import HandConfig, PatchConfig
-from skinnode.model.config.patches import LayoutConfig
 from skinnode.model.layout import Float
 from skinnode.monitor.maps import Surface, mean_shear_m, surface_of
 from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
-from skinnode.wire.emergency import register_text
 
 Level = Literal["good", "note", "bad"]
 """How much it matters: all is well, worth a look, a fault."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
 from skinnode.node.source import ResistanceSource, read_source
-from skinnode.wire.codec import Codes, CodeScale, chunk_of_code, encode
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.codec import Codes, CodeScale, chunk_of_code, encode
+from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16
 """Readings averaged into a baseline: its noise, a quarter of a reading's, then adds 3 % to that of R/R0."""

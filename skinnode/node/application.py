@@ -14,8 +14,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.emergency import TOO_SLOW
 from skinnode.model.layout import PRESET_IDS, Float, PatchLayout
-from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.clock import NO_DEADLINE_NS, Pacing
 from skinnode.node.device import Services
@@ -25,8 +27,7 @@ from skinnode.node.od import ObjectStore
 from skinnode.node.self_test import self_test
 from skinnode.node.source import SourceFailed, SourceFault
 from skinnode.node.stream import OutgoingScan, ScanStream
-from skinnode.wire import indices as od
-from skinnode.wire.codec import (
+from skinnode.protocol.codec import (
     SELF_TEST_NEVER_RUN,
     Codes,
     SendMode,
@@ -35,9 +36,8 @@ from skinnode.wire.codec import (
     pack_scan,
     pack_self_test,
 )
-from skinnode.wire.coordinates import pack_coordinates
-from skinnode.wire.emergency import TOO_SLOW
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.coordinates import pack_coordinates
+from skinnode.protocol.profile import PatchProfile
 
 
 class PatchApplication:

@@ -13,12 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.dictionary import Object
+from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress
+from skinnode.canopen.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.lss import BitRateChange, LssSlave
 from skinnode.node.memory import Memory
-from skinnode.node.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.od import ObjectStore
 from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.node.rpdo import RpdoEngine
@@ -28,9 +31,6 @@ from skinnode.node.sync import Sync
 from skinnode.node.time_of_day import TimeConsumer
 from skinnode.node.tpdo import TpdoEngine
 from skinnode.transport.bus_state import BusState
-from skinnode.wire import indices as od
-from skinnode.wire.dictionary import Object
-from skinnode.wire.lss import NOT_CONFIGURED, LssAddress
 
 HARDWARE_VERSION: Final = "none"
 """A node in software has no board."""

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.errors import BusError
-from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
-from skinnode.wire import indices as od
 
 _WAITING: Final = 16
 """Messages kept while inhibit time, a stopped node or the bus hold them back; the oldest give way."""

@@ -10,15 +10,15 @@ import functools
 from collections.abc import Callable
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtState
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from skinnode.node.nmt import NmtState
 from skinnode.node.od import ObjectStore
 from skinnode.node.rejected import Rejected, RejectedFrames
-from skinnode.wire import indices as od
 
 Handler = Callable[[bytes, int], None]
 

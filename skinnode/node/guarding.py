@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtState
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyCode, EmcyProducer
-from skinnode.node.nmt import NmtState
 from skinnode.node.od import ObjectStore
-from skinnode.wire import indices as od
 
 _TOGGLE: Final = 0x80
 

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.nmt import NmtState
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyCode, EmcyProducer
-from skinnode.node.nmt import NmtState
 from skinnode.node.od import ObjectStore
-from skinnode.wire import indices as od
 
 _LAST_NODE: Final = 127
 _BOOTED: Final = 1

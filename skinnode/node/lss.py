@@ -12,8 +12,7 @@ import operator
 from collections.abc import Callable, Collection
 from typing import Final
 
-from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.wire.lss import (
+from skinnode.canopen.lss import (
     BIT_RATES_BPS,
     LSS_DONE,
     NOT_CONFIGURED,
@@ -22,6 +21,7 @@ from skinnode.wire.lss import (
     LssCommand,
     LssState,
 )
+from skinnode.node.clock import NO_DEADLINE_NS
 
 _CIA_301_TABLE: Final = 0
 

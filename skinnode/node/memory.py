@@ -19,10 +19,10 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
+from skinnode.canopen.lss import BIT_RATES_BPS, NOT_CONFIGURED
 from skinnode.errors import SkinError
-from skinnode.file_lock import lock_file
-from skinnode.whole_file import create_beside, discard, discard_leftovers, flush_folder
-from skinnode.wire.lss import BIT_RATES_BPS, NOT_CONFIGURED
+from skinnode.files.file_lock import lock_file
+from skinnode.files.whole_file import create_beside, discard, discard_leftovers, flush_folder
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24

@@ -13,8 +13,8 @@ from skinnode.node.device import CanopenDevice, Send, Services
 from skinnode.node.memory import Memory
 from skinnode.node.rejected import Rejected
 from skinnode.node.source import ResistanceSource
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.profile import PatchProfile, eds_name
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import PatchProfile, eds_name
 
 
 class PatchNode(CanopenDevice):

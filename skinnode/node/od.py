@@ -1,6 +1,6 @@
 """The object dictionary of a running node: the declarations of the profile, and the values.
 
-Declarations come from :mod:`skinnode.wire.profile`, the same that the EDS files are generated from. Values
+Declarations come from :mod:`skinnode.protocol.profile`, which also generates the EDS files. Values
 are the bytes that travel (little-endian), so that an SDO answer and a PDO are slices and a joined list. An
 object may be computed when it is read (:meth:`ObjectStore.bind`), may refuse a value
 (:meth:`ObjectStore.guard`) and may act on one that was accepted (:meth:`ObjectStore.watch`); a DOMAIN may be
@@ -13,8 +13,8 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final, NamedTuple
 
-from skinnode.node.abort import AbortCode, Refused
-from skinnode.wire.dictionary import DataType, Entry, Object, Value
+from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
 """Memory there is for a value whose length nothing limits."""
@@ -63,7 +63,7 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 class ObjectStore:
     """Values of all objects of one node.
 
-    ``read`` and ``write`` are a client's accesses and refuse with :class:`~skinnode.node.abort.Refused`;
+    ``read`` and ``write`` are a client's accesses and refuse with :class:`~skinnode.canopen.abort.Refused`;
     ``raw``,
     ``integer`` and ``put`` are the node's own, on objects it knows to exist.
     """

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.od import ObjectStore
-from skinnode.wire import indices as od
 
 INVALID_BIT: Final = od.PDO_INVALID
 NO_RTR_BIT: Final = 1 << 30

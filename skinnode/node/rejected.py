@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
+from skinnode.canopen import indices as od
 from skinnode.node.od import ObjectStore
-from skinnode.wire import indices as od
 
 _MOST: Final = 0xFFFF_FFFF
 

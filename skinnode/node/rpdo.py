@@ -11,7 +11,9 @@ from __future__ import annotations
 import contextlib
 import functools
 
-from skinnode.node.abort import Refused
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import Refused
+from skinnode.canopen.data_length import fd_length
 from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
@@ -19,8 +21,6 @@ from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import PdoRecords
 from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.node.sync import SyncWindow
-from skinnode.wire import indices as od
-from skinnode.wire.timing import fd_length
 
 
 class _Rpdo:

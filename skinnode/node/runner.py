@@ -9,13 +9,13 @@ from collections.abc import Iterable
 from types import TracebackType
 from typing import Final, Self
 
+from skinnode.canopen.lss import NOT_CONFIGURED
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.node import PatchNode
 from skinnode.transport.bus_state import BusState, bus_state
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
-from skinnode.wire.lss import NOT_CONFIGURED
 
 _IDLE_S: Final = 0.1
 """Longest wait for a frame: how soon the thread sees that it should end."""

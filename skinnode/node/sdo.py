@@ -11,7 +11,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
 from skinnode.node.sdo_block import BlockDownload, BlockUpload

@@ -12,8 +12,8 @@ import struct
 from enum import Enum, IntEnum, auto
 from typing import Final
 
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.errors import BusError
-from skinnode.node.abort import AbortCode, Refused
 from skinnode.node.sdo_transfer import MULTIPLEXER_U32, Channel, Incoming, Transfer
 
 SEGMENT_BYTES: Final = 7

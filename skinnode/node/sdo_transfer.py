@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.od import ObjectStore
 
 MULTIPLEXER: Final = struct.Struct("<BHB")

@@ -14,7 +14,7 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.node.acquisition import find_faults
 from skinnode.node.source import SourceFailed
-from skinnode.wire.codec import CodeScale, SelfTest, SelfTestFault, encode
+from skinnode.protocol.codec import CodeScale, SelfTest, SelfTestFault, encode
 
 READINGS: Final = 16
 """As many as a tare takes. The standard deviation of a crossing is then known to 18 % (1/√30), that of the

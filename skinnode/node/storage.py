@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.clock import Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.memory import Fault, Kept, Memory, MemoryFault, Parameters
 from skinnode.node.od import ObjectStore
-from skinnode.wire import indices as od
 
 COMMUNICATION: Final = 0x1000, 0x1FFF
 APPLICATION: Final = 0x2000, 0x9FFF

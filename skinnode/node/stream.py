@@ -29,11 +29,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.canopen import indices as od
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
 from skinnode.node.tpdo import Tpdo, TpdoEngine
-from skinnode.wire import indices as od
-from skinnode.wire.codec import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
+from skinnode.protocol.codec import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
 """Share of the sending time that may be lost before chunks count as held up; thread jitter stays below it."""

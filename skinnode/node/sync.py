@@ -6,13 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
 from skinnode.node.rejected import Rejected, RejectedFrames
-from skinnode.wire import indices as od
 
 PRODUCER_BIT: Final = 1 << 30
 """Of 0x1005: the device generates SYNC."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.clock import Clock
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
-from skinnode.wire import indices as od
 
 _CONSUMES: Final = 1 << 31
 _PRODUCES: Final = 1 << 30

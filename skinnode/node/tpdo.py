@@ -26,12 +26,12 @@ from bisect import bisect_left
 from collections.abc import Callable, Collection
 from typing import Protocol
 
+from skinnode.canopen import indices as od
 from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
 from skinnode.node.sync import SyncWindow
-from skinnode.wire import indices as od
 
 Send = Callable[[int, bytes], None]
 

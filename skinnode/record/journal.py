@@ -29,12 +29,12 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 
+from skinnode.config import BusConfig, HandConfig, PatchConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host.bringup import NodeFacts
-from skinnode.model.config import BusConfig, HandConfig, PatchConfig, parse_hand
 from skinnode.model.layout import PatchLayout
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import PatchProfile
 
 FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"

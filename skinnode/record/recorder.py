@@ -16,10 +16,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects, keep_on
 from skinnode.host.pipeline import Solver
-from skinnode.model.config import HandConfig
 from skinnode.record.journal import SUFFIX, Header, facts_table
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFrame, create

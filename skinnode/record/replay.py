@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from skinnode.canopen.indices import SYNC_COB_ID
+from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
 from skinnode.host.dealer import BusStats, Dealer
@@ -25,13 +27,11 @@ from skinnode.host.publish import Publisher
 from skinnode.host.reception import PatchReception, receive_bus, receive_patch
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline
-from skinnode.model.config import BusConfig
 from skinnode.model.frames import FieldFrame
 from skinnode.record.journal import SUFFIX, facts_of, read_journal
 from skinnode.record.recorder import channels
+from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
-from skinnode.wire.indices import SYNC_COB_ID
-from skinnode.words import counted
 
 LONGEST_SILENCE_S: Final = 60.0
 """A longer one is played as one of this length: it may be a damaged time."""

@@ -21,12 +21,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.jit import njit
+from skinnode.compiled.jit import njit
 from skinnode.model.forward import jacobian
 from skinnode.model.kernels import potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.linear import Index, dot, largest, lu_factor, lu_solve_transposed, padded
-from skinnode.solve.problem import PatchProblem
+from skinnode.solve.linalg.factorisations import Index, dot, largest, lu_factor, lu_solve_transposed, padded
+from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
 """ℓ. With 1.0 the guided start finds 3204 of the 3209 wires that are on the branch of the rest position, in

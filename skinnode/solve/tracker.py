@@ -19,12 +19,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.bundle import Bundle
+from skinnode.compiled.array_table import Bundle
 from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve import frame
 from skinnode.solve.branch import (
     AGREE,
     BLIND,
@@ -35,10 +34,11 @@ from skinnode.solve.branch import (
     folded_wires,
     wire_deviations,
 )
-from skinnode.solve.exact import ExactTracker
+from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
-from skinnode.solve.posterior import Posterior
-from skinnode.solve.problem import PatchProblem
+from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.wires import frame
+from skinnode.solve.wires.problem import PatchProblem
 
 METHODS: Final = ("auto", "exact", "posterior")
 EXACT_SHARE: Final = 0.0025

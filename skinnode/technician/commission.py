@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.lss import LssAddress
 from skinnode.errors import ConfigError
 from skinnode.host.lss import LssFailed
 from skinnode.technician.line import Line
 from skinnode.technician.survey import find_unconfigured
-from skinnode.wire import indices as od
-from skinnode.wire.lss import LssAddress
 
 BOOT_S: Final = 5.0
 """How long a node may take to boot at its new node-ID."""

@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.eds_encoding import for_people, octets, octets_text
 from skinnode.conformance.eds import Eds, EdsEntry
 from skinnode.technician.dictionary import NOT_CONFIGURATION, Reading
 from skinnode.technician.sheet import Sheet
-from skinnode.wire import indices as od
-from skinnode.wire.eds_encoding import for_people, octets, octets_text
 
 _BYTES_KEY: Final = ";ParameterBytes"
 _BYTES_LINE: Final = re.compile(r"^;(ParameterBytes=)", re.MULTILINE)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
+from skinnode.canopen import indices as od
 from skinnode.conformance.eds import SIGNED, UNSIGNED, Eds, EdsEntry, number
 from skinnode.errors import ConfigError, SdoAbort
 from skinnode.host.network import MOST_BYTES, RemoteOd
-from skinnode.printable import printable
 from skinnode.technician.standard import (
     SERIES,
     SINGLE,
@@ -20,7 +20,7 @@ from skinnode.technician.standard import (
     standard_entries,
     standard_entry,
 )
-from skinnode.wire import indices as od
+from skinnode.text.printable import printable
 
 Value = int | float | str
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from skinnode.canopen import indices as od
 from skinnode.transport import Frame
-from skinnode.wire import indices as od
 
 _KEPT: Final = 256
 """Messages of a kind and node that are kept: more than half a minute of heartbeats four times a second."""

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.emergency import history_text, register_text
 from skinnode.conformance.eds import Eds, parse_eds
 from skinnode.errors import NodeError, SdoAbort
 from skinnode.host.network import RemoteOd
 from skinnode.model.layout import PRESET_IDS, Float
-from skinnode.printable import printable
+from skinnode.protocol.codec import SelfTestFault, SelfTestStatus
+from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.technician.line import Line
 from skinnode.technician.pdo import Pdo, pdo_text, read_pdos
 from skinnode.technician.sheet import read_profile
-from skinnode.wire import indices as od
-from skinnode.wire.codec import SelfTestFault, SelfTestStatus
-from skinnode.wire.emergency import history_text, register_text
-from skinnode.wire.profile import PatchProfile, eds_text
-from skinnode.words import counted
+from skinnode.text.printable import printable
+from skinnode.text.words import counted
 
 
 @dataclass(frozen=True, slots=True)

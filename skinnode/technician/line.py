@@ -8,14 +8,14 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Final, NamedTuple, Self
 
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.mainline import Mainline
 from skinnode.host.network import RemoteOd
-from skinnode.model.config import BusConfig
 from skinnode.technician.heard import Beat, Heard
-from skinnode.wire import indices as od
 
 STATES: Final = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
 """NMT states as a heartbeat carries them (CiA 301, 7.2.8.3.2.2)."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from skinnode.canopen import indices as od
 from skinnode.technician.line import Line, State, state_name
-from skinnode.wire import indices as od
 
 FOLLOW_S: Final = 1.5
 """How long a node may take to say that it is in its new state, beyond its heartbeat period."""

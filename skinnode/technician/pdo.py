@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from skinnode.canopen import indices as od
 from skinnode.errors import SdoAbort
 from skinnode.host.network import RemoteOd
-from skinnode.wire import indices as od
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 Direction = Literal["TPDO", "RPDO"]
 

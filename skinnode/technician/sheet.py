@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+from skinnode.canopen import indices as od
 from skinnode.conformance.eds import Eds, parse_eds, parse_eds_file
 from skinnode.errors import ConfigError, NodeError, ProfileError, Shown
 from skinnode.host.network import RemoteOd
-from skinnode.wire import indices as od
-from skinnode.wire.profile import BusType, PatchProfile, eds_name, eds_text
+from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
 
 
 class Sheet(NamedTuple):
@@ -17,7 +17,7 @@ class Sheet(NamedTuple):
 
     eds: Eds
     text: str
-    """See :class:`~skinnode.wire.eds_encoding.EdsText`."""
+    """See :class:`~skinnode.canopen.eds_encoding.EdsText`."""
     codec: str = "utf-8"
     """Codec of its non-ASCII characters."""
     note: str = ""

@@ -11,11 +11,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.lss import LssAddress
 from skinnode.errors import NodeError
-from skinnode.printable import printable
 from skinnode.technician.line import Line
-from skinnode.wire import indices as od
-from skinnode.wire.lss import LssAddress
+from skinnode.text.printable import printable
 
 PACE_S: Final = 0.001
 """Between two questions: a sixth of a bus at 1 Mbit/s, so that PDOs under way are not held up."""

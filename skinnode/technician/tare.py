@@ -15,14 +15,14 @@ from typing import Final
 
 import numpy as np
 
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, SdoAbort
 from skinnode.host.network import RemoteOd
-from skinnode.model.config import BusConfig, PatchConfig
 from skinnode.model.layout import Float
+from skinnode.protocol.profile import PatchProfile
 from skinnode.technician.line import Line
 from skinnode.technician.sheet import read_profile
-from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile
 
 QUIET_S: Final = 0.3
 """Silence of a node's SDO channel that shows that no other client is in a transfer with it."""

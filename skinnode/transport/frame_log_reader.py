@@ -19,15 +19,14 @@ from typing import Final
 
 import can
 
+from skinnode.canopen.data_length import FD_LENGTHS
 from skinnode.errors import ConfigError
+from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
-from skinnode.words import counted
 
 DAMAGES_KEPT: Final = 100
 """Damages that are described; more are only counted."""
-
-_FD_LENGTHS: Final = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +203,7 @@ def _candump_frame(line: bytes) -> LoggedFrame | None:
         return None
     can_id = int(word, 16)
     data = b"" if digits is None else bytes.fromhex(digits.decode())
-    if (fd is None and len(data) > 8) or len(data) not in _FD_LENGTHS or (len(word) == 3 and can_id > 0x7FF):
+    if (fd is None and len(data) > 8) or len(data) not in FD_LENGTHS or (len(word) == 3 and can_id > 0x7FF):
         return None
     error = len(word) == 8 and bool(can_id & _ERROR_BIT)
     frame = Frame(

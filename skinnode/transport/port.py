@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import can
 
+from skinnode.canopen.data_length import fd_length
 from skinnode.errors import BusError
+from skinnode.text.words import counted
 from skinnode.transport.frame import Frame
 from skinnode.transport.socketcan import BATCH_FRAMES, SocketReader, set_link_bitrate
-from skinnode.wire.timing import fd_length
-from skinnode.words import counted
 
 if TYPE_CHECKING:
-    from skinnode.model.config import BusConfig
+    from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
 """Frames that wait in an endpoint of python-can's virtual bus, about 4 s of a full bus at 1 Mbit/s. Without a

@@ -19,7 +19,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.recvmmsg import MessageBatch
 
 if TYPE_CHECKING:
-    from skinnode.model.config import BusConfig
+    from skinnode.config import BusConfig
 
 _SO_RXQ_OVFL: Final = 40
 _SO_TIMESTAMPNS: Final = 35

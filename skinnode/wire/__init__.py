@@ -1,0 +1,1 @@
+"""Old paths of :mod:`skinnode.protocol`, for one version."""

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from skinnode.bench import path as _bench_path
 from skinnode.cli.bench import app
-from skinnode.solve.schedule import Uniform
+from skinnode.solve.paths.step_control import Uniform
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from skinnode import jit
 from skinnode.bench import soak_cache as _soak_cache
 from skinnode.bench.soak_starvation import starved_processor
 from skinnode.cli.bench import app
+from skinnode.compiled import jit
 from skinnode.host.pipeline import Lane
 from skinnode.host.publish import Publisher
 from skinnode.model.frames import FieldFrame

@@ -16,9 +16,9 @@ import pytest
 
 from skinnode.cli.main import main
 from skinnode.errors import ConfigError
-from skinnode.input_file import read_input
+from skinnode.files.input_file import read_input
+from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.record.journal import read_journal
-from skinnode.wire.profile import PatchProfile, eds_text
 from vcan_sim.cli import main as simulate
 
 EDS = (

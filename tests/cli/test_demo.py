@@ -13,9 +13,9 @@ import pytest
 from rich.console import Console
 
 from skinnode.cli.demo import demo_hand
+from skinnode.config import HandConfig
 from skinnode.demo import run as _demo
 from skinnode.demo.view import BusView, PatchView, render
-from skinnode.model.config import HandConfig
 from skinnode.model.layout import Float
 from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet

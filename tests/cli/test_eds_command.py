@@ -1,4 +1,4 @@
-"""``skinnode eds`` as its user meets it; what is in the files is held in tests/wire."""
+"""``skinnode eds`` as its user meets it; what is in the files is tested in tests/protocol."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from skinnode.cli.main import main
-from skinnode.wire.profile import PatchProfile, dcf_text, eds_text
+from skinnode.protocol.profile import PatchProfile, dcf_text, eds_text
 
 
 def run(*arguments: str) -> int:

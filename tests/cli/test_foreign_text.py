@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 import typer
 
+from skinnode.canopen import indices as od
 from skinnode.cli.main import app, main
-from skinnode.model.config import BusConfig
+from skinnode.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.node import NodeRunner, PatchNode, VolatileMemory
-from skinnode.printable import PrintableStream, printable
+from skinnode.text.printable import PrintableStream, printable
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
 from vcan_sim.cli import main as simulate
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\x9b31m<script>alert(1)</script>[bold]:bomb:\r\nforged: \x7f"
@@ -87,7 +87,7 @@ class Place:
         return self.file("broken.toml", f'name = "{_toml(WORSE[:-1])}"\n"{_toml(WORSE[:-1])}" = 1\n')
 
     def eds(self) -> str:
-        from skinnode.wire.profile import PatchProfile, eds_text
+        from skinnode.protocol.profile import PatchProfile, eds_text
 
         text = eds_text(PatchProfile.from_layout(PatchLayout.preset("staggered", **LAYOUT)))
         name = EVIL.replace("\r", " ").replace("\n", " ")

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from skinnode.bus_load.plan import check_plan
 from skinnode.cli.main import app
+from skinnode.config import HandConfig, load_hand, parse_hand
+from skinnode.config.schema import SCHEMA_FILE, schema_text
 from skinnode.errors import ConfigError
-from skinnode.model.config import HandConfig, load_hand, parse_hand
-from skinnode.model.config.schema import SCHEMA_FILE, schema_text
-from skinnode.wire.plan import check_plan
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 
@@ -178,7 +178,7 @@ def test_schema_is_the_one_that_is_shipped() -> None:
     printed = command("schema").stdout
     assert printed == schema_text()
     assert json.loads(SCHEMA_FILE.read_text(encoding="utf-8")) == json.loads(printed), (
-        "python -m skinnode.model.config.schema writes it again"
+        "python -m skinnode.config.schema writes it again"
     )
 
 

@@ -14,8 +14,8 @@ from skinnode.cli._bus import Place
 from skinnode.cli._usage import run
 from skinnode.cli.main import app
 from skinnode.cli.scan import _faults
+from skinnode.config import load_hand
 from skinnode.errors import ConfigError
-from skinnode.model.config import load_hand
 from skinnode.technician.survey import FoundNode, Survey
 from vcan_sim.cli import app as simulator
 from vcan_sim.fleet import Fleet

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from skinnode.cli.node import _memory
+from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
-from skinnode.model.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.node.find_source import GROUP, load, make_source

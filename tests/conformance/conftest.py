@@ -8,13 +8,13 @@ from contextlib import contextmanager
 
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.conformance import Dut, connect
-from skinnode.model.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode, VolatileMemory
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
-from skinnode.wire.profile import PatchProfile
 
 NODE_ID = 4
 

@@ -13,7 +13,7 @@ import pytest
 
 from skinnode.cli.main import main
 from skinnode.conformance import CASES
-from skinnode.wire.profile import PatchProfile, eds_text
+from skinnode.protocol.profile import PatchProfile, eds_text
 
 from .conftest import NODE_ID, patch_on
 

@@ -137,8 +137,8 @@ def test_the_phase_of_a_cyclic_tpdo_is_the_devices_own(monkeypatch: pytest.Monke
 
 def test_a_node_that_starts_by_itself_fails_where_that_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
     """And nowhere else: the other cases put it into PRE-OPERATIONAL first."""
+    from skinnode.canopen.nmt import NmtState
     from skinnode.node.device import CanopenDevice
-    from skinnode.node.nmt import NmtState
 
     reset = CanopenDevice._reset
 

@@ -9,9 +9,9 @@ import can
 import canopen
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.conformance import Dut, Verdict, connect, parse_eds, run_cases, select
 from skinnode.errors import ConfigError, ProfileError
-from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort
 
 NODE_ID = 0x21

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import skinnode
-from skinnode.model.config import HandConfig
-from skinnode.wire.profile import REFERENCE_PROFILES
+from skinnode.config import HandConfig
+from skinnode.protocol.profile import REFERENCE_PROFILES
 
 from .blocks import PAGES, REPOSITORY
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from skinnode.model.config import BusConfig, HandConfig, parse_hand
+from skinnode.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float
 from skinnode.node import NodeRunner, PatchNode
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort, Frame
-from skinnode.wire.profile import PatchProfile
 from vcan_sim.fleet import Fleet
 
 SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}

@@ -10,7 +10,7 @@ import pytest
 from skinnode.host.pipeline import Solver
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
-from skinnode.wire.assembler import Scan
+from skinnode.protocol.assembler import Scan
 from vcan_sim.sensor import SimulatedPatch
 
 STEP = 1.0 / 65532

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.host.accounting import discrepancies
 from skinnode.host.dealer import Dealer
 from skinnode.host.pipeline import LaneStats
-from skinnode.model.config import BusConfig
 from skinnode.transport import Frame
 
 BUS = {"read": 31, "received": 20, "ignored": 5, "error_frames": 3, "dropped": 2, "waiting": 1}

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import NodeTimeout
 from skinnode.host import Condition, Host
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.transport import CanPort
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet

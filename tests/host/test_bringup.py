@@ -12,17 +12,17 @@ from typing import Any
 
 import pytest
 
+from skinnode.canopen.nmt import NmtState
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout, ProfileError, SdoAbort
 from skinnode.host import BringUpCancelled, Host
 from skinnode.host.hand_files import check_eds
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node.nmt import NmtState
 from skinnode.node.node import PatchNode
 from skinnode.node.runner import NodeRunner
+from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.transport import CanPort
-from skinnode.wire.profile import PatchProfile, eds_text
 from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, eventually, heard

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skinnode.config import SimulationConfig
 from skinnode.host.code_watch import CodeWatch, WireFault, WireState
-from skinnode.model.config import SimulationConfig
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.wire.assembler import Scan
-from skinnode.wire.codec import CodeScale, SummaryFlag, encode
+from skinnode.protocol.assembler import Scan
+from skinnode.protocol.codec import CodeScale, SummaryFlag, encode
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 

@@ -12,7 +12,9 @@ from typing import Any
 
 import pytest
 
+from skinnode.bus_load.timing import BusLoad
 from skinnode.cli.host import faults_of
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import SkinError
 from skinnode.host import Condition, Host, containment
 from skinnode.host.code_watch import CodeWatch
@@ -22,12 +24,10 @@ from skinnode.host.health import NodeMonitor
 from skinnode.host.pipeline import Solver
 from skinnode.host.station import Station
 from skinnode.host.supervisor import Supervisor
-from skinnode.model.config import HandConfig, parse_hand
+from skinnode.protocol.assembler import ScanAssembler
 from skinnode.record import Recorder
 from skinnode.transport import CanPort, Frame
 from skinnode.transport.receiver import Intake, Receiver
-from skinnode.wire.assembler import ScanAssembler
-from skinnode.wire.timing import BusLoad
 
 from .conftest import SMALL, Rack, eventually
 

@@ -9,10 +9,10 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.errors import NodeError
 from skinnode.host import Condition, Host
 from skinnode.host.network import Abandoned, RemoteOd, SkinNetwork
-from skinnode.model.config import HandConfig
 from skinnode.transport import CanPort
 
 from .conftest import Rack, eventually

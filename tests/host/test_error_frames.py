@@ -6,10 +6,10 @@ import can
 import pytest
 
 from skinnode.cli.host import faults_of
+from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Host
 from skinnode.host.accounting import discrepancies, losses_of_bus
 from skinnode.host.dealer import Dealer
-from skinnode.model.config import BusConfig, HandConfig
 from skinnode.transport import Frame
 from vcan_sim.fleet import Fleet
 

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Condition, Host
 from skinnode.host.accounting import discrepancies
-from skinnode.model.config import BusConfig, HandConfig
-from skinnode.wire.assembler import AssemblerStats
+from skinnode.protocol.assembler import AssemblerStats
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
 

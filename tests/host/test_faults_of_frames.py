@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.host import Condition, Host
 from skinnode.host.accounting import discrepancies, losses_of_lane
 from skinnode.host.facade import HostStats
 from skinnode.host.pipeline import LaneStats
-from skinnode.model.config import HandConfig
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
 

@@ -9,10 +9,10 @@ from contextlib import ExitStack
 
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.host import Condition, Host, bringup
 from skinnode.host.accounting import discrepancies
 from skinnode.host.events import EventSubscription, HealthEvent
-from skinnode.model.config import HandConfig
 from skinnode.transport import CanPort
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.fleet import Fleet

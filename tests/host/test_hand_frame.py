@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skinnode.config import HandConfig, parse_hand
 from skinnode.host import Condition, HandFrame, Host
 from skinnode.host.hand_frame import LATE, OVERTAKEN, HandGatherer, HandSubscription
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.node import NmtState
 from skinnode.transport import CanPort

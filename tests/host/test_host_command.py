@@ -20,8 +20,8 @@ import pytest
 
 from skinnode.cli.host import left, operational, verdict
 from skinnode.cli.main import main
+from skinnode.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.host import Host
-from skinnode.model.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.transport import CanPort
 from skinnode.transport.receiver import drain
 from vcan_sim.command import _too_slow

@@ -19,11 +19,11 @@ from typing import Any, Final
 
 import pytest
 
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, SkinError
 from skinnode.host import Host, supervisor
 from skinnode.host.containment import Defects
 from skinnode.host.sdo_streams import Client
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.record import Recorder
 from skinnode.transport import CanPort, Frame
 

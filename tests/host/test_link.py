@@ -10,16 +10,16 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
+from skinnode.bus_load.timing import exact_bits
+from skinnode.config import BusConfig, HandConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host import containment
 from skinnode.host.containment import Defects
 from skinnode.host.dealer import Dealer
 from skinnode.host.link import BusLink
 from skinnode.host.mainline import Mainline
-from skinnode.model.config import BusConfig, HandConfig
 from skinnode.transport import CanPort, Frame
 from skinnode.transport.receiver import GATHER_NS
-from skinnode.wire.timing import exact_bits
 
 from .conftest import eventually
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from skinnode.canopen import indices as od
+from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress, LssCommand
 from skinnode.host.lss import ANSWER_S, LssFailed, LssMaster
 from skinnode.node.lss import LssSlave
-from skinnode.wire import indices as od
-from skinnode.wire.lss import NOT_CONFIGURED, LssAddress, LssCommand
 
 LATE_S = 1.5 * ANSWER_S
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.host import Host
-from skinnode.model.config import HandConfig
 from vcan_sim.fleet import Fleet
 
 from .conftest import eventually

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.host.bringup import NodeFacts
 from skinnode.host.containment import Defects
@@ -18,14 +19,12 @@ from skinnode.host.pipeline import Lane, Solver
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Inline, Job, OnError, Workers
-from skinnode.model.config import HandConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.tracker import Tracker
-from skinnode.wire.assembler import Scan, ScanAssembler
-from skinnode.wire.codec import (
+from skinnode.protocol.assembler import Scan, ScanAssembler
+from skinnode.protocol.codec import (
     CodeScale,
     SummaryFlag,
     check_of_codes,
@@ -34,7 +33,8 @@ from skinnode.wire.codec import (
     pack_scan,
     pack_summary,
 )
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.profile import PatchProfile
+from skinnode.solve.tracker import Tracker
 
 from .conftest import SMALL, eventually
 

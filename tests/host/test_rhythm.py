@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skinnode.config import HandConfig
 from skinnode.host.dealer import Dealer
 from skinnode.host.publish import Publisher
 from skinnode.host.reception import receive_patch
 from skinnode.host.rhythm import APART_NS, MOST, REMEMBERED, Rhythm
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Inline
-from skinnode.model.config import HandConfig
 
 PERIOD_NS = 50_000_000
 

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from skinnode.cli.host import faults_of
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError, NodeError
 from skinnode.host import Condition, Host
 from skinnode.host.accounting import discrepancies
 from skinnode.host.sync import SyncProducer, Ticks
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
-from skinnode.wire.profile import PatchProfile
 
 from .conftest import SMALL, Rack, eventually, heard
 from .test_supervisor import scans, take

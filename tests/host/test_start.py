@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from skinnode.config import BringUpConfig, HandConfig, Missing
 from skinnode.errors import NodeError, NodeTimeout
 from skinnode.host import Host, start
 from skinnode.host.pipeline import Solver
 from skinnode.host.station import Station
-from skinnode.model.config import BringUpConfig, HandConfig, Missing
 
 from .conftest import Rack, eventually
 

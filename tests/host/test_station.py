@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import pytest
 
+from skinnode.canopen.indices import LSS_REQUEST_COB_ID
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, NodeError
 from skinnode.host import Condition, Host
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.transport import CanPort
-from skinnode.wire.indices import LSS_REQUEST_COB_ID
 
 from .conftest import Rack, eventually, heard
 

@@ -16,16 +16,16 @@ import can
 import numpy as np
 import pytest
 
+from skinnode.canopen.nmt import NmtState
+from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Condition, Host, Subscription
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp
 from skinnode.model.layout import Float
 from skinnode.node import NodeRunner, PatchNode
-from skinnode.node.nmt import NmtState
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
-from skinnode.wire.profile import PatchProfile
 from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, Rack, eventually, heard

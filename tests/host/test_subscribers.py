@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.errors import BusError, NodeTimeout
 from skinnode.host import Host
 from skinnode.host.publish import Publisher
-from skinnode.model.config import HandConfig
 from skinnode.model.frames import FieldFrame, SolveStats
 from vcan_sim.fleet import Fleet
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.config import HandConfig, parse_hand
 from skinnode.host import Condition, Host, Subscription
-from skinnode.model.config import HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import PatchLayout

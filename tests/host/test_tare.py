@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.errors import NodeError, NodeTimeout
 from skinnode.host import Host
 from skinnode.host.bringup import Bringer
-from skinnode.model.config import HandConfig
 from skinnode.record import Recorder
 from skinnode.transport import CanPort
 

@@ -16,14 +16,14 @@ from typing import Any
 import pytest
 from textual.pilot import Pilot
 
-from skinnode.model.config import HandConfig, parse_hand
+from skinnode.config import HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float
 from skinnode.monitor.app import MonitorApp
 from skinnode.monitor.source import Source
 from skinnode.node import NodeRunner, PatchNode
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
-from skinnode.wire.profile import PatchProfile
 
 SMALL = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from skinnode.config import HandConfig
 from skinnode.host import Host
-from skinnode.model.config import HandConfig
 from skinnode.record import Recorder, replay
 from vcan_sim.fleet import Fleet
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from skinnode.model.config import HandConfig
+from skinnode.config import HandConfig
 from skinnode.node import NmtState
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet

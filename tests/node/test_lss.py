@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skinnode.canopen.lss import LssAddress, LssState
 from skinnode.node.lss import LssSlave
-from skinnode.wire.lss import LssAddress, LssState
 
 ADDRESS = LssAddress(0x0000_0360, 0x534B_494E, 0x0001_0000, 0x0102_0304)
 SELECT = (

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinnode.file_lock import FileInUse
+from skinnode.files.file_lock import FileInUse
 from skinnode.node.memory import (
     Fault,
     FileMemory,

@@ -12,8 +12,8 @@ import pytest
 from canopen.objectdictionary import ODVariable, datatypes, eds
 
 from skinnode.model.layout import PatchLayout
-from skinnode.wire.coordinates import pack_coordinates
-from skinnode.wire.profile import PatchProfile, eds_text
+from skinnode.protocol.coordinates import pack_coordinates
+from skinnode.protocol.profile import PatchProfile, eds_text
 
 COMPUTED = {0x1010, 0x1011}  # says 0, cannot store, whatever the EDS of the finished device promises
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skinnode.canopen.communication import communication_objects
 from skinnode.errors import BusError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
@@ -13,7 +14,6 @@ from skinnode.node import NmtState
 from skinnode.node.emcy import EmcyCode, EmcyProducer
 from skinnode.node.od import ObjectStore
 from skinnode.transport.bus_state import BusState
-from skinnode.wire.communication import communication_objects
 
 
 def test_open_wire_is_told_once_and_its_end_too(operational) -> None:

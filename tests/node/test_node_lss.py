@@ -16,12 +16,12 @@ import canopen.lss
 import numpy as np
 import pytest
 
-from skinnode.model.config import BusConfig
+from skinnode.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NOT_CONFIGURED, FileMemory, NmtState, NodeRunner, PatchNode, VolatileMemory
 from skinnode.node.memory import Kept
+from skinnode.protocol.profile import eds_text
 from skinnode.transport import CanPort
-from skinnode.wire.profile import eds_text
 
 MS = 1_000_000
 ON, OFF = "04 01 00 00 00 00 00 00", "04 00 00 00 00 00 00 00"

@@ -6,10 +6,10 @@ import struct
 
 import pytest
 
-from skinnode.node.abort import AbortCode, Refused
+from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 from skinnode.node.od import MAX_BYTES, ObjectStore
 from skinnode.node.sdo import SdoServer
-from skinnode.wire.dictionary import DataType, Entry, Object, ObjectType
 
 INDEX = 0x2000
 WRITE_ONLY, READ_ONLY, NO_SUBINDEX = "01 00 01 06", "02 00 01 06", "11 00 09 06"

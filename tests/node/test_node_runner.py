@@ -12,14 +12,14 @@ import canopen
 import numpy as np
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, NodeRunner, PatchNode
 from skinnode.node.clock import THRIFTY
+from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.transport import CanPort
 from skinnode.transport.frame import Frame
-from skinnode.wire.profile import PatchProfile, eds_text
 
 WAIT_S = 5.0
 

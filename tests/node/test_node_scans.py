@@ -11,8 +11,8 @@ import pytest
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.node import THRIFTY, Pacing
-from skinnode.wire.codec import CodeScale, encode
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.codec import CodeScale, encode
+from skinnode.protocol.profile import PatchProfile
 
 from ..scan_crc import check_of_scan
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from skinnode.model.layout import PatchLayout
-from skinnode.wire.coordinates import pack_coordinates
+from skinnode.protocol.coordinates import pack_coordinates
 
 MS = 1_000_000
 TIMED_OUT = "00 00 04 05"

@@ -16,12 +16,12 @@ import canopen
 import numpy as np
 import pytest
 
-from skinnode.model.config import BusConfig
+from skinnode.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode
+from skinnode.protocol.coordinates import pack_coordinates
+from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.transport import CanPort
-from skinnode.wire.coordinates import pack_coordinates
-from skinnode.wire.profile import PatchProfile, eds_text
 
 WAIT_S = 5.0
 LAYOUT = PatchLayout.preset("staggered")  # 10 × 30: 300 R0, 4800 bytes of coordinates

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
 from skinnode.node.sdo import SdoServer
-from skinnode.wire.dictionary import DataType, Entry, Object, ObjectType
 
 INDEX = 0x2301
 START_NS = 10**9

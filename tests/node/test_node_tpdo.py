@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.profile import PatchProfile
 
 PDO = 0x384  # TPDO3, spare from the start
 COUNTER = 0x2011_0108  # scan counter of the summary, a byte that changes with every scan

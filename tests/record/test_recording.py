@@ -16,9 +16,9 @@ import pytest
 from typer.testing import CliRunner
 
 from skinnode.cli.main import app
+from skinnode.config import BusConfig, HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError
 from skinnode.host import Host
-from skinnode.model.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, replay
 from skinnode.transport import CanPort

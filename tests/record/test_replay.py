@@ -21,9 +21,9 @@ from typer.testing import CliRunner
 
 from skinnode.cli._contacts import contact_tables
 from skinnode.cli.main import app
+from skinnode.config import HandConfig, load_hand, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host import Host
-from skinnode.model.config import HandConfig, load_hand, parse_hand
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, replay
 from skinnode.transport.frame import Frame
@@ -130,7 +130,7 @@ def test_python_can_reads_what_was_written(tmp_path: Path) -> None:
 CHILD = """
 import sys, time
 from skinnode.transport.frame import Frame
-from skinnode.model.config import parse_hand
+from skinnode.config import parse_hand
 from skinnode.record import Recorder
 hand = parse_hand({"buses": [{}], "patches": [{"name": "p", "node_id": 5}]})
 recorder = Recorder(hand, sys.argv[1])
@@ -213,7 +213,7 @@ def test_whatever_is_in_a_file_nothing_is_raised(tmp_path: Path, suffix: str, da
 FULL = """
 import resource, sys, time
 from skinnode.transport.frame import Frame
-from skinnode.model.config import parse_hand
+from skinnode.config import parse_hand
 from skinnode.record import Recorder
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 hand = parse_hand({"buses": [{}], "patches": [{"name": "p", "node_id": 5}]})

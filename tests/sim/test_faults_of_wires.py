@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skinnode.config import parse_hand
 from skinnode.errors import ConfigError
-from skinnode.model.config import parse_hand
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, Faults, faults_of
 from vcan_sim.faulty_node import WIRE_NOISE, FaultyNode
 from vcan_sim.fleet import Fleet

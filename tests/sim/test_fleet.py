@@ -10,12 +10,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from skinnode.config import BusConfig, HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError
-from skinnode.model.config import BusConfig, HandConfig, parse_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.node import NmtState
+from skinnode.protocol.codec import CodeScale, encode, restore_time_us, unpack_chunk, unpack_summary
 from skinnode.transport import CanPort, Frame
-from skinnode.wire.codec import CodeScale, encode, restore_time_us, unpack_chunk, unpack_summary
 from vcan_sim.fleet import Fleet
 
 SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from skinnode.model.config import SimulationConfig
+from skinnode.config import SimulationConfig
 from skinnode.model.layout import PatchLayout
 from vcan_sim.scene import LEAD_S, Scene
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from skinnode.model.config import SimulationConfig
+from skinnode.config import SimulationConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from vcan_sim.scene import Scene

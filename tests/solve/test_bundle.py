@@ -7,8 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.bundle import Bundle, byte_matrix, code_matrix, cube, fixed_cube, int_vector, matrix, vector
-from skinnode.jit import njit
+from skinnode.compiled.array_table import (
+    Bundle,
+    byte_matrix,
+    code_matrix,
+    cube,
+    fixed_cube,
+    int_vector,
+    matrix,
+    vector,
+)
+from skinnode.compiled.jit import njit
 
 
 @njit

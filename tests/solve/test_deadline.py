@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import skinnode as sk
-from skinnode.solve import exact, patch_stream, wires
-from skinnode.solve.exact import ExactTracker
-from skinnode.solve.patch_solver import TAKE, PatchSolver
+from skinnode.solve.exact import patch_stream
+from skinnode.solve.exact import tracker as exact
+from skinnode.solve.exact.tracker import ExactTracker
+from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires.patch_solver import TAKE, PatchSolver
 
 from .press import dent, frame_ohm, hertz_press
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skinnode as sk
-from skinnode.solve import patch_stream
-from skinnode.solve.exact import ExactTracker
+from skinnode.solve.exact import patch_stream
+from skinnode.solve.exact.tracker import ExactTracker
 
 from .press import HI, LO, STEPS, frame_ohm, hertz_press, noisy, quantised
 

@@ -14,11 +14,11 @@ import pytest
 from scipy.optimize import least_squares
 
 import skinnode as sk
-from skinnode.solve import innovation
-from skinnode.solve.dense import cholesky
-from skinnode.solve.estimate import PRIOR_DOUBT, SMOOTH_SHARE, Data, Estimator
-from skinnode.solve.prior import ElasticPrior
-from skinnode.solve.problem import PatchProblem
+from skinnode.solve.linalg.cholesky import cholesky
+from skinnode.solve.posterior import innovation
+from skinnode.solve.posterior.estimate import PRIOR_DOUBT, SMOOTH_SHARE, Data, Estimator
+from skinnode.solve.posterior.prior import ElasticPrior
+from skinnode.solve.wires.problem import PatchProblem
 
 from .press import frame_ohm, hertz_press
 

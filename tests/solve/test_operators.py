@@ -9,8 +9,17 @@ from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 from scipy.optimize import minimize_scalar
 
-from skinnode.solve import operators
-from skinnode.solve.operators import EPS, LAM, LEVENBERG_MARQUARDT, LIMIT, RADIUS, REJECTED, TRY, workspace
+from skinnode.solve.operators import steps as operators
+from skinnode.solve.operators.steps import (
+    EPS,
+    LAM,
+    LEVENBERG_MARQUARDT,
+    LIMIT,
+    RADIUS,
+    REJECTED,
+    TRY,
+    workspace,
+)
 
 DOGLEG = operators.OPERATORS["dogleg"]
 

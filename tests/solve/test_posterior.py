@@ -17,7 +17,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.model.elastic import HertzContact, Rubber
-from skinnode.solve import estimate, posterior
+from skinnode.solve.posterior import estimate, posterior
 
 from .press import frame_ohm, hertz_press
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import skinnode as sk
-from skinnode.solve.problem import PatchProblem
-from skinnode.solve.schedule import shortest_cycle
-from skinnode.solve.walk import Walk
+from skinnode.solve.paths.path_tracker import Walk
+from skinnode.solve.paths.step_control import shortest_cycle
+from skinnode.solve.wires.problem import PatchProblem
 
 from .press import frame_ohm, hertz_press
 

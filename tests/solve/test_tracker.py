@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import skinnode as sk
 from skinnode.model.elastic import Rubber
-from skinnode.solve.exact import ExactTracker
+from skinnode.protocol.codec import MISSING, CodeScale, as_baseline, decode, encode
+from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
-from skinnode.wire.codec import MISSING, CodeScale, as_baseline, decode, encode
 
 from .press import frame_ohm, hertz_press
 

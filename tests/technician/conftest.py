@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from skinnode.model.config import BusConfig
+from skinnode.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode, VolatileMemory

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from skinnode.canopen import indices as od
 from skinnode.doctor.facts import BusFacts, PatchFacts, ScanFacts
+from skinnode.protocol.assembler import AssemblerStats, ScanAssembler
+from skinnode.protocol.profile import PatchProfile
 from skinnode.technician.survey import FoundNode
-from skinnode.wire import indices as od
-from skinnode.wire.assembler import AssemblerStats, ScanAssembler
-from skinnode.wire.profile import PatchProfile
 
 NO_LOSS = ScanAssembler(PatchProfile(4, 12, 4, 4)).stats
 STEP = 1.0 / ((1 << 16) - 4)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from skinnode.doctor.capture import Capture
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import Frame
-from skinnode.wire.codec import CodeScale
-from skinnode.wire.profile import PatchProfile
 
 MS = 1_000_000
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from skinnode.model.config import BusConfig
+from skinnode.config import BusConfig
 from skinnode.technician.dcf import as_dcf, expected
 from skinnode.technician.dictionary import Reading, decode, type_name
 from skinnode.technician.sheet import Sheet, load_sheet

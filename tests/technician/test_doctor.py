@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, load_hand
 from skinnode.doctor import gather
 from skinnode.host import Host
-from skinnode.model.config import BusConfig, load_hand
+from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.technician import survey
 from skinnode.technician.line import Line
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile, eds_text
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from skinnode.canopen import indices as od
+from skinnode.config import PatchConfig, load_hand
 from skinnode.doctor.causes import grouped, merged
 from skinnode.doctor.facts import BusFacts, PatchFacts, Sure
 from skinnode.host import Host
-from skinnode.model.config import PatchConfig, load_hand
 from skinnode.technician.heard import Emergency
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.canopen.lss import LssAddress
+from skinnode.config import PatchConfig, SimulationConfig
 from skinnode.doctor.checks import diagnose, not_judged, others
 from skinnode.doctor.facts import BusFacts, Finding, PatchFacts, Sure
-from skinnode.model.config import PatchConfig, SimulationConfig
 from skinnode.model.layout import PatchLayout
-from skinnode.printable import printable
 from skinnode.technician.heard import Emergency
-from skinnode.wire.lss import LssAddress
+from skinnode.text.printable import printable
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 

@@ -11,10 +11,10 @@ import canopen
 import pytest
 from canopen.objectdictionary import ObjectDictionary
 
-from skinnode.model.config import BusConfig
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 from skinnode.technician import survey
 from skinnode.technician.standard import standard_entries
-from skinnode.wire import indices as od
 
 from .conftest import run
 

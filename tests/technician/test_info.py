@@ -10,17 +10,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 from skinnode.errors import SdoAbort
 from skinnode.host.network import RemoteOd
-from skinnode.model.config import BusConfig
 from skinnode.node import PatchNode
+from skinnode.protocol.profile import PatchProfile
 from skinnode.technician import survey
 from skinnode.technician.info import read_info
 from skinnode.technician.line import Line
 from skinnode.technician.sheet import read_profile
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile
 
 from .conftest import LAYOUT, Rest, run
 

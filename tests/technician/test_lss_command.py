@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from skinnode.model.config import BusConfig
+from skinnode.canopen.lss import NOT_CONFIGURED
+from skinnode.config import BusConfig
 from skinnode.node import NmtState, PatchNode, VolatileMemory
-from skinnode.wire.lss import NOT_CONFIGURED
-from skinnode.wire.profile import PatchProfile
+from skinnode.protocol.profile import PatchProfile
 
 from .conftest import LAYOUT, boards, run
 

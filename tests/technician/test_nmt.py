@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from skinnode.model.config import BusConfig
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 from skinnode.node import NmtState, PatchNode
 from skinnode.technician.line import Line
-from skinnode.wire import indices as od
 
 from .conftest import run
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import canopen
 import pytest
 
-from skinnode.model.config import BusConfig
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig
 from skinnode.node import PatchNode
+from skinnode.protocol.profile import PatchProfile, dcf_text, eds_text
 from skinnode.technician.line import Line
-from skinnode.wire import indices as od
-from skinnode.wire.profile import PatchProfile, dcf_text, eds_text
 
 from .conftest import LAYOUT, run
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from skinnode.model.config import BusConfig
+from skinnode.canopen import indices as od
+from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress, LssCommand
+from skinnode.config import BusConfig
 from skinnode.node import NmtState, PatchNode, VolatileMemory
 from skinnode.node.lss import LssSlave
 from skinnode.technician.line import Line
 from skinnode.technician.survey import survey
 from skinnode.transport import CanPort
-from skinnode.wire import indices as od
-from skinnode.wire.lss import NOT_CONFIGURED, LssAddress, LssCommand
 
 from .conftest import LAYOUT, run
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skinnode.canopen import indices as od
+from skinnode.config import BusConfig, load_hand
 from skinnode.host import Host
-from skinnode.model.config import BusConfig, load_hand
 from skinnode.model.forward import resistance_ohm
 from skinnode.node import PatchNode
 from skinnode.technician.line import Line
-from skinnode.wire import indices as od
 from vcan_sim.fleet import Fleet
 
 from .conftest import LAYOUT, Rest, run

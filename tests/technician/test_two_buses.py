@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from skinnode.model.config import load_hand
+from skinnode.config import load_hand
 from vcan_sim.fleet import Fleet
 
 from .conftest import SMALL, run

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig
 from skinnode.transport import Frame
 from skinnode.transport.datagram import DatagramPort, datagram, free_channel
 

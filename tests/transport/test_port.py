@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame
 from skinnode.transport import port as port_module
 

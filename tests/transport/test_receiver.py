@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame, Intake, Receiver
 from skinnode.transport.datagram import DatagramPort, datagram, free_channel
 from skinnode.transport.receiver import GATHER_NS, LONG_NS

@@ -9,8 +9,8 @@ import time
 
 import pytest
 
+from skinnode.config import BusConfig
 from skinnode.errors import BusError
-from skinnode.model.config import BusConfig
 from skinnode.transport import CanPort, Frame
 from skinnode.transport import port as port_module
 from skinnode.transport.socketcan import HardwareDelay

@@ -13,8 +13,8 @@ import markdown_text as md
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from skinnode.model.config import HandConfig
-from skinnode.model.config.explain import allowed_in, tables_in
+from skinnode.config import HandConfig
+from skinnode.config.explain import allowed_in, tables_in
 
 _TYPES: Final = {str: "text", int: "integer", float: "number", bool: "boolean", Path: "path", dict: "table"}
 _UNITS: Final = {

@@ -10,11 +10,14 @@ import markdown_text as md
 import numpy as np
 from canopen.sdo.exceptions import SdoAbortedError
 
-from skinnode.node.abort import AbortCode
+from skinnode.bus_load.timing import fd_worst_case_bits, worst_case_bits
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode
+from skinnode.canopen.dictionary import Entry, Object, highest
+from skinnode.canopen.emergency import error_text
 from skinnode.node.emcy import EmcyCode
 from skinnode.node.rejected import Rejected
-from skinnode.wire import indices as od
-from skinnode.wire.codec import (
+from skinnode.protocol.codec import (
     CodeScale,
     SummaryFlag,
     check_of_codes,
@@ -23,10 +26,7 @@ from skinnode.wire.codec import (
     pack_command,
     pack_scan,
 )
-from skinnode.wire.dictionary import Entry, Object, highest
-from skinnode.wire.emergency import error_text
-from skinnode.wire.profile import REFERENCE_PROFILES, PatchProfile, eds_name
-from skinnode.wire.timing import fd_worst_case_bits, worst_case_bits
+from skinnode.protocol.profile import REFERENCE_PROFILES, PatchProfile, eds_name
 
 PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4

@@ -29,7 +29,13 @@ from cosmic_ray.mutating import mutate_code
 
 ROOT: Final = Path(__file__).parents[2]
 LIST: Final = Path(__file__).with_name("mutants.json")
-PACKAGES: Final = ("wire", "node", "solve", "host")
+GROUPS: Final = {
+    "protocol": ("canopen", "protocol", "bus_load"),
+    "node": ("node",),
+    "solve": ("solve",),
+    "host": ("host",),
+}
+"""Packages of ``skinnode`` by the group that a draw is made from."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -60,8 +66,9 @@ class Mutant:
         return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
 
     @property
-    def package(self) -> str:
-        return Path(self.file).parts[1]
+    def group(self) -> str:
+        package = Path(self.file).parts[1]
+        return next(group for group, packages in GROUPS.items() if package in packages)
 
 
 def _digest(*parts: object) -> str:
@@ -215,11 +222,12 @@ def find(mutant: Mutant, source: str) -> str:
     raise LookupError(f"{mutant.name}: {mutant.file}, {mutant.function}: no longer has {mutant.before!r}")
 
 
-def draw(package: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
-    """Draw ``count`` mutants of ``skinnode/<package>``, at as many places."""
+def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
+    """Draw ``count`` mutants of a group's packages, at as many places."""
     sources: dict[str, str] = {}
     places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
-    for path in sorted((root / "skinnode" / package).glob("*.py")):
+    folders = [root / "skinnode" / package for package in GROUPS[group]]
+    for path in sorted(path for folder in folders for path in folder.rglob("*.py")):
         file, source = str(path.relative_to(root)), path.read_text("utf-8")
         sources[file] = source
         functions, lines = _functions(source), source.splitlines()
@@ -257,9 +265,9 @@ def read() -> list[Mutant]:
 
 
 def write(mutants: list[Mutant]) -> None:
-    """Store ``mutants``, in the order of packages and files."""
+    """Store ``mutants``, in the order of groups and files."""
     mutants = sorted(
-        mutants, key=lambda each: (PACKAGES.index(each.package), each.file, each.function, each.name)
+        mutants, key=lambda each: (list(GROUPS).index(each.group), each.file, each.function, each.name)
     )
     entries = [asdict(each) for each in mutants]
     LIST.write_text(
@@ -268,10 +276,10 @@ def write(mutants: list[Mutant]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw mutants again; those of other packages are kept.")
-    parser.add_argument("--package", choices=PACKAGES, action="append")
-    packages = parser.parse_args().package or list(PACKAGES)
-    kept = [each for each in read() if each.package not in packages] if LIST.exists() else []
+    parser = argparse.ArgumentParser(description="Draw mutants again; those of other groups are kept.")
+    parser.add_argument("--package", choices=GROUPS, action="append")
+    packages = parser.parse_args().package or list(GROUPS)
+    kept = [each for each in read() if each.group not in packages] if LIST.exists() else []
     for package in packages:
         drawn = draw(package, PER_PACKAGE, SEED)
         print(f"{package}: {len(drawn)} mutants in {len({each.file for each in drawn})} files")

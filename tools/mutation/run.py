@@ -1,4 +1,4 @@
-"""Run the tests against each drawn mutant: ``python -m tools.mutation.run --package wire``.
+"""Run the tests against each drawn mutant: ``python -m tools.mutation.run --package protocol``.
 
 Each mutant is applied to a private copy of the repository, and the stages of ``stages.toml`` run on it, each
 until its first failure. A failure of a real-time test counts only if the test also fails when run alone. A
@@ -30,19 +30,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from tools.mutation.draw import PACKAGES, ROOT, Mutant, find, read
+from tools.mutation.draw import GROUPS, ROOT, Mutant, find, read
 
 HERE: Final = Path(__file__).parent
 RESULTS: Final = HERE / "results.json"
 EQUIVALENT: Final = HERE / "equivalent.toml"
 
 _KERNELS: Final = (
-    "simd.py",
-    "bundle.py",
+    "compiled/*.py",
     "model/kernels.py",
     "solve/*.py",
-    "wire/stuffing.py",
-)  # as in skinnode.jit
+    "solve/*/*.py",
+    "bus_load/stuffing.py",
+)  # as in skinnode.compiled.jit
 _MEMORY_BYTES: Final = 8 << 30
 _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
@@ -126,8 +126,8 @@ class Tree:
                 kept.unlink()
 
     def _leaf(self) -> str:
-        """Return the name of the folder in which skinnode.jit keeps the kernels of the present copy."""
-        code = "from skinnode.jit import cache_dir; print(cache_dir().name)"
+        """Return the name of the folder that holds the compiled kernels of the present copy."""
+        code = "from skinnode.compiled.jit import cache_dir; print(cache_dir().name)"
         with tempfile.TemporaryDirectory() as folder:
             environment = os.environ | {"PYTHONPATH": str(self.source), "SKINNODE_CACHE_DIR": folder}
             command = [sys.executable, "-c", code]
@@ -260,10 +260,10 @@ def _end_children(group: int) -> None:
 
 def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
     """Return the test files for a mutant, stage by stage, each file once."""
-    package = table[mutant.package]
-    first = package.get("first", {}).get(Path(mutant.file).stem, [])
+    group = table[mutant.group]
+    first = group.get("first", {}).get(Path(mutant.file).stem, [])
     stages, seen = [], set[str]()
-    for stage in [first, *package["stages"]]:
+    for stage in [first, *group["stages"]]:
         files = [path for pattern in stage for path in _expand(pattern) if path not in seen]
         seen |= set(files)
         if files:
@@ -365,18 +365,18 @@ def show(mutant: Mutant) -> str:
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return a line for every package, then each survivor that is not equivalent."""
+    """Return a line for every group, then each survivor that is not equivalent."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")
-    for package in PACKAGES:
-        verdicts = [verdict[each.name] for each in mutants if each.package == package]
+    for group in GROUPS:
+        verdicts = [verdict[each.name] for each in mutants if each.group == group]
         if verdicts:
             counts = {word: verdicts.count(word) for word in ("killed", "equivalent", "survived", "not run")}
             told = ", ".join(f"{count} {word}" for word, count in counts.items())
             decided = counts["killed"] + counts["survived"]
             share = f": {100 * counts['killed'] / decided:.1f} % killed" if decided else ""
-            lines.append(f"{package:6} {len(verdicts)} drawn, {told}{share}")
+            lines.append(f"{group:8} {len(verdicts)} drawn, {told}{share}")
     lines += [show(each) for each in mutants if verdict[each.name] == "survived"]
     return "\n".join(lines)
 
@@ -395,7 +395,7 @@ def _preload() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--package", choices=PACKAGES, action="append", help="default: all")
+    parser.add_argument("--package", choices=GROUPS, action="append", help="default: all")
     parser.add_argument(
         "--only", action="append", metavar="NAME", help="run this mutant, whatever its verdict"
     )
@@ -411,8 +411,8 @@ def main() -> None:
     options = parser.parse_args()
     mutants, results = read(), _load(RESULTS)
     if not options.show:
-        packages = options.package or list(PACKAGES)
-        todo = [each for each in mutants if each.package in packages and each.name not in _equivalent()]
+        packages = options.package or list(GROUPS)
+        todo = [each for each in mutants if each.group in packages and each.name not in _equivalent()]
         if options.only:
             todo = [each for each in mutants if each.name in options.only]
         else:

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench.accuracy_front import SOLVED
-from skinnode.plot_file import save_figure
+from skinnode.files.plot_file import save_figure
 
 MARKS: Final = (
     ("skinnode", "tab:blue", "o"),

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinnode.plot_file import save_figure
+from skinnode.files.plot_file import save_figure
 
 COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from skinnode.bench.pipeline import LATENCY_MS, lost, name_of
-from skinnode.plot_file import save_figure
+from skinnode.files.plot_file import save_figure
 
 _GROUPS: Final = {"receive": "tab:blue", "mainline": "tab:orange", "solve": "tab:green", "subscriber": "0.5"}
 

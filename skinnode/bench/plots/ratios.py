@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
-from skinnode.plot_file import save_figure
+from skinnode.files.plot_file import save_figure
 
 OURS: Final = "tab:blue"
 THEIRS: Final = "0.65"

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from skinnode.bench.verdict import LIMIT, named
-from skinnode.plot_file import save_figure
+from skinnode.files.plot_file import save_figure
 
 COLUMNS: Final = (
     ("path\nGN", "path gauss_newton"),

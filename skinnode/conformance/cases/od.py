@@ -10,7 +10,7 @@ from skinnode.conformance.cases.sdo import NO_SUBINDEX, READ_ONLY, TOO_HIGH, TOO
 from skinnode.conformance.dut import RESTORE, STORE, Dut
 from skinnode.conformance.eds import EdsEntry
 from skinnode.conformance.sdo import Aborted, expedited, mux
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 _COMMUNICATION = 0x1000, 0x1FFF
 _REST = 0x2000, 0x9FFF

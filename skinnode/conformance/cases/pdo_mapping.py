@@ -22,7 +22,7 @@ from skinnode.conformance.pdo import (
     tpdos,
 )
 from skinnode.conformance.sdo import Aborted, expedited
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 NOT_MAPPABLE = (0x0602_0000, 0x0604_0041)
 TOO_MUCH = (0x0602_0000, 0x0604_0041, 0x0604_0042)

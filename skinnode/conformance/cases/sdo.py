@@ -10,7 +10,7 @@ from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, Dut
 from skinnode.conformance.eds import SIGNED, UNSIGNED, EdsEntry
 from skinnode.conformance.sdo import expedited, mux
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 READ_ONLY = (0x0601_0000, 0x0601_0002)
 WRITE_ONLY = (0x0601_0000, 0x0601_0001)

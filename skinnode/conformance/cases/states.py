@@ -23,7 +23,7 @@ from skinnode.conformance.pdo import (
 )
 from skinnode.conformance.provoke import COMMUNICATION_LOST, expect_emcy, lose_partner
 from skinnode.conformance.sdo import mux
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 _BEHAVIOUR = 0x1029
 _EVENT_MS = 20

@@ -8,7 +8,7 @@ from skinnode.conformance.dut import STORE, Dut
 from skinnode.conformance.pace import check_period
 from skinnode.conformance.pdo import SYNC_ID, Pdo, drain, mapped, payload_bytes, set_up, sync, tpdos
 from skinnode.conformance.sdo import Aborted, expedited
-from skinnode.words import counted
+from skinnode.text.words import counted
 
 COB_ID, PERIOD, OVERFLOW = 0x1005, 0x1006, 0x1019
 PRODUCE = 1 << 30

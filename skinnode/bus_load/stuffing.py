@@ -1,0 +1,166 @@
+"""Compiled kernels of :mod:`skinnode.bus_load.timing`: count the bits of frames on the bus.
+
+Pure functions of arrays of one kind each: uint32 identifiers, uint8 lengths and payloads, int64 bits.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit_brief
+
+HEAD_BITS: Final = 19  # SOF, 11 bits identifier, RTR, IDE, r0, 4 bits DLC
+CRC_BITS: Final = 15
+TAIL_BITS: Final = 13
+"""CRC delimiter, ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space."""
+FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11 bits identifier, RRS, IDE, FDF, res, BRS; and the tail
+_CRC_POLYNOMIAL: Final = 0x4599
+_RUN: Final = 5
+ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
+
+_Int = NDArray[np.int64]
+_Bytes = NDArray[np.uint8]
+
+
+@functools.cache
+def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
+    """CRC of a byte; and for run << 8 | byte: the run after the byte and the stuff bits in it.
+
+    A run is 0 before the first bit, else value << 2 | (length − 1) + 1, with lengths 1 … 4: a fifth equal bit
+    brings the stuff bit, which begins a run of its own.
+    """
+    crc_table = []
+    for byte in range(256):
+        crc = byte << 7
+        for _ in range(8):
+            crc = crc << 1 ^ (_CRC_POLYNOMIAL if crc & 0x4000 else 0)
+        crc_table.append(crc & 0x7FFF)
+    next_run, stuffed = [], []
+    for run in range(9):
+        for byte in range(256):
+            value, length = ((run - 1) >> 2, (run - 1 & 3) + 1) if run else (-1, 0)
+            stuff = 0
+            for shift in range(7, -1, -1):
+                bit = byte >> shift & 1
+                length = length + 1 if bit == value else 1
+                value = bit
+                if length == _RUN:
+                    stuff += 1
+                    value, length = 1 - bit, 1
+            next_run.append((value << 2 | length - 1) + 1)
+            stuffed.append(stuff)
+    return tuple(crc_table), tuple(next_run), tuple(stuffed)
+
+
+@functools.cache
+def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    """CRC of a byte; and for run << 8 | byte: the run after the byte << 8 | the stuff bits in it."""
+    crc, next_run, stuffed = (np.array(table, np.uint16) for table in tables())
+    return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
+
+
+_loaded = False
+
+
+def are_loaded() -> bool:
+    """Whether :func:`load_kernels` was called."""
+    return _loaded
+
+
+def load_kernels() -> None:
+    """Compile them, or read them from the cache, now: half a second in which a thread that receives would let
+    questions go unanswered."""
+    global _loaded
+    _loaded = True
+    none, nothing, bits = np.zeros(0, np.uint32), np.zeros(0, np.uint8), np.zeros(0, np.int64)
+    classic_bits(none, nothing, nothing, 0, bits)
+    fd_bits(none, nothing, nothing, bits, bits)
+
+
+def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stride: int, bits: _Int) -> int:
+    """Into ``bits`` (n,) those of standard data frames, and their sum. ``payload`` holds the data of one
+    frame after the other, which begin ``stride`` bytes apart; 0 where nothing is between them."""
+    return int(_classic(ids, lengths, payload, stride, *_arrays(), bits))
+
+
+def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: _Int, fast: _Int) -> None:
+    """Into ``nominal`` and ``fast`` (n,) those of CAN FD frames at either rate. Lengths are those that frames
+    can have; nothing is between the data of one frame and the next."""
+    _fd(ids, lengths, payload, _arrays()[1], nominal, fast)
+
+
+@njit_brief
+def _classic(ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run_of: Any, bits: Any) -> int:
+    total, begin = 0, 0
+    for i in range(ids.size):
+        length: Any = np.int64(lengths[i])
+        head: Any = np.int64(ids[i] & 0x7FF) << 7 | length
+        crc: Any = np.int64(crc_of[head >> 16])
+        crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head >> 8 & 0xFF)])
+        crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
+        for k in range(begin, begin + length):
+            crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
+        # 19 + 15 bits of head and CRC are two more than four bytes: six bits of filler make it five. The
+        # bytes of the stuffed region straddle those of the payload, so they are cut from pairs of neighbours.
+        stream = (ALTERNATING & 0x3F) << 18 | head >> 1
+        stuff: Any = 0
+        run: Any = 0
+        before = head
+        for shift in (16, 8, 0):
+            entry = np.int64(run_of[run << 8 | (stream >> shift & 0xFF)])
+            stuff, run = stuff + (entry & 0xFF), entry >> 8
+        for k in range(begin, begin + length):
+            byte = np.int64(payload[k])
+            entry = np.int64(run_of[run << 8 | (before & 1) << 7 | byte >> 1])
+            stuff, run, before = stuff + (entry & 0xFF), entry >> 8, byte
+        last = (before & 1) << 15 | crc
+        for shift in (8, 0):
+            entry = np.int64(run_of[run << 8 | (last >> shift & 0xFF)])
+            stuff, run = stuff + (entry & 0xFF), entry >> 8
+        bits[i] = HEAD_BITS + 8 * length + CRC_BITS + TAIL_BITS + stuff
+        total += bits[i]
+        begin += stride if stride else length
+    return total
+
+
+@njit_brief
+def _fd(ids: Any, lengths: Any, payload: Any, run_of: Any, nominal: Any, fast: Any) -> None:
+    begin = 0
+    for i in range(ids.size):
+        length: Any = np.int64(lengths[i])
+        if length <= 8:
+            code = length
+        elif length <= 24:
+            code = 6 + length // 4  # 12, 16, 20, 24
+        else:
+            code = 11 + length // 16  # 32, 48, 64
+        # 22 bits up to the length code are two less than three bytes, and the data follow bytewise. FDF, res
+        # and BRS alternate: no stuff bit stands between the first two bytes (nominal) and ESI.
+        stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
+        slow: Any = 0
+        stuff: Any = 0
+        run: Any = 0
+        last = code & 1
+        for shift in (16, 8, 0):
+            entry = np.int64(run_of[run << 8 | (stream >> shift & 0xFF)])
+            run = entry >> 8
+            if shift:
+                slow += entry & 0xFF
+            else:
+                stuff += entry & 0xFF
+        for k in range(begin, begin + length):
+            entry = np.int64(run_of[run << 8 | np.int64(payload[k])])
+            stuff, run = stuff + (entry & 0xFF), entry >> 8
+            last = np.int64(payload[k]) & 1
+        # A stuff bit due after the last bit is not sent: the first fixed one stands there.
+        if run - 1 >> 2 != last:
+            stuff -= 1
+        crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
+        # ESI, DLC, data, count, CRC, delimiter
+        fast[i] = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1 + stuff
+        nominal[i] = FD_NOMINAL_BITS + slow
+        begin += length

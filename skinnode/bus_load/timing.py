@@ -1,0 +1,264 @@
+"""How long a CAN frame occupies the bus, to the bit (ISO 11898-1:2015), and what load that makes.
+
+Classic frames. From start of frame to the end of the CRC sequence a stuff bit of the other value follows
+every five equal bits, stuff bits included in the count. The tail of 13 bits is not stuffed: CRC delimiter,
+ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space. CRC: polynomial 0x4599, 15 bits,
+initially 0.
+
+Both the CRC and the stuffing run bytewise through tables. The head of a frame is filled up on its left to
+whole bytes: with zeros for the CRC, which leave it 0, and with alternating bits that end in a 1 for the
+stuffing, after which the dominant start of frame begins a new run.
+
+CAN FD frames, with an 11-bit identifier and bit-rate switch. Such stuffing ends with the data: in the CRC
+field stand 4 bits that count the stuff bits, 17 bits of CRC (21 beyond 16 bytes of data) and a fixed stuff
+bit before them and after each 4, whatever their values. The bits from ESI to the CRC delimiter are sent at
+the data bit rate; the 17 before them and the 12 after them (ACK slot and delimiter, 7 bits end of frame, 3
+bits inter-frame space) at the nominal one.
+"""
+
+from __future__ import annotations
+
+import functools
+from array import array
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skinnode.bus_load import stuffing
+from skinnode.bus_load.stuffing import (
+    ALTERNATING,
+    CRC_BITS,
+    FD_NOMINAL_BITS,
+    HEAD_BITS,
+    TAIL_BITS,
+    tables,
+)
+from skinnode.canopen.data_length import FD_LENGTHS
+from skinnode.errors import ConfigError
+from skinnode.text.words import counted
+
+_EXTENDED_HEAD_BITS: Final = 39  # SOF, 11 bits, SRR, IDE, 18 bits, RTR, r1, r0, 4 bits DLC
+"""Bytes that a CAN FD frame can have, by its length code."""
+_RUN: Final = 5
+_NO_RUN: Final = 0
+_Int = NDArray[np.int64]
+
+
+def nominal_bits(dlc: int, *, extended: bool = False) -> int:
+    """Bits of a frame without any stuff bit."""
+    return (_EXTENDED_HEAD_BITS if extended else HEAD_BITS) + 8 * dlc + CRC_BITS + TAIL_BITS
+
+
+def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
+    """Bits of the longest frame with ``dlc`` bytes: a stuff bit after the first 5 bits and each 4 more.
+
+    Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
+    """
+    nominal = nominal_bits(dlc, extended=extended)
+    return nominal + (nominal - TAIL_BITS - 1) // (_RUN - 1)
+
+
+def exact_bits(
+    can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int | None = None
+) -> int:
+    """Bits of a classic data frame on the bus, inter-frame space included.
+
+    A remote frame (``remote``) carries no data; its length code is ``dlc``. Raises ValueError for an
+    identifier that does not fit or more than 8 bytes.
+    """
+    if not 0 <= can_id < 1 << (29 if extended else 11):
+        raise ValueError(f"can_id: got 0x{can_id:X}, must fit {29 if extended else 11} bits")
+    if len(data) > 8:
+        raise ValueError(f"data: got {counted(len(data), 'byte')}, must be at most 8")
+    if remote:
+        data, code = b"", dlc or 0
+    else:
+        code = len(data)
+    if extended:
+        base, extension = can_id >> 18, can_id & 0x3FFFF
+        head = (base << 20 | 0b11 << 18 | extension) << 7 | remote << 6 | code
+        head_bits = _EXTENDED_HEAD_BITS
+    else:
+        head = can_id << 7 | remote << 6 | code
+        head_bits = HEAD_BITS
+    head_bytes = -(-head_bits // 8)
+    crc_table, next_run, stuffed = tables()
+    crc = 0
+    for byte in head.to_bytes(head_bytes, "big") + data:
+        crc = (crc << 8 & 0x7FFF) ^ crc_table[crc >> 7 ^ byte]
+
+    n_bits = head_bits + 8 * len(data) + CRC_BITS
+    bits = (head << 8 * len(data) | int.from_bytes(data, "big")) << CRC_BITS | crc
+    n_bytes = -(-n_bits // 8)
+    filler = ALTERNATING & ((1 << 8 * n_bytes - n_bits) - 1)
+    run, stuff = _NO_RUN, 0
+    for byte in (filler << n_bits | bits).to_bytes(n_bytes, "big"):
+        at = run << 8 | byte
+        stuff += stuffed[at]
+        run = next_run[at]
+    return n_bits + stuff + TAIL_BITS
+
+
+def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
+    """Bits of CAN FD frames of one length: (n,) identifiers and (n, length) bytes to (n,) bits at the nominal
+    bit rate, inter-frame space included, and (n,) at the data bit rate.
+
+    Raises ValueError for other shapes, an identifier of more than 11 bits or a length that no frame has.
+    """
+    ids, payload = np.asarray(can_id, np.int64), np.asarray(data, np.uint8)
+    if ids.ndim != 1 or payload.ndim != 2 or len(payload) != len(ids):
+        raise ValueError(f"can_id, data: got shapes {ids.shape}, {payload.shape}, must be (n,), (n, length)")
+    length = payload.shape[1]
+    if length not in FD_LENGTHS or np.any((ids < 0) | (ids > 0x7FF)):
+        raise ValueError(
+            f"can_id, data: got {counted(length, 'byte')}, must be one of {FD_LENGTHS}, and 11-bit numbers"
+        )
+    nominal, fast = np.empty((2, len(ids)), np.int64)
+    lengths = np.full(len(ids), length, np.uint8)
+    stuffing.fd_bits(ids.astype(np.uint32), lengths, payload.flatten(), nominal, fast)
+    return nominal, fast
+
+
+@functools.cache
+def fd_worst_case_bits(length: int) -> tuple[int, int]:
+    """Most bits at the nominal and at the data bit rate of a CAN FD frame with ``length`` bytes, as in
+    :func:`fd_bits`: found over all data, run by run.
+
+    Raises ValueError for a length that no frame has.
+    """
+    if length not in FD_LENGTHS:
+        raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
+    # From SOF to IDE stand 14 bits, whose first 5 and each 4 more may bring a stuff bit.
+    # FDF, res and BRS alternate, ESI is 0 and the length code is known; the data are what is worst.
+    stuff = {(1 << 2) + 1: 0}  # a run of one recessive bit, BRS
+    code = FD_LENGTHS.index(length)
+    choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
+    choices += [(0, 1)] * (8 * length)
+    for number, bits in enumerate(choices, 1):
+        after: dict[int, int] = {}
+        for run, count in stuff.items():
+            for bit in bits:
+                value, equal = (run - 1) >> 2, (run - 1 & 3) + 1
+                equal = equal + 1 if bit == value else 1
+                stuffed = equal == _RUN
+                state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
+                # A stuff bit due after the last bit is not sent: the first fixed one stands there.
+                total = count + (stuffed and number < len(choices))
+                after[state] = max(after.get(state, 0), total)
+        stuff = after
+    crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)
+    data_bits = 1 + 4 + 8 * length + 4 + crc_bits + fixed + 1
+    return FD_NOMINAL_BITS + (14 - 1) // (_RUN - 1), data_bits + max(stuff.values())
+
+
+def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
+    """:func:`exact_bits` of many standard data frames: (n,) identifiers, (n,) lengths, (n, 8) bytes, as (n,).
+
+    Bytes beyond a frame's length are ignored. Raises ValueError for other shapes, identifiers or lengths.
+    """
+    ids, lengths, payload = (
+        np.asarray(can_id, np.int64),
+        np.asarray(dlc, np.int64),
+        np.asarray(data, np.uint8),
+    )
+    n = ids.size
+    if ids.shape != (n,) or lengths.shape != (n,) or payload.shape != (n, 8):
+        shapes = f"{ids.shape}, {lengths.shape}, {payload.shape}"
+        raise ValueError(f"can_id, dlc, data: got shapes {shapes}, must be (n,), (n,), (n, 8)")
+    if np.any((ids < 0) | (ids > 0x7FF) | (lengths < 0) | (lengths > 8)):
+        raise ValueError("can_id, dlc: got a number out of range, must be 0 to 0x7FF and 0 to 8")
+    bits = np.empty(n, np.int64)
+    stuffing.classic_bits(ids.astype(np.uint32), lengths.astype(np.uint8), payload.flatten(), 8, bits)
+    return bits
+
+
+class BusLoad:
+    """Counts frames and their exact bits. Adding a frame is cheap; the bits are worked out in batches.
+
+    Plain code with one owner. Raises ConfigError for a bit rate that is not positive.
+    """
+
+    _BATCH: Final = 4096
+
+    def __init__(self, bitrate_bps: int = 1_000_000, data_bitrate_bps: int | None = None) -> None:
+        for name, rate in (("bitrate_bps", bitrate_bps), ("data_bitrate_bps", data_bitrate_bps)):
+            if rate is not None and rate <= 0:
+                raise ConfigError(name, rate, "more than 0")
+        self.bitrate_bps = bitrate_bps
+        self._data_bit = bitrate_bps / (data_bitrate_bps or bitrate_bps)
+        self._frames = 0
+        self._bits = self._fast_bits = 0
+        self._classic: tuple[list[int], list[bytes]] = [], []
+        self._fd: tuple[list[int], list[bytes]] = [], []
+
+    def add(
+        self,
+        can_id: int,
+        data: bytes,
+        *,
+        extended: bool = False,
+        remote: bool = False,
+        dlc: int = 0,
+        fd: bool = False,
+    ) -> None:
+        """Count a frame, as in :func:`exact_bits` or, where ``fd``, :func:`fd_bits`. ``data`` is kept until
+        the next batch, not copied."""
+        if extended or remote:
+            self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
+            self._frames += 1
+            return
+        self.add_all(((can_id, data),), fd=fd)
+
+    def add_all(self, frames: Iterable[tuple[int, bytes, *tuple[object, ...]]], *, fd: bool = False) -> None:
+        """Count standard data frames; of each the identifier and the data come first."""
+        ids, data = self._fd if fd else self._classic
+        ids += [frame[0] for frame in frames]
+        data += [frame[1] for frame in frames]
+        if len(ids) >= self._BATCH:
+            self._work_off()
+
+    @property
+    def frames(self) -> int:
+        """Frames added so far."""
+        return self._frames + len(self._classic[0]) + len(self._fd[0])
+
+    @property
+    def bits(self) -> int:
+        """Bits they were on the bus; one at the data bit rate of CAN FD counts as its share of a nominal
+        one."""
+        self._work_off()
+        return self._bits + round(self._fast_bits * self._data_bit)
+
+    def load(self, time_s: float) -> float:
+        """Share of ``time_s`` the bus was busy with the frames so far; above 1 they do not fit."""
+        return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
+
+    def _work_off(self) -> None:
+        ids, data = self._classic
+        self._frames += len(ids)
+        if not stuffing.are_loaded():  # a command that listens for a second or two does well without
+            self._bits += sum(map(exact_bits, ids, data))
+        elif ids:
+            self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
+        ids.clear()
+        data.clear()
+        ids, data = self._fd
+        self._frames += len(ids)
+        if ids:
+            nominal, fast = np.empty((2, len(ids)), np.int64)
+            stuffing.fd_bits(*_packed(ids, data), nominal, fast)
+            self._bits += int(nominal.sum())
+            self._fast_bits += int(fast.sum())
+        ids.clear()
+        data.clear()
+
+
+def _packed(
+    ids: list[int], data: list[bytes]
+) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
+    """(n,) identifiers and lengths, and the data one after the other, in memory that can be written: kernels
+    are compiled for each kind."""
+    lengths, joined = bytearray(map(len, data)), bytearray().join(data)
+    return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

@@ -1,0 +1,17 @@
+"""Payload lengths of CAN FD frames (ISO 11898-1:2015, 8.4.2.4)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skinnode.text.words import counted
+
+FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+
+
+def fd_length(n_bytes: int) -> int:
+    """The shortest data of a CAN FD frame that holds ``n_bytes``. Raises ValueError for more than 64."""
+    for length in FD_LENGTHS:
+        if n_bytes <= length:
+            return length
+    raise ValueError(f"data: got {counted(n_bytes, 'byte')}, must be at most {FD_LENGTHS[-1]}")

@@ -1,0 +1,151 @@
+"""Emergency messages, the error register and the error history in words (CiA 301 v4.2, 7.2.7, tables 26 and
+48). What a code means beyond that, and what follows it, is the maker's own: it is told of our patches alone.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skinnode.text.words import counted
+
+OVERRUN: Final = 0x8110
+"""CAN overrun; of a skinnode patch also: scans skipped."""
+
+TOO_SLOW: Final = 1
+"""Third byte of the detail of 0x8110, after the u16 count of skipped scans. 1: chunks left later than the
+inhibit time requires, because the computer that runs the node, or its bus, was too slow. 0: a scan takes
+longer than the scan period."""
+
+_CODES: Final = {
+    0x0000: "no error, or an error is over",
+    0x8110: "CAN overrun: messages lost",
+    0x8120: "CAN error passive",
+    0x8130: "heartbeat or guarding lost",
+    0x8140: "recovered from bus-off",
+    0x8150: "CAN-ID collision",
+    0x8210: "PDO not processed: wrong length",
+    0x8220: "PDO too long",
+    0x8230: "multiplexed PDO not processed: no such object",
+    0x8240: "SYNC of unexpected length",
+    0x8250: "RPDO timed out",
+}
+_OWN_CODES: Final = {
+    0x5000: "wire open or shorted",
+    0x6300: "stored data",
+    0x8110: "overrun: messages or scans lost",
+    0x8150: "CAN-ID collision: another node has this node-ID",
+    0x8200: "synchronous PDO too late",
+    0x8210: "PDO not processed: too short",
+    0xFF00: "no reading from the converter",
+}
+"""Meaning of the codes when a skinnode patch sends them."""
+_CLASSES: Final = {
+    0x10: "generic error",
+    0x20: "current",
+    0x21: "current at the input",
+    0x22: "current inside",
+    0x23: "current at the output",
+    0x30: "voltage",
+    0x31: "mains voltage",
+    0x32: "voltage inside",
+    0x33: "output voltage",
+    0x40: "temperature",
+    0x41: "ambient temperature",
+    0x42: "device temperature",
+    0x50: "hardware",
+    0x60: "software",
+    0x61: "internal software",
+    0x62: "user software",
+    0x63: "data set",
+    0x70: "additional modules",
+    0x80: "monitoring",
+    0x81: "communication",
+    0x82: "protocol",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "device-specific",
+}
+_WIRE_FAULTS: Final = ("upper wire open", "upper wire shorted", "lower wire open", "lower wire shorted")
+_DATA_FAULTS: Final = {
+    1: "the memory is unreadable",
+    2: "the memory is damaged",
+    3: "the memory is of another patch",
+    4: "an object refuses what was stored",
+    5: "could not be saved",
+}
+_SOURCE_FAULTS: Final = {1: "it failed", 2: "it gave an array of another shape"}
+_REGISTER: Final = (
+    "generic",
+    "current",
+    "voltage",
+    "temperature",
+    "communication",
+    "profile-specific",
+    "reserved",
+    "manufacturer-specific",
+)
+
+
+def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
+    """Return an emergency error code in words. ``ours``: vendor and product are those of a skinnode patch;
+    otherwise the words are those of CiA 301. ``detail``: the bytes after the code; the first two are also in
+    the history."""
+    own = _OWN_CODES.get(code) if ours else None
+    text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
+    more = _detail_text(code, detail) if ours else ""
+    return f"{text}: {more}" if more else text
+
+
+def history_text(entry: int, *, ours: bool) -> str:
+    """Return an entry of 0x1003 in words: the code and, above it, two manufacturer-specific bytes, which are
+    decoded if it is ``ours``."""
+    code, more = entry & 0xFFFF, entry >> 16
+    text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
+    return text if ours or not more else f"{text} (manufacturer-specific: 0x{more:04X})"
+
+
+def says_too_slow(code: int, detail: bytes) -> bool:
+    """Return whether an emergency with ``detail`` says that scans were skipped because the computer that runs
+    the node, or its bus, was too slow, which is no fault of the skin."""
+    return code == OVERRUN and detail[:2] != b"\0\0" and detail[2:3] == bytes((TOO_SLOW,))
+
+
+def register_text(register: int) -> str:
+    """The bits of the error register (0x1001) that are set."""
+    return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "no error"
+
+
+def _detail_text(code: int, detail: bytes) -> str:
+    if len(detail) < 2:
+        return ""
+    first, second = detail[0], detail[1]
+    word = first | second << 8
+    match code:
+        case 0x5000 if first < len(_WIRE_FAULTS):
+            count = int.from_bytes(detail[2:4], "little") if len(detail) >= 4 else 1
+            return f"{_WIRE_FAULTS[first]} {second}" + (f", {count} wires in all" if count > 1 else "")
+        case 0x6300:
+            return _DATA_FAULTS.get(first, "")
+        case 0x8110 if word:
+            skipped = f"{counted(word, 'scan')} skipped so far"
+            slow = says_too_slow(code, detail)
+            return f"{skipped} because the computer that runs the node is too slow" if slow else skipped
+        case 0x8130 if first:
+            return f"node {first} restarted" if second else f"of node {first}"
+        case 0x8130:
+            return "of the master"
+        case 0x8210 | 0x8220 if len(detail) >= 3:
+            return f"RPDO{first}, {counted(second, 'byte')} in place of {detail[2]}"
+        case 0x8210 | 0x8220:
+            return f"RPDO{first}, {counted(second, 'byte')}"
+        case 0x8240:
+            return f"{counted(first, 'byte')} in place of {second}"
+        case 0x8200 if word:
+            return f"TPDO{word}"
+        case 0x8250:
+            return f"RPDO{word}"
+        case 0x8150:
+            return f"0x{word:03X}"
+        case 0xFF00:
+            return _SOURCE_FAULTS.get(first, "")
+    return ""

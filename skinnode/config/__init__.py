@@ -1,0 +1,48 @@
+"""The options of a hand, read from ``hand.toml``: one module for each room of the file.
+
+:func:`load_hand` reads a file, :func:`parse_hand` a table that is already in memory. Both raise
+:class:`~skinnode.errors.ConfigError` with one line: file, line and column, the dotted key, what was found
+there and what is allowed. Types are strict, as TOML is typed: ``node_id = "3"`` is an error, not a 3.
+
+Units are the suffixes of the keys; everything without one is a count, a ratio or a name.
+"""
+
+from skinnode.config.buses import (
+    MAX_BUS_LOAD,
+    BringUpConfig,
+    BusConfig,
+    Missing,
+    OtherFrame,
+    SyncConfig,
+)
+from skinnode.config.hand import HandConfig, load_hand, parse_hand
+from skinnode.config.patches import (
+    CalibrationConfig,
+    LayoutConfig,
+    PatchConfig,
+    PoseConfig,
+    load_layout,
+)
+from skinnode.config.running import Partial, SolverConfig, StreamConfig
+from skinnode.config.simulation import SimulationConfig
+
+__all__ = [
+    "MAX_BUS_LOAD",
+    "BringUpConfig",
+    "BusConfig",
+    "CalibrationConfig",
+    "HandConfig",
+    "LayoutConfig",
+    "Missing",
+    "OtherFrame",
+    "Partial",
+    "PatchConfig",
+    "PoseConfig",
+    "SimulationConfig",
+    "SolverConfig",
+    "StreamConfig",
+    "SyncConfig",
+    "load_hand",
+    "load_layout",
+    "parse_hand",
+]

@@ -1,0 +1,202 @@
+"""The hand as its integrator writes it down: ``hand.toml`` to frozen, validated options."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
+
+from skinnode.config.buses import BringUpConfig, BusConfig, SyncConfig
+from skinnode.config.explain import first_error, key_path, short
+from skinnode.config.patches import PatchConfig
+from skinnode.config.running import SolverConfig, StreamConfig
+from skinnode.config.simulation import SimulationConfig
+from skinnode.config.table import Allowed, Name, Table
+from skinnode.config.toml_text import Document, read_toml
+from skinnode.errors import NOTHING, ConfigError, Shown
+from skinnode.model.layout_file import impossible
+
+NODE_IDS: Final = 127
+"""Number of node-IDs on a bus (CiA 301 v4.2, 7.3.2)."""
+
+MOST_BUSES: Final = 64
+"""Maximum buses of a hand, far more than one machine has interfaces."""
+
+
+class HandConfig(Table):
+    """A hand: its buses, its patches and what the host does with them.
+
+    Raises (as part of pydantic's ValidationError; :func:`parse_hand` unwraps it) ConfigError for names,
+    node-IDs or serial numbers used twice, a bus that is not there, an impossible geometry, or a role that a
+    bus cannot have. Whether the plan fits its buses is asked of :func:`skinnode.bus_load.plan.check_plan`.
+    """
+
+    name: Name = "hand"
+    """What programs and reports call the hand."""
+    buses: Annotated[
+        tuple[BusConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[buses]]")
+    ]
+    """Its CAN buses."""
+    patches: Annotated[
+        tuple[PatchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[patches]]")
+    ]
+    """Its patches of skin."""
+    sync: SyncConfig = SyncConfig()
+    bring_up: BringUpConfig = BringUpConfig()
+    solver: SolverConfig = SolverConfig()
+    stream: StreamConfig = StreamConfig()
+    simulation: SimulationConfig = SimulationConfig()
+    _read_of: Document = PrivateAttr(Document("", {}, {}))
+
+    def bus(self, name: str) -> BusConfig:
+        """The bus of that name. Raises KeyError."""
+        return {bus.name: bus for bus in self.buses}[name]
+
+    def patch(self, name: str) -> PatchConfig:
+        """The patch of that name. Raises KeyError."""
+        return {patch.name: patch for patch in self.patches}[name]
+
+    def patches_on(self, bus: str) -> tuple[PatchConfig, ...]:
+        """The patches on the bus of that name, in the order of the file."""
+        return tuple(patch for patch in self.patches if patch.bus == bus)
+
+    def where(self, key: str) -> str:
+        """``file:line:column`` of a dotted key, for errors; nothing for a hand that is of no file."""
+        return self._read_of.where(key_path(key))
+
+    def on(self, interface: str | None = None, channel: str | None = None) -> HandConfig:
+        """The same hand on another interface or channel, as ``--interface`` and ``--channel`` ask for.
+
+        Raises ConfigError where a channel is given for a hand of several buses.
+        """
+        if channel is not None and len(self.buses) > 1:
+            raise ConfigError(
+                "--channel", channel, f"only for a hand with one bus; this one has {len(self.buses)}"
+            )
+        change = {"interface": interface, "channel": channel}
+        kept = {key: value for key, value in change.items() if value is not None}
+        for key, value in kept.items():
+            if not value:
+                raise ConfigError(f"--{key}", value, "a name")
+        return self.model_copy(update={"buses": tuple(bus.model_copy(update=kept) for bus in self.buses)})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _counts(cls, table: Any) -> Any:
+        """Check the number of buses and patches before building them: ten thousand patches would take
+        minutes."""
+        if isinstance(table, Mapping):
+            buses, patches = table.get("buses"), table.get("patches")
+            if isinstance(buses, list) and len(buses) > MOST_BUSES:
+                raise ConfigError("buses", Shown(f"{len(buses)} of them"), f"at most {MOST_BUSES}")
+            if isinstance(patches, list) and isinstance(buses, list):
+                most = NODE_IDS * len(buses)
+                if len(patches) > most > 0:
+                    on = "it has" if len(buses) == 1 else f"{len(buses)} have"
+                    allowed = f"at most {most}: a bus has node-IDs 1 to {NODE_IDS}, and {on} no more"
+                    raise ConfigError("patches", Shown(f"{len(patches)} of them"), allowed)
+        return table
+
+    @model_validator(mode="after")
+    def _cross_checks(self) -> HandConfig:
+        _require_unique("buses", "name", [bus.name for bus in self.buses])
+        _require_unique("buses", "channel", [(bus.interface, bus.channel) for bus in self.buses])
+        _require_unique("patches", "name", [patch.name for patch in self.patches])
+        names = [bus.name for bus in self.buses]
+        for i, patch in enumerate(self.patches):
+            if patch.bus not in names:
+                raise ConfigError(f"patches[{i}].bus", patch.bus, f"a bus of this file: {', '.join(names)}")
+            _check_geometry(f"patches[{i}]", patch)
+        _require_unique("patches", "node_id", [(patch.bus, patch.node_id) for patch in self.patches])
+        serials = [object() if patch.serial is None else patch.serial for patch in self.patches]
+        _require_unique("patches", "serial", serials)
+        self._check_roles()
+        return self
+
+    def _check_roles(self) -> None:
+        """What a bus cannot give its host, or its patches, in the role it has."""
+        overflow, guest = self.sync.counter_overflow, all(bus.role == "guest" for bus in self.buses)
+        if overflow == 1 or (overflow == 0 and not guest):
+            allowed = "an integer from 2 to 240; 0 where all buses are a guest's"
+            raise ConfigError("sync.counter_overflow", overflow, allowed)
+        masters = [bus for bus in self.buses if bus.role == "master"]
+        if (len(masters) - 1) * self.sync.stagger_ms >= self.sync.period_ms:
+            most = self.sync.period_ms / (len(masters) - 1)
+            allowed = (
+                f"below {most:g}: the SYNC of the last of {len(masters)} buses must be out before the next"
+            )
+            raise ConfigError("sync.stagger_ms", self.sync.stagger_ms, allowed)
+        for i, bus in enumerate(self.buses):
+            node_ids = [patch.node_id for patch in self.patches_on(bus.name)]
+            if bus.role == "guest" and bus.heartbeat_node_id is not None:
+                raise ConfigError(
+                    f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, 'only with role = "master"'
+                )
+            if bus.heartbeat_node_id in node_ids:
+                allowed = "an integer from 1 to 127 that no node has"
+                raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, allowed)
+        for i, patch in enumerate(self.patches):
+            bus = self.bus(patch.bus)
+            if bus.role == "master" or bus.guest_sends == "sdo":
+                continue
+            if patch.baseline is None:
+                allowed = f"a file: on {bus.name} the host is a guest that sends nothing"
+                raise ConfigError(f"patches[{i}].baseline", NOTHING, allowed)
+            if patch.layout.coordinates == "node":
+                allowed = f"preset: on {bus.name} the host is a guest that sends nothing"
+                raise ConfigError(f"patches[{i}].layout.coordinates", "node", allowed)
+        guests = [bus.name for bus in self.buses if bus.role == "guest"]
+        if guests and "period_ms" not in self.sync.model_fields_set:
+            allowed = f"that of the SYNC on {guests[0]}, where the host is a guest"
+            raise ConfigError("sync.period_ms", NOTHING, allowed)
+
+
+def load_hand(path: Path | str) -> HandConfig:
+    """Read a hand file. Paths in it are relative to its folder.
+
+    Raises ConfigError, in one line: file that cannot be read, TOML syntax, unknown or missing key, wrong
+    type, value out of range, and everything HandConfig checks; with line and column.
+    """
+    path = Path(path)
+    return _parse(read_toml(path, "hand file"), path.parent)
+
+
+def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: str = "") -> HandConfig:
+    """Validate a table with the keys of a hand file. ``folder`` is where relative paths start (default: the
+    working directory), ``where`` the file to name in errors. Raises ConfigError as :func:`load_hand`.
+    """
+    return _parse(Document(where, dict(table), {}), folder or Path())
+
+
+def _parse(document: Document, folder: Path) -> HandConfig:
+    try:
+        hand = HandConfig.model_validate(document.table, context={"folder": folder})
+    except ValidationError as error:
+        raise first_error(error, HandConfig, document.where) from None
+    hand._read_of = document
+    return hand
+
+
+def _check_geometry(key: str, patch: PatchConfig) -> None:
+    """Raises ConfigError for electrodes that cannot be, or measurements that are not of as many wires."""
+    try:
+        layout = patch.layout.build()
+    except ValueError as error:
+        if patch.layout.file is not None:
+            raise ConfigError(f"{key}.layout.file", str(patch.layout.file), f"a layout ({error})") from None
+        raise impossible(error, f"{key}.layout") from None
+    gains, wires = patch.calibration.upper_gain, layout.shape[0]
+    if gains is not None and len(gains) != wires:
+        allowed = f"{wires} numbers, one for each upper wire"
+        raise ConfigError(f"{key}.calibration.upper_gain", short(list(gains)), allowed)
+
+
+def _require_unique(table: str, key: str, values: Iterable[object]) -> None:
+    seen: dict[object, int] = {}
+    for i, value in enumerate(values):
+        if value in seen:
+            shown = value[-1] if isinstance(value, tuple) else value
+            raise ConfigError(f"{table}[{i}].{key}", shown, f"one that {table}[{seen[value]}] does not use")
+        seen[value] = i

@@ -1,0 +1,226 @@
+"""``[[patches]]``: who a patch is on its bus, what it looks like, where it sits, what was measured of it."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+
+from skinnode.config.explain import first_error
+from skinnode.config.table import (
+    Allowed,
+    Count,
+    Length,
+    Name,
+    NodeId,
+    Ratio,
+    Stiffness,
+    Table,
+    existing_file,
+    one_of,
+)
+from skinnode.config.toml_text import read_toml
+from skinnode.errors import ConfigError
+from skinnode.model.elastic import Rubber
+from skinnode.model.layout import PatchLayout
+from skinnode.model.layout_file import from_electrodes, has_electrodes, impossible, read_npz
+from skinnode.model.pose import Pose
+
+Preset = Literal["aligned", "symmetric", "staggered"]
+Coordinates = Literal["preset", "node"]
+
+_Resistivity = Annotated[
+    float, Field(ge=1e-3, le=1e15, allow_inf_nan=False), Allowed("a number of ohm/m from 1e-3 to 1e15")
+]
+_RUBBER = Rubber()
+_Metres = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False), Allowed("a number from -10 to 10")]
+_Angle = Annotated[
+    float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False), Allowed("a number from -6.2832 to 6.2832")
+]
+_Part = Annotated[float, Field(ge=-1.001, le=1.001, allow_inf_nan=False), Allowed("a number from -1 to 1")]
+_Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a number from 0.1 to 10")]
+
+
+class LayoutConfig(Table):
+    """Geometry of a patch: the arguments of :meth:`skinnode.PatchLayout.preset`, or a file."""
+
+    file: Annotated[Path | None, Field(strict=False), Allowed("the path of a layout file")] = None
+    """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML with the other keys of
+    this table, which then may not stand here. Relative to the hand file."""
+    preset: Annotated[Preset, one_of(Preset)] = "staggered"
+    """Named arrangement of the electrodes."""
+    pitch_m: Length = 4e-3
+    """Distance of neighbours on an upper wire, metres."""
+    height_m: Length = 2e-3
+    """Height of the upper electrodes above the lower ones, metres."""
+    upper_wires: Count = 10
+    """Upper wires U, the rows of a frame."""
+    upper_electrodes: Count = 10
+    """Electrodes of an upper wire, N."""
+    lower_wires: Count | None = None
+    """Lower wires K, the columns of a frame; None is 3 for each electrode of an upper wire."""
+    lower_electrodes: Count | None = None
+    """Electrodes of a lower wire, M; None is one for each upper wire."""
+    resistivity_ohm_per_m: _Resistivity = 1e7
+    """Resistance of the rubber for each metre between two electrodes."""
+    coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
+    """``node``: the patch itself says where its electrodes are (0x2300); preset or file stand for it in plans
+    and simulations, and their numbers of wires and electrodes must be right."""
+
+    @field_validator("file")
+    @classmethod
+    def _existing(cls, value: Path | None, info: ValidationInfo) -> Path | None:
+        return existing_file(value, info, "the path of a layout file")
+
+    @model_validator(mode="after")
+    def _file_or_keys(self) -> LayoutConfig:
+        if self.file is not None:
+            for key in sorted(self.model_fields_set - {"file", "coordinates"}):
+                raise ConfigError(key, getattr(self, key), "only without layout.file, which sets it")
+        return self
+
+    def build(self) -> PatchLayout:
+        """The layout. Raises ValueError where the geometry is impossible, ConfigError for a file that is
+        none."""
+        if self.file is not None:
+            return load_layout(self.file)
+        return _preset(
+            self.preset,
+            pitch_m=self.pitch_m,
+            height_m=self.height_m,
+            upper_wires=self.upper_wires,
+            upper_electrodes=self.upper_electrodes,
+            lower_wires=self.lower_wires,
+            lower_electrodes=self.lower_electrodes,
+            resistivity_ohm_per_m=self.resistivity_ohm_per_m,
+        )
+
+
+@functools.lru_cache(maxsize=256)
+def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
+    """Return a cached layout: patches of a hand are mostly alike and built at every check, and layouts are
+    immutable."""
+    return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
+
+
+class PoseConfig(Table):
+    """Where the patch sits: its frame (x along the upper wires, z out of the skin) in that of the hand."""
+
+    position_m: Annotated[
+        tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
+    ] = (0.0, 0.0, 0.0)
+    """Origin of the patch's frame, metres."""
+    quaternion_xyzw: Annotated[
+        tuple[_Part, _Part, _Part, _Part] | None,
+        Field(strict=False),
+        Allowed("four numbers [x, y, z, w] of unit length"),
+    ] = None
+    """Orientation as a unit quaternion, real part last."""
+    rpy_rad: Annotated[
+        tuple[_Angle, _Angle, _Angle] | None,
+        Field(strict=False),
+        Allowed("three numbers [roll, pitch, yaw], radians"),
+    ] = None
+    """Orientation as roll, pitch, yaw about the fixed axes x, y, z, radians, as URDF has it."""
+
+    @model_validator(mode="after")
+    def _is_one(self) -> PoseConfig:
+        if self.quaternion_xyzw is not None and self.rpy_rad is not None:
+            raise ConfigError("rpy_rad", list(self.rpy_rad), "only without quaternion_xyzw")
+        try:
+            self.build()
+        except ValueError as error:
+            got = list(self.quaternion_xyzw or ())
+            raise ConfigError("quaternion_xyzw", got, f"unit length ({error})") from None
+        return self
+
+    def build(self) -> Pose:
+        """The pose, for :func:`skinnode.model.pose.positions_in_hand_m`."""
+        if self.rpy_rad is not None:
+            return Pose.from_rpy(self.position_m, self.rpy_rad)
+        return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
+
+
+class CalibrationConfig(Table):
+    """What was measured of this patch. Its resistances at rest are ``baseline``, its resistivity is in the
+    layout."""
+
+    stiffness_n_per_m: Stiffness | None = None
+    """Stiffness of the rubber under one electrode, in place of ``solver.stiffness_n_per_m``."""
+    young_pa: Annotated[
+        float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
+    ] = _RUBBER.young_pa
+    """Young's modulus of the rubber, from which the posterior has its forces."""
+    poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
+        _RUBBER.poisson
+    )
+    """Poisson's ratio of the rubber."""
+    upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
+    """One factor for each upper wire that brings its resistances back to what they were when the baseline was
+    taken."""
+
+    @property
+    def rubber(self) -> Rubber:
+        """The material, for the posterior."""
+        return Rubber(self.young_pa, self.poisson)
+
+
+class PatchConfig(Table):
+    """One patch of skin: who it is on the bus and what it looks like."""
+
+    name: Name
+    """What programs and reports call it."""
+    node_id: NodeId
+    """CANopen node-ID, 1 to 127, once on a bus."""
+    bus: Name = "can0"
+    """Name of its bus."""
+    link: Name | None = None
+    """Name of the robot's link that it sits on, for programs that know one."""
+    pose: PoseConfig = PoseConfig()
+    eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
+    """Electronic data sheet to compare with the wire format of this file; relative to the hand file."""
+    layout: LayoutConfig = LayoutConfig()
+    code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
+    """Width of a resistance on the bus."""
+    serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
+        None
+    )
+    """Serial number the node must have (0x1018:4); None takes any. With it a node that does not answer at its
+    node-ID is searched for by LSS and given it."""
+    relative_noise: Ratio = 3e-6
+    """Standard deviation of the analogue noise of a resistance, relative, without quantisation."""
+    baseline: Annotated[
+        Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
+    ] = None
+    """Resistances at rest as text, a line an upper wire and a number a lower wire; None: the node says."""
+    calibration: CalibrationConfig = CalibrationConfig()
+
+    @field_validator("eds", "baseline")
+    @classmethod
+    def _existing_file(cls, value: Path | None, info: ValidationInfo) -> Path | None:
+        what = "an EDS file" if info.field_name == "eds" else "a file of resistances in ohm"
+        return existing_file(value, info, f"the path of {what}")
+
+
+def load_layout(path: Path | str) -> PatchLayout:
+    """Read a layout file: NPZ or TOML with the arrays ``upper_m`` and ``lower_m``, or TOML with the keys of
+    ``[patches.layout]``. Raises ConfigError, in one line, for whatever is wrong with it."""
+    path = Path(path)
+    if path.suffix == ".npz":
+        return read_npz(path)
+    document = read_toml(path, "layout file")
+    if has_electrodes(document.table):
+        return from_electrodes(document.table, path)
+    for key in ("file", "coordinates"):
+        if key in document.table:
+            raise ConfigError(
+                key, document.table[key], "nothing in a layout file", where=document.where((key,))
+            )
+    try:
+        return LayoutConfig.model_validate(document.table).build()
+    except ValidationError as error:
+        raise first_error(error, LayoutConfig, document.where) from None
+    except ValueError as error:
+        raise impossible(error, where=str(path)) from None

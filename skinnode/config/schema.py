@@ -1,0 +1,23 @@
+"""The JSON Schema of a hand file. ``python -m skinnode.config.schema`` writes the shipped one again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Final
+
+from skinnode.config.hand import HandConfig
+
+SCHEMA_FILE: Final = Path(__file__).with_name("hand.schema.json")
+"""As shipped; CI compares it with the code."""
+
+
+def schema_text() -> str:
+    """The schema as JSON, the same bytes for the same code."""
+    schema = HandConfig.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    SCHEMA_FILE.write_text(schema_text(), encoding="utf-8")

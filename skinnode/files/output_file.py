@@ -1,0 +1,42 @@
+"""Files that commands write: known to be writable before any work is done."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from skinnode.errors import ConfigError
+from skinnode.files.whole_file import replace_file
+
+
+def require_writable(option: str, file: Path) -> None:
+    """Raises ConfigError where ``file``, the value of ``option``, could not be written."""
+    try:
+        if file.is_dir():
+            raise ConfigError(option, str(file), "the name of a file, not a folder")
+        target = file if file.exists() else file.absolute().parent
+    except OSError as error:
+        raise ConfigError(option, str(file), f"a file that can be written ({error.strerror})") from error
+    if not os.access(target, os.W_OK):
+        raise ConfigError(option, str(file), "a file in an existing folder that can be written")
+
+
+def write_text(option: str, file: Path, text: str) -> None:
+    """Write ``text`` to ``file``, the value of ``option``. Raises ConfigError if not all of it can be
+    written; the file then keeps its old content."""
+    write_bytes(option, file, text.encode())
+
+
+def write_bytes(option: str, file: Path, data: bytes) -> None:
+    """Write ``data`` like :func:`write_text`. A regular file is replaced once all data is written, and keeps
+    its permissions; anything else, such as a pipe, is written in place."""
+    try:
+        target = Path(os.path.realpath(file))  # for /dev/stdout, a name that does not exist
+        if file.exists() and not (file.is_file() and os.access(target.parent, os.W_OK)):
+            file.write_bytes(data)
+        else:
+            mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o666
+            replace_file(target, data, mode=mode)
+    except OSError as error:
+        raise ConfigError(option, str(file), f"a file that can be written ({error.strerror})") from error

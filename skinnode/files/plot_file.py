@@ -1,0 +1,30 @@
+"""Files of plots. matplotlib is an extra; a command that needs it says so before it does any work."""
+
+from __future__ import annotations
+
+import io
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from skinnode.errors import ConfigError
+from skinnode.files.output_file import write_bytes
+
+
+def require_matplotlib(file: Path) -> None:
+    """Raises ConfigError where matplotlib is missing or does not write files of this kind."""
+    if find_spec("matplotlib") is None:
+        raise ConfigError("--plot", str(file), "only with matplotlib: sh install.sh plot")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    kinds = sorted(FigureCanvasAgg.get_supported_filetypes())
+    if file.suffix.removeprefix(".").lower() not in kinds:
+        raise ConfigError("--plot", str(file), f"a file name that ends in one of {', '.join(kinds)}")
+
+
+def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
+    """Draw a matplotlib ``figure`` to ``file``, whole or not at all, in the format of its suffix. Raises
+    ConfigError if the file cannot be written."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=dpi, format=file.suffix[1:].lower() or None)
+    write_bytes(option, file, drawn.getvalue())

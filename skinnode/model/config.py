@@ -1,0 +1,5 @@
+"""Old path of :mod:`skinnode.config`, for one version."""
+
+from skinnode.moved import moved
+
+__getattr__ = moved(__name__, "skinnode.config")

@@ -1,0 +1,1 @@
+"""Signals, child processes and pauses of garbage collection."""

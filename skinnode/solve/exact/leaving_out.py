@@ -1,0 +1,191 @@
+"""Two switches of the exact tracker that leave unknowns out, and what the deviation of those is.
+
+``normal_only``: x and y of every electrode stay at rest. ``active_only``: the electrodes that no contact
+moves stay at rest. A wire starts with none that moves; when χ² says that this does not explain the frame,
+the electrode that explains most of the residual joins with its neighbours, until χ² is content, or more than
+half have joined and the rest follow. All are at rest again when that explains the frame. The deviation of a
+coordinate so left out is the move at which χ² would have noticed its electrode, were it the only one, in
+first order at rest: √(quantile − degrees of freedom) σ / ‖its column of J outside the range of the unknowns
+and of the electrode's other columns‖.
+
+Both are claims about the skin, and the deviations of the unknowns are those given the claim. Of active_only
+χ² sees to it. Of normal_only it sees less: a smooth shear looks like a slope of z. On staggered h = 0.5,
+noise 1e-5, a Hertzian press with a shear of 0.3 of its depth is refused where it is strong; where not, z is
+off by up to 16 of its small deviations, 0.2 % of h. To allow for it would cost more than to solve for it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.forward import jacobian
+from skinnode.model.layout import Float
+from skinnode.solve.exact.patch_stream import TOLERANCE, Frame, PatchStream
+from skinnode.solve.exact.recovery import recover
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.operators import steps as op
+from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires.follow import Z_HOLD, chi2_quantile
+from skinnode.solve.wires.frame import DEADLINE, STALE
+
+Z_WIDEN: Final = 3.719
+"""Normal deviate of the quantile, 1 − 1e-4, of χ² at which electrodes join: a long press at 100 frames/s
+gains one by chance in 100 s."""
+TINY: Final = 1e-200
+"""Far below any square of a slope, and nothing overflows that is divided by it."""
+
+
+class LeftOut:
+    """What is no unknown on the wires of a stream, and how far it may move unnoticed."""
+
+    def __init__(self, stream: PatchStream, active_only: bool) -> None:
+        problem = stream.problem
+        self._layout = layout = problem.layout
+        self._stream = stream
+        self._active_only = active_only
+        # ∂r/∂x at rest of every coordinate, (U, 3N, K)
+        slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
+        self._slopes = np.ascontiguousarray((slopes * problem.a_rest[:, :, None]).transpose(0, 2, 1))
+        # (U, 3N) what a coordinate may move by unnoticed, pitches a unit of σ, and (U, K) at which weights
+        self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
+        self._unnoticed_weight = np.zeros(layout.shape)
+        # limits of χ² by degrees of freedom
+        self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
+            np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
+            for z in (Z_HOLD, Z_WIDEN, wires.Z_REFUSE)
+        )
+
+    def reset(self) -> None:
+        """Start anew; with ``active_only`` from no electrode that moves."""
+        self._unnoticed_weight[:] = 0.0
+        if self._active_only:
+            for u in range(self._layout.shape[0]):
+                self._set_electrodes(u, np.arange(0))
+
+    def take_in(self, wires_: NDArray[np.bool_]) -> None:
+        """Make every electrode of these wires (U,) an unknown."""
+        for u in np.flatnonzero(wires_).tolist():
+            self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
+
+    def leave_out(self, sigma: float) -> None:
+        """Put wires to rest where that explains the frame; what χ² may miss of all that is no unknown."""
+        solver, its = self._stream.solver, self._stream.arrays
+        if self._active_only:
+            a_rest = self._stream.problem.a_rest
+            usable = np.where(its.used > 0, its.a, 1.0)
+            square = (its.used * (usable / a_rest - 1.0)) ** 2
+            chi2 = square.sum(axis=1) / (sigma**2 + TOLERANCE**2)
+            count = np.count_nonzero(its.used, axis=1)
+            known = (chi2 <= self._chi2_hold[count]) & (count >= solver.each * self._layout.unknowns // 3)
+            for u in np.flatnonzero(known & (solver.free > 0)).tolist():
+                self._set_electrodes(u, np.arange(0))
+                self._unnoticed_weight[u] = 0.0  # to be measured below
+        its.unknowns[:] = self._stream.unknowns
+        if solver.each * solver.free.min() < self._layout.unknowns:
+            for u in np.flatnonzero(_changed(its.used, self._unnoticed_weight)).tolist():
+                self._measure_unnoticed(u, its.used[u])
+            solver.still_std[:] = sigma * self._unnoticed
+
+    def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Let electrodes join on the wires that had a turn and are not explained; (U,) which those were. For
+        those reached after the time was over ``turns`` (U,) becomes False."""
+        unexplained = turns & ~self._explained()
+        for u in [u for u in frame.order.tolist() if unexplained[u]]:
+            turns[u] = not frame.expired
+            self._widen(u, frame)
+        return unexplained
+
+    def _set_electrodes(self, u: int, electrodes: Index) -> None:
+        """Give unknowns to these electrodes of wire u only."""
+        solver, its, problem = self._stream.solver, self._stream.arrays, self._stream.problem
+        solver.set_electrodes(u, electrodes)
+        its.predictable[u] = len(electrodes) == 0
+        if its.predictable[u]:  # then rest is known to be the solution, without noise
+            its.x[u], its.a_solved[u] = problem.rest[u], problem.a_rest[u]
+            solver.a_solved[u], solver.noise[u] = its.a_solved[u], 0.0
+
+    def _measure_unnoticed(self, u: int, weight: Float) -> None:
+        """How far each coordinate that is no unknown moves before χ² notices, pitches a unit of σ."""
+        solver, (_, lower) = self._stream.solver, self._layout.shape
+        self._unnoticed_weight[u] = weight
+        unnoticed = self._unnoticed[u].reshape(-1, 3)
+        unnoticed[:] = 0.0
+        moving = solver.electrodes(u)
+        resting = np.ones(len(unnoticed), bool)
+        resting[moving] = False
+        slopes = (self._slopes[u] * weight).reshape(-1, 3, lower)
+        unknown = slopes[moving, 3 - solver.each :].reshape(-1, lower)
+        spare = np.count_nonzero(weight) - len(unknown)
+        limit = self._chi2_refuse
+        if resting.any():
+            limit = self._chi2_widen if len(moving) else self._chi2_hold
+        least = math.inf if spare <= 0 else math.sqrt(limit[spare] - spare)
+        for group, most in ((moving, 3 - solver.each), (resting, 3)):
+            if most:
+                seen = _outside(slopes[group, :most].reshape(-1, lower), unknown).reshape(-1, most, lower)
+                power, direction = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
+                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # rounding is no knowledge
+                unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
+
+    def _explained(self) -> NDArray[np.bool_]:
+        """(U,) wires at a root or minimum whose χ² noise can cause, and those with no electrode to add."""
+        solver = self._stream.solver
+        spare = solver.report[:, wires.SPARE]
+        limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
+        content = (solver.report[:, wires.HELD] == 1) | (solver.measure[:, wires.CHI2] <= limit)
+        whole = 3 * solver.free == self._layout.unknowns
+        return np.asarray(whole | (self._stream.roots() & content))
+
+    def _widen(self, u: int, frame: Frame) -> None:
+        """Let electrodes of wire u join until they explain the frame; undone where not even all do."""
+        stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
+        before = solver.electrodes(u).copy()
+        while stream.solvable()[u] and not self._explained()[u]:
+            if frame.expired:
+                solver.report[u, wires.STATUS] = DEADLINE
+                break
+            electrodes = np.arange(most)
+            near = not stream.problem.out_of_reach(solver.x)[u]
+            if near and solver.measure[u, wires.CHI2] < np.inf:  # a minimum, if not low enough
+                joined = np.union1d(solver.electrodes(u), self._suspects(u))
+                electrodes = electrodes if 2 * len(joined) > most else joined
+            self._set_electrodes(u, electrodes)
+            solver.x[u] = stream.arrays.x[u]
+            stream.solve(stream.only(u), frame)
+            if len(electrodes) == most and not stream.roots()[u] and stream.solvable()[u]:
+                recover(stream, u, frame)
+        if len(solver.electrodes(u)) > len(before) and not stream.roots()[u]:
+            self._set_electrodes(u, before)
+        if len(solver.electrodes(u)) > len(before):
+            self._measure_unnoticed(u, stream.arrays.used[u])
+            left_out = self._unnoticed[u] > 0
+            solver.std[u, left_out] = frame.sigma * self._unnoticed[u, left_out]
+
+    def _suspects(self, u: int) -> Index:
+        """The electrode at rest that explains most of the residual of wire u, and its neighbours."""
+        solver, its = self._stream.solver, self._stream.arrays
+        each, (_, lower), most = solver.each, self._layout.shape, self._layout.unknowns // 3
+        slopes = (self._slopes[u] * its.used[u]).reshape(most, 3, lower)[:, 3 - each :]
+        moving = solver.electrodes(u)
+        rest = np.setdiff1d(np.arange(most), moving)
+        outside = _outside(slopes[rest].reshape(-1, lower), slopes[moving].reshape(each * len(moving), lower))
+        directions = np.linalg.qr(outside.reshape(-1, each, lower).transpose(0, 2, 1))[0]
+        residual = its.used[u] * self._stream.relative_residual(solver.x[u], its.a[u])
+        explained = ((directions * residual[:, None]).sum(axis=1) ** 2).sum(axis=1)
+        best = int(rest[np.argmax(explained)])
+        return np.arange(max(best - 1, 0), min(best + 2, most))
+
+
+def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
+    """(U,) wires with an equation that counts for over ``STALE`` times as much, or as little, as before."""
+    return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
+
+
+def _outside(rows: Float, others: Float) -> Float:
+    """``rows`` (n, K) less what the rows ``others`` (m, K) span."""
+    q = np.linalg.qr(others.T)[0]
+    return np.asarray(rows - (rows @ q) @ q.T)

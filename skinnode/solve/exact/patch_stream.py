@@ -1,0 +1,125 @@
+"""What all of the exact tracker works on: solver and arrays of the stream of a patch, and what is a root.
+
+A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and
+no electrode moves farther than its clearance from the lower layer. A system with more equations than unknowns
+has no determinant; there χ² of the residual must be one that noise can cause.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.operators import steps as op
+from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires.frame import FrameArrays
+from skinnode.solve.wires.patch_solver import PatchSolver
+from skinnode.solve.wires.problem import PatchProblem
+
+TOLERANCE: Final = 1e-9
+"""Of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from 1e-5."""
+FRAME_STEPS: Final = 12
+"""Most steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
+TASKS: Final = wires.COVARIANCE | wires.REUSE
+"""Of every solve that may be the last of its frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """On what terms the frame in the arrays is solved."""
+
+    sigma: float
+    """The least deviation of its resistances."""
+    order: Index
+    """(U,) the wires as they have their turn."""
+    until: float
+    """When its time is over, s; inf for never."""
+
+    @property
+    def expired(self) -> bool:
+        return self.until < math.inf and perf_counter() >= self.until
+
+
+class PatchStream:
+    """A patch and where its stream is: the solver and the arrays that tracker, recovery and leaving out read
+    and write in place. One owner."""
+
+    def __init__(self, problem: PatchProblem, operator: int, normal_only: bool) -> None:
+        self.problem = problem
+        self.solver = PatchSolver(problem, operator, normal_only)
+        self._rest_branch = self.solver.solve_rest()
+        self._rest_known = self.solver.report[:, wires.STATUS] == op.CONVERGED
+        self._rest_inverse = self.solver.inverse.copy()
+        self.arrays = FrameArrays(problem, self._rest_branch, self.unknowns)
+
+    def reset(self) -> None:
+        """Back to the rest position."""
+        solver, its = self.solver, self.arrays
+        its.x[:], its.a_solved[:] = self.problem.rest, self.problem.a_rest
+        solver.inverse[:] = self._rest_inverse
+        solver.turn = 0
+        solver.a_solved[:] = self.problem.a_rest
+        solver.noise[:] = 0.0
+        its.weight_solved[:] = 1.0
+        its.predictable[:] = self._rest_known
+
+    @property
+    def unknowns(self) -> NDArray[np.int64]:
+        """(U,) unknowns of each wire."""
+        return np.asarray(self.solver.each * self.solver.free)
+
+    def solve(
+        self, todo: NDArray[np.uint8], frame: Frame, *, a: Float | None = None, tasks: int = TASKS,
+        tolerance: float = TOLERANCE, most: int = FRAME_STEPS, method: int | None = None,
+        units: float = math.inf,
+    ) -> None:  # fmt: skip
+        """One call of the solver for the wires in ``todo`` (U,), of at most ``most`` steps a wire. ``a``
+        (U, K) and ``method`` in place of those of the frame and of the solver; ``units`` as in
+        :func:`skinnode.solve.wires.driver.solve_wires`."""
+        self.solver.solve(
+            todo,
+            self.arrays.a if a is None else a,
+            self.arrays.weight,
+            tasks,
+            tolerance,
+            tolerance,
+            most,
+            frame.sigma,
+            method,
+            frame.order,
+            units,
+        )
+
+    def only(self, u: int) -> NDArray[np.uint8]:
+        """(U,) what to do: solve wire u, leave the others."""
+        todo = np.full(len(self.solver.x), wires.LEAVE, np.uint8)
+        todo[u] = wires.SOLVE
+        return todo
+
+    def roots(self) -> NDArray[np.bool_]:
+        """(U,) wires that the solver brought to a root on the branch of the rest position, within reach."""
+        solver = self.solver
+        converged = solver.report[:, wires.STATUS] == op.CONVERGED
+        same_branch = solver.report[:, wires.BRANCH] * self._rest_branch >= 0
+        return np.asarray(converged & same_branch & ~self.problem.out_of_reach(solver.x))
+
+    def solvable(self) -> NDArray[np.bool_]:
+        """(U,) wires with enough usable resistances in the frame for their unknowns."""
+        count = np.count_nonzero(self.arrays.used, axis=1)
+        return np.asarray((count > 0) & (count >= self.unknowns))
+
+    def relative_residual(self, x: Float, a: Float) -> Float:
+        """(K,) a F − 1 of a wire at ``x`` (3N,), pitches."""
+        gaps = x.reshape(-1, 1, 3, 1) - self.problem.lower.transpose(1, 0, 2)[None]
+        return np.asarray(a * (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1)) - 1.0)
+
+    def a_at(self, x: Float) -> Float:
+        """(K,) the a of a wire whose root is ``x`` (3N,), pitches."""
+        return np.asarray(1.0 / (1.0 + self.relative_residual(x, np.ones(self.problem.layout.shape[1]))))

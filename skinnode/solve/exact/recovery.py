@@ -1,0 +1,97 @@
+"""A second try for the wires of a frame that no solve brought to a root that counts.
+
+bridge     R interpolated from the last trusted frame to the new one, solved substep by substep
+restart    the same from the rest position
+give up    a wire that still fails keeps its last trusted position, with an infinite deviation and a status
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float
+from skinnode.solve.exact.patch_stream import Frame, PatchStream
+from skinnode.solve.operators import steps as op
+from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires.frame import DEADLINE
+
+BRIDGES: Final = (3, 5, 10)
+"""Substeps of the bridges tried in turn. On staggered, h = 0.5, from rest: 3 bring every wire through
+a 50 % press between two frames, 5 all but one of 24 through 70 %. Steps halved and doubled, and held to the
+trusted branch, do worse: the straight line crosses singular points that the press does not."""
+BRIDGE_TOLERANCE: Final = 1e-6
+"""Of the substeps of a bridge, the paper's intermediate tolerance."""
+BRIDGE_STEPS: Final = 20
+"""Most steps of a substep."""
+RECOVERY_STEPS: Final = 300
+"""Most steps all bridges of a frame may take together, about 15 ms: a broken frame must
+not stop the stream."""
+
+
+def recover_lost(
+    stream: PatchStream, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
+) -> None:
+    """Recover the wires that are not at a root, into ``good`` and ``status`` of the stream's arrays; give up
+    those that fail, and the ``exhausted`` (U,), of which nothing is left to try. Who would need time that
+    is over has had no turn: False in ``turns`` (U,)."""
+    solver, its = stream.solver, stream.arrays
+    good, status = its.good, its.status
+    good[:], status[:] = stream.roots(), solver.report[:, wires.STATUS]
+    if good.all():
+        return
+    status[(status == op.CONVERGED) & ~good] = op.ILL_CONDITIONED
+    lost = ~good & (status != DEADLINE) & stream.solvable()
+    for u in [u for u in frame.order.tolist() if lost[u] and not exhausted[u]]:
+        if frame.expired:
+            turns[u], status[u] = False, DEADLINE
+            continue
+        good[u] = recover(stream, u, frame)
+        ended = int(solver.report[u, wires.STATUS])
+        status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
+    solver.std[~good] = np.inf
+    its.predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
+
+
+def recover(stream: PatchStream, u: int, frame: Frame) -> bool:
+    """Bridge wire u from its last trusted position, then from rest; whether that brought it to a root."""
+    solver, its, problem = stream.solver, stream.arrays, stream.problem
+    starts = [(its.x[u].copy(), its.a_solved[u].copy())]
+    rest = problem.rest[u], problem.a_rest[u]
+    if not np.array_equal(starts[0][0], rest[0]):
+        starts.append(rest)
+    for substeps in BRIDGES:
+        for x_from, a_from in starts:
+            if solver.tally[2] >= RECOVERY_STEPS:
+                return False
+            if not _bridge(stream, u, x_from, a_from, frame, substeps):
+                solver.report[u, wires.STATUS] = DEADLINE
+                return False
+            if stream.roots()[u]:
+                return True
+    return False
+
+
+def _bridge(stream: PatchStream, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int) -> bool:
+    """Solve wire u along the straight line of its resistances from ``a_from`` (K,) to those of the frame.
+
+    Only the last point counts: the line is no deformation of rubber, so the points between may lie on any
+    branch. The outcome is the solver's report of the wire. False where the deadline cut it short.
+    """
+    todo, a_to = stream.only(u), stream.arrays.a[u]
+    between = stream.arrays.a.copy()
+    stream.solver.x[u] = x_from
+    method = op.LEVENBERG_MARQUARDT  # the sturdiest across a gap, whatever follows the stream
+    for part in range(1, substeps):
+        if frame.expired:
+            return False
+        between[u] = a_from + part / substeps * (a_to - a_from)
+        stream.solve(
+            todo, frame, a=between, tasks=0, tolerance=BRIDGE_TOLERANCE, most=BRIDGE_STEPS, method=method
+        )
+    if frame.expired:
+        return False
+    stream.solve(todo, frame, most=BRIDGE_STEPS, method=method)
+    return True

@@ -1,0 +1,265 @@
+"""Dense kernels for some hundred unknowns: Cholesky, triangular solves, products.
+
+LAPACK would do, but the last bits of OpenBLAS depend on its number of threads, and the same frames have to
+give the same field whatever that is. Here each element of a result is one sum in the order of its index, so
+that neither threads nor a split of the columns change it.
+
+All of it is one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, which
+costs 8 loads for 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix multiplication,
+2008). Arrays are C-ordered float64; of buffers bigger than the problem the leading n rows and columns are
+used. Nothing is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.compiled.simd import LANES, fma, load, splat, store, total
+from skinnode.model.layout import Float
+
+ROWS: Final = 6
+"""Rows of a tile: with 2 vectors a row, 12 sums, 2 loads and a factor fit the 16 registers of AVX2."""
+TILE: Final = 2 * LANES
+"""Columns of a tile."""
+
+
+@njit_part
+def _tile(
+    c: Float, r: int, rows: int, a: Float, b: Float, low: int, high: int, col: int, count: int, subtract: bool
+) -> None:
+    """``c``[r:r+rows, tile] = Σ_k ``a``[r:r+rows, k] ``b``[k, tile], low ≤ k < high, or is reduced by it.
+
+    The tile is ``count`` ≤ TILE columns from ``col`` on; rows ≤ ROWS.
+    """
+    zero = splat(0.0)
+    right = col + LANES
+    more = count - LANES
+    if rows < ROWS:
+        for i in range(r, r + rows):
+            c0, c1 = zero, zero
+            factors = a[i]
+            for k in range(low, high):
+                row = b[k]
+                c0 = fma(factors[k], load(row, col, count), c0)
+                c1 = fma(factors[k], load(row, right, more), c1)
+            row = c[i]
+            if subtract:
+                c0 = load(row, col, count) - c0
+                c1 = load(row, right, more) - c1
+            store(row, col, count, c0)
+            store(row, right, more, c1)
+        return
+    a0, a1, a2, a3, a4, a5 = a[r], a[r + 1], a[r + 2], a[r + 3], a[r + 4], a[r + 5]
+    c00, c10, c20, c30, c40, c50 = zero, zero, zero, zero, zero, zero
+    c01, c11, c21, c31, c41, c51 = zero, zero, zero, zero, zero, zero
+    for k in range(low, high):
+        row = b[k]
+        b0 = load(row, col, count)
+        b1 = load(row, right, more)
+        c00, c01 = fma(a0[k], b0, c00), fma(a0[k], b1, c01)
+        c10, c11 = fma(a1[k], b0, c10), fma(a1[k], b1, c11)
+        c20, c21 = fma(a2[k], b0, c20), fma(a2[k], b1, c21)
+        c30, c31 = fma(a3[k], b0, c30), fma(a3[k], b1, c31)
+        c40, c41 = fma(a4[k], b0, c40), fma(a4[k], b1, c41)
+        c50, c51 = fma(a5[k], b0, c50), fma(a5[k], b1, c51)
+    t0, t1, t2, t3, t4, t5 = c[r], c[r + 1], c[r + 2], c[r + 3], c[r + 4], c[r + 5]
+    if subtract:
+        c00, c01 = load(t0, col, count) - c00, load(t0, right, more) - c01
+        c10, c11 = load(t1, col, count) - c10, load(t1, right, more) - c11
+        c20, c21 = load(t2, col, count) - c20, load(t2, right, more) - c21
+        c30, c31 = load(t3, col, count) - c30, load(t3, right, more) - c31
+        c40, c41 = load(t4, col, count) - c40, load(t4, right, more) - c41
+        c50, c51 = load(t5, col, count) - c50, load(t5, right, more) - c51
+    store(t0, col, count, c00)
+    store(t1, col, count, c10)
+    store(t2, col, count, c20)
+    store(t3, col, count, c30)
+    store(t4, col, count, c40)
+    store(t5, col, count, c50)
+    store(t0, right, more, c01)
+    store(t1, right, more, c11)
+    store(t2, right, more, c21)
+    store(t3, right, more, c31)
+    store(t4, right, more, c41)
+    store(t5, right, more, c51)
+
+
+@njit_part
+def _forward(l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int) -> None:
+    """Rows r to r + rows of L⁻¹ B in place of a tile of ``b``, whose rows low to r have theirs."""
+    _tile(b, r, rows, l, b, low, r, col, count, True)
+    right = col + LANES
+    more = count - LANES
+    for i in range(r, r + rows):
+        factors, row = l[i], b[i]
+        b0 = load(row, col, count)
+        b1 = load(row, right, more)
+        for k in range(r, i):
+            above = b[k]
+            b0 = fma(-factors[k], load(above, col, count), b0)
+            b1 = fma(-factors[k], load(above, right, more), b1)
+        inverse = 1.0 / factors[i]
+        store(row, col, count, b0 * inverse)
+        store(row, right, more, b1 * inverse)
+
+
+@njit
+def cholesky(a: Float, n: int) -> int:
+    """Cholesky factor of the symmetric ``a`` (n, n) in place: L on and below the diagonal, Lᵀ above it.
+
+    Only what is on and above the diagonal is read. 1, or 0 where ``a`` is not positive definite.
+    """
+    first: Any = np.int64(0)  # a literal 0 would have what it is given to compiled once more
+    for r in range(0, n, ROWS):
+        rows = min(ROWS, n - r)
+        end = r + rows
+        _tile(a, r, rows, a, a, first, r, r, rows, True)
+        for i in range(r, end):
+            upper = a[i]
+            for k in range(r, i):
+                factor = a[k, i]
+                for j in range(i, end):
+                    upper[j] -= factor * a[k, j]
+            pivot = upper[i]
+            if not (pivot > 0.0 and pivot < math.inf):
+                return 0
+            root = math.sqrt(pivot)
+            upper[i] = root
+            for j in range(i + 1, end):
+                upper[j] /= root
+                a[j, i] = upper[j]
+        for col in range(end, n, TILE):
+            _forward(a, a, r, rows, first, col, min(TILE, n - col))
+        for j in range(end, n):
+            lower = a[j]
+            for i in range(r, end):
+                lower[i] = a[i, j]
+    return 1
+
+
+@njit
+def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
+    """L⁻¹ B in place of the leading (n, cols) of ``b``; of ``l`` the lower triangle is read."""
+    first: Any = np.int64(0)
+    for col in range(0, cols, TILE):
+        for r in range(0, n, ROWS):
+            _forward(l, b, r, min(ROWS, n - r), first, col, min(TILE, cols - col))
+
+
+@njit_part
+def _backward(l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int) -> None:
+    """Rows r to r + rows of L⁻ᵀ B in place of a tile of ``b``, whose rows r + rows to n have theirs."""
+    _tile(b, r, rows, l, b, r + rows, n, col, count, True)
+    right = col + LANES
+    more = count - LANES
+    for i in range(r + rows - 1, r - 1, -1):
+        factors, row = l[i], b[i]
+        b0 = load(row, col, count)
+        b1 = load(row, right, more)
+        for k in range(i + 1, r + rows):
+            below = b[k]
+            b0 = fma(-factors[k], load(below, col, count), b0)
+            b1 = fma(-factors[k], load(below, right, more), b1)
+        inverse = 1.0 / factors[i]
+        store(row, col, count, b0 * inverse)
+        store(row, right, more, b1 * inverse)
+
+
+@njit
+def solve_lower_transposed(l: Float, b: Float, n: int, cols: int) -> None:
+    """L⁻ᵀ B in place of the leading (n, cols) of ``b``; of ``l`` the upper triangle is read, which has Lᵀ."""
+    for col in range(0, cols, TILE):
+        for r in range((n - 1) // ROWS * ROWS, -1, -ROWS):
+            _backward(l, b, r, min(ROWS, n - r), n, col, min(TILE, cols - col))
+
+
+@njit
+def solve_lower_vector(l: Float, v: Float, n: int) -> None:
+    """L⁻¹ v in place of the leading n of ``v``."""
+    for i in range(n):
+        row = l[i]
+        even, odd = splat(0.0), splat(0.0)
+        for k in range(0, i, TILE):
+            right, left, more = k + LANES, i - k, i - k - LANES
+            even = fma(load(row, k, left), load(v, k, left), even)
+            odd = fma(load(row, right, more), load(v, right, more), odd)
+        v[i] = (v[i] - total(even + odd)) / row[i]
+
+
+@njit
+def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
+    """L⁻ᵀ v in place of the leading n of ``v``."""
+    for i in range(n - 1, -1, -1):
+        row = l[i]
+        value = v[i] / row[i]
+        v[i] = value
+        for k in range(0, i, LANES):
+            store(v, k, i - k, fma(-value, load(row, k, i - k), load(v, k, i - k)))
+
+
+@njit
+def multiply(a: Float, b: Float, c: Float) -> None:
+    """``c`` (m, n) = ``a`` (m, k) · ``b`` (k, n)."""
+    (rows, inner), cols = a.shape, b.shape[1]
+    first: Any = np.int64(0)
+    for col in range(0, cols, TILE):
+        for r in range(0, rows, ROWS):
+            _tile(c, r, min(ROWS, rows - r), a, b, first, inner, col, min(TILE, cols - col), False)
+
+
+@njit
+def multiply_vector(a: Float, v: Float, out: Float) -> None:
+    """``out`` (m,) = ``a`` (m, n) · ``v`` (n,)."""
+    n = v.size
+    for i in range(out.size):
+        row = a[i]
+        even, odd = splat(0.0), splat(0.0)
+        for k in range(0, n, TILE):
+            right, left, more = k + LANES, n - k, n - k - LANES
+            even = fma(load(row, k, left), load(v, k, left), even)
+            odd = fma(load(row, right, more), load(v, right, more), odd)
+        out[i] = total(even + odd)
+
+
+@njit
+def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
+    """``c`` (m, n) = ``a`` (m, k) · ``b``ᵀ with ``b`` (n, k); ``work`` (k, n) is scratch.
+
+    Where Bᵀ is at hand, :func:`multiply` does the same.
+    """
+    for j in range(b.shape[0]):
+        row = b[j]
+        for k in range(row.size):
+            work[k, j] = row[k]
+    multiply(a, work, c)
+
+
+@njit
+def inverse_diagonal(l: Float, work: Float, out: Float, n: int) -> None:
+    """Diagonal of (L Lᵀ)⁻¹ into the leading n of ``out``: out_j = Σ_i (L⁻¹)_ij².
+
+    L⁻¹ is left in the lower triangle of ``work`` (n, n).
+    """
+    for col in range(0, n, TILE):
+        count = min(TILE, n - col)
+        right, more = col + LANES, count - LANES
+        s0, s1 = splat(0.0), splat(0.0)
+        for r in range(col, n, ROWS):
+            rows = min(ROWS, n - r)
+            for i in range(r, r + rows):
+                row = work[i]
+                store(row, col, count, splat(0.0))
+                store(row, right, more, splat(0.0))
+                if i < col + count:
+                    row[i] = 1.0
+            _forward(l, work, r, rows, col, col, count)
+            for i in range(r, r + rows):
+                row = work[i]
+                b0, b1 = load(row, col, count), load(row, right, more)
+                s0, s1 = fma(b0, b0, s0), fma(b1, b1, s1)
+        store(out, col, count, s0)
+        store(out, right, more, s1)

@@ -1,0 +1,179 @@
+"""Loads on the skin and the contacts they form, from the posterior of the displacement.
+
+The prior's loads q ~ N(0, s² D) move the electrodes by u = G q + slack. Given the displacement their mean is
+D Gᵀ C⁻¹ u; after the frame the variance of any sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the notation of
+solve/posterior/innovation.py.
+
+Single cells are noisy and their neighbours make up for it, so contacts are looked for in sums of 3 × 3 cells:
+those that press significantly, and not much less than the strongest, form contacts with their neighbours.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skinnode.compiled.jit import njit
+from skinnode.model.frames import Contact
+from skinnode.model.layout import Float, PatchLayout
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.posterior.estimate import PRIOR_DOUBT, Estimator
+from skinnode.solve.posterior.prior import ElasticPrior
+
+SIGNIFICANT: Final = 5.0
+"""Deviations by which a sum of cells must press to be part of a contact: with 200 sums a frame, noise does so
+once in some ten thousand frames."""
+RELEVANT: Final = 0.25
+"""Share of the strongest sum that another must reach: the flanks of a contact ring at a tenth."""
+HERTZ_SPREAD: Final = 2.5
+"""a² over the mean of r² under Hertz's pressure √(1 − r²/a²)."""
+
+
+class ContactFinder:
+    """The constants of a patch, and the deviations of its sums of cells."""
+
+    def __init__(self, prior: ElasticPrior, layout: PatchLayout) -> None:
+        self._prior = prior
+        self._own = prior.own_cells().ravel()
+        self._own_frame = prior.frame[self._own]
+        self._electrodes = layout.upper_m.shape
+        cells = prior.shape[0] * prior.shape[1]
+        near = np.pad(np.arange(cells).reshape(prior.shape), 1, constant_values=-1)
+        rows, columns = prior.shape
+        box = np.stack([near[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=-1)
+        self._near: Index = box.reshape(cells, 9)  # a cell and its neighbours, −1 beyond the lattice
+        self._region, self._label, self._stack = np.empty((3, cells), np.int64)
+        self._made_by = -1
+        self._box_std = np.full(cells, np.nan)
+
+    def find(self, estimator: Estimator) -> tuple[Float, tuple[Contact, ...]]:
+        """(U, N, 3) forces on the cells of the electrodes, N, and the contacts, the strongest first."""
+        q = estimator.loads()
+        force = np.einsum("qt,qti->qi", q[self._own] * self._prior.load_n, self._own_frame)
+        pressing = -np.append(q[:, 2], 0.0)[self._near].sum(axis=1)
+        strong = np.flatnonzero(pressing > RELEVANT * max(float(pressing.max()), 0.0))
+        seed = strong[pressing[strong] > SIGNIFICANT * self._deviations(strong, estimator)]
+        count = _number_regions(self._near, seed, self._label, self._region, self._stack)
+        found = [
+            contact
+            for number in range(1, count + 1)
+            if (contact := self._contact(np.flatnonzero(self._region == number), q, estimator)) is not None
+        ]
+        found.sort(key=lambda contact: -contact.normal_force_n)
+        return force.reshape(self._electrodes), tuple(found)
+
+    def warm_up(self, estimator: Estimator) -> None:
+        """Compile what a contact needs."""
+        self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), estimator)
+
+    def _deviations(self, boxes: Index, estimator: Estimator) -> Float:
+        """(B,) deviations of these sums; each is worked out once for a set of factors."""
+        if self._made_by != estimator.factors:
+            self._made_by = estimator.factors
+            self._box_std[:] = np.nan
+        new = boxes[np.isnan(self._box_std[boxes])]
+        if new.size:
+            near = self._near[new]
+            self._box_std[new] = estimator.load_std(3 * np.maximum(near, 0) + 2, (near >= 0).astype(float))
+        return self._box_std[boxes]
+
+    def _contact(self, region: Index, q: Float, estimator: Estimator) -> Contact | None:
+        """The contact on the cells ``region``."""
+        loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
+        centroid, shear = np.empty((2, 3))
+        force, spread = _sum_region(
+            region, q, self._prior.load_n, self._prior.cell_m, centroid, shear, loads, weights
+        )
+        if not force > 0:
+            return None
+        # how a contact's load is shared out to its cells is for the most part the prior's word
+        std = math.sqrt(PRIOR_DOUBT) * estimator.load_std(loads, weights)
+        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load all over its cell about the centre
+        return Contact(
+            centroid_m=centroid,
+            centroid_std_m=std[1:4],
+            area_m2=math.pi * HERTZ_SPREAD * max(spread, 0.0),
+            area_std_m2=math.pi * HERTZ_SPREAD * float(std[4]),
+            normal_force_n=force,
+            normal_force_std_n=float(std[0]),
+            shear_force_n=shear[:2],
+            shear_force_std_n=std[5:],
+        )
+
+
+@njit
+def _number_regions(near: Index, seed: Index, label: Index, region: Index, stack: Index) -> int:
+    """Number the connected groups of the cells ``seed`` from 1 on into ``label`` (Q,), 0 elsewhere, and their
+    cells and neighbours into ``region`` (Q,), a cell between two groups to the first; how many there are.
+
+    ``stack`` (Q,) is scratch.
+    """
+    label[:], region[:] = 0, 0
+    for cell in seed:
+        label[cell] = -1
+    count = 0
+    for first in seed:
+        if label[first] > 0:
+            continue
+        count += 1
+        label[first], stack[0], top = count, first, 1
+        while top > 0:
+            top -= 1
+            for i in near[stack[top]]:
+                if i < 0:
+                    continue
+                if region[i] == 0:
+                    region[i] = count
+                if label[i] < 0:
+                    label[i], stack[top] = count, i
+                    top += 1
+    return count
+
+
+@njit
+def _sum_region(
+    region: Index,
+    q: Float,
+    load: Float,
+    place: Float,
+    centroid: Float,
+    shear: Float,
+    loads: Index,
+    weights: Float,
+) -> tuple[float, float]:
+    """Normal force, N, and mean r² of the pressure, m², on the cells ``region`` (n,); ``centroid`` (3,) and
+    ``shear`` (3,) force with them.
+
+    ``loads`` and ``weights`` (7, n) say how force, centroid, mean r² and shear change with the loads, to
+    first order (delta method). All but the force are undefined where that is not positive.
+    """
+    force, mean = 0.0, 0.0
+    for t in range(3):
+        centroid[t], shear[t] = 0.0, 0.0
+    for cell in region:
+        force -= q[cell, 2] * load[2]
+    if not force > 0.0:
+        return force, mean
+    for cell in region:
+        for t in range(3):
+            centroid[t] -= q[cell, 2] * load[2] * place[cell, t] / force
+            shear[t] += q[cell, t] * load[t]
+    for c in range(region.size):
+        cell = region[c]
+        spread = 0.0
+        for t in range(3):
+            away = place[cell, t] - centroid[t]
+            weights[1 + t, c] = away * load[2] / force
+            spread += away * away
+        weights[4, c] = spread
+        mean -= q[cell, 2] * load[2] * spread / force
+    for c in range(region.size):
+        weights[0, c] = load[2]
+        weights[4, c] = (weights[4, c] - mean) * load[2] / force
+        weights[5, c], weights[6, c] = load[0], load[1]
+        for f in range(5):
+            loads[f, c] = 3 * region[c] + 2
+        loads[5, c], loads[6, c] = 3 * region[c], 3 * region[c] + 1
+    return force, mean

@@ -1,0 +1,428 @@
+"""The linear algebra of one posterior step, in the space of the data.
+
+The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
+g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, its model
+
+    r(x) − H g = noise of deviation 1,      H: what a unit of each nuisance does to r
+
+With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
+
+    x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
+
+and the covariance there s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
+2005, 3.4). No eigenvalue of S is below 1, so that rounding costs ε ‖S‖ of a standard deviation: a thousandth
+at signals of 10⁶ σ, whatever the condition of J.
+
+A step with the factors of an older J still leads to the same place. At the maximum of the posterior
+e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish, and with the old J, H, S
+
+    δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
+
+is Newton's correction, a chord step, at the cost of two triangular solves.
+
+A wire with more equations than unknowns is first reduced to as many by a QR of [J H], which loses nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.kernels import potential, potential_jacobian
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.cholesky import (
+    multiply,
+    solve_lower_transposed,
+    solve_lower_transposed_vector,
+    solve_lower_vector,
+)
+from skinnode.solve.linalg.factorisations import Index, dot, qr_factor, qr_project
+
+
+class Buffers(NamedTuple):
+    """What the step of a patch writes to: U wires, K equations and f free coordinates each, p nuisances,
+    R = min(K, f + p) rows a wire after reduction."""
+
+    r: Float
+    """(U, K) residuals."""
+    jt: Float
+    """(U, 3N, K) transposed Jacobians."""
+    free_jt: Float
+    """(f + p, K) the rows of one wire's Jᵀ that are free, then its Hᵀ."""
+    jacobian: Float
+    """(U R, f) J of the wires in the step, one below the other."""
+    nuisance: Float
+    """(U R, p) H of them."""
+    y: Float
+    """(U R,)"""
+    gain: Float
+    """(U R, U f) s² J C."""
+    innovation: Float
+    """(U R, U R) S, then its factor L."""
+    whitened: Float
+    """(U R, U f) V."""
+    weights: Float
+    """(U R, U f) Kᵀ, what a unit of noise of each equation does to the estimate."""
+    work: Float
+    """(U R, U R) scratch."""
+    gradient: Float
+    """(U f,) Jᵀ (r − H g)."""
+    v: Float
+    """(U R,) scratch."""
+    block: Float
+    """(f, K) Jᵀ of one wire in one piece."""
+    qr: Float
+    """(K, f + p)"""
+    diagonal: Float
+    beta: Float
+    scratch: Float
+    e: Float
+    """(K,) scratch."""
+
+
+def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: int) -> Buffers:
+    """Zeroed buffers."""
+    columns = free + nuisances
+    rows = min(equations, columns)
+    m, n = wires * rows, wires * free
+    return Buffers(
+        r=np.zeros((wires, equations)), jt=np.zeros((wires, coordinates, equations)),
+        free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
+        nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
+        gain=np.zeros((m, n)), innovation=np.zeros((m, m)), whitened=np.zeros((m, n)),
+        weights=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
+        block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
+        beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
+    )  # fmt: skip
+
+
+@njit
+def linearise(members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
+    """r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    potentials(members, x, lower, r, jt)
+    weigh(members, a, weight, r, jt)
+
+
+@njit
+def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> None:
+    """F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    for i in range(members.size):
+        u = members[i]
+        potential_jacobian(x[u], lower, f[u], jt[u])
+
+
+@njit
+def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
+    """In place of F and its Jacobian, r = w (a F − 1) and its own."""
+    for i in range(members.size):
+        u = members[i]
+        r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
+        for k in range(r_u.size):
+            r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+        for j in range(jt_u.shape[0]):
+            row = jt_u[j]
+            for k in range(r_u.size):
+                row[k] *= w_u[k] * a_u[k]
+
+
+@njit
+def residuals(
+    members: Index, x: Float, lower: Float, a: Float, weight: Float, h: Float, g: Float, r: Float
+) -> float:
+    """r − H g with r = w (a F − 1) of the wires ``members`` (P,) into ``r`` (U, K); the sum of squares."""
+    square = 0.0
+    for i in range(members.size):
+        u = members[i]
+        r_u, a_u, w_u = r[u], a[u], weight[u]
+        potential(x[u], lower, r_u)
+        for k in range(r_u.size):
+            r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+        for q in range(g.size):
+            for k in range(r_u.size):
+                r_u[k] -= h[u, k, q] * g[q]
+        square += dot(r_u, r_u)
+    return square
+
+
+@njit
+def surprises(
+    free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
+) -> None:
+    """r − H g in place of ``r`` (U, K), and how badly that fits: χ² of each wire into ``square_sum`` (U,); by
+    how much each coordinate alone would be off, |Jᵢᵀ r| / ‖Jᵢ‖², into ``move`` (U, f); and the largest of a
+    wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
+    for u in range(jt.shape[0]):
+        r_u = r[u]
+        for q in range(g.size):
+            for k in range(r_u.size):
+                r_u[k] -= h[u, k, q] * g[q]
+        square_sum[u] = dot(r_u, r_u)
+        top[u] = 0.0
+        for i in range(free.size):
+            row = jt[u, free[i]]
+            square = dot(row, row)
+            move[u, i] = 0.0
+            if square > 0.0:
+                along = abs(dot(row, r_u))
+                move[u, i] = along / square
+                top[u] = max(top[u], along / math.sqrt(square))
+
+
+@njit
+def load_squares(told: Float, loads: Index, weights: Float, out: Float) -> None:
+    """‖L⁻¹ J G w‖² of the sums w with ``weights`` (F, n) of the ``loads`` (F, n) into ``out`` (F,); ``told``
+    (m, 3Q) is L⁻¹ J G."""
+    for f in range(out.size):
+        out[f] = 0.0
+    for i in range(told.shape[0]):
+        row = told[i]
+        for f in range(out.size):
+            value, column, weight = 0.0, loads[f], weights[f]
+            for c in range(weight.size):
+                value += weight[c] * row[column[c]]
+            out[f] += value * value
+
+
+@njit
+def loads_found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
+    """Squares of the loads ``q`` (Q, 3), freed from their own prior variances ``own`` (Q,), into ``found``
+    (Q,): of a cell the largest that is significant, else 0; ``stiffness`` (3Q,). The largest square over its
+    noise."""
+    most = 0.0
+    for cell in range(found.size):
+        found[cell] = 0.0
+        for i in range(3):
+            k = stiffness[3 * cell + i]
+            alone = q[cell, i] / (own[cell] * k)
+            noise = max(1.0 / k - own[cell], 0.0)
+            if alone * alone > significant * noise:
+                found[cell] = max(found[cell], alone * alone - noise)
+                most = max(most, alone * alone / noise if noise > 0.0 else math.inf)
+    return most
+
+
+@njit_part
+def _reduce(u: int, top: int, free: Index, h: Float, x: Float, b: Buffers) -> None:
+    """J, H and y of wire ``u`` into the rows from ``top`` on, reduced to as many as there are columns."""
+    f, p = free.size, h.shape[2]
+    equations = h.shape[1]
+    y = b.e
+    for k in range(equations):
+        y[k] = -b.r[u, k]
+    for i in range(f):
+        row, source, value = b.free_jt[i], b.jt[u, free[i]], x[u, free[i]]
+        for k in range(equations):
+            row[k] = source[k]
+            y[k] += source[k] * value
+    for q in range(p):
+        row = b.free_jt[f + q]
+        for k in range(equations):
+            row[k] = h[u, k, q]
+    if equations <= f + p:
+        for k in range(equations):
+            b.y[top + k] = y[k]
+            row = b.jacobian[top + k]
+            for i in range(f):
+                row[i] = b.free_jt[i, k]
+            for q in range(p):
+                b.nuisance[top + k, q] = h[u, k, q]
+        return
+    qr_factor(b.free_jt, b.qr, b.diagonal, b.beta, b.scratch)
+    qr_project(b.qr, b.beta, y)
+    for k in range(f + p):
+        b.y[top + k] = y[k]
+        row, source = b.jacobian[top + k], b.qr[k]
+        for i in range(f):
+            row[i] = source[i] if i > k else (b.diagonal[k] if i == k else 0.0)
+        for q in range(p):
+            j = f + q
+            b.nuisance[top + k, q] = source[j] if j > k else (b.diagonal[k] if j == k else 0.0)
+
+
+@njit
+def assemble(
+    members: Index, free: Index, c: Float, s2: float, h: Float, d: Float, x: Float, b: Buffers
+) -> float:
+    """J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``; trace of s² J C Jᵀ.
+
+    ``free`` (f,) coordinates of a wire that move; ``c`` (U f, U f) their prior; ``h`` (U, K, p), ``d`` (p,).
+    Of S the upper triangle is written.
+    """
+    f, p = free.size, h.shape[2]
+    rows = b.jacobian.shape[0] // x.shape[0]
+    trace = 0.0
+    for i in range(members.size):
+        u, top = members[i], i * rows
+        _reduce(u, top, free, h, x, b)
+        multiply(b.jacobian[top : top + rows], c[u * f : (u + 1) * f], b.gain[top : top + rows])
+        for k in range(top, top + rows):
+            row = b.gain[k]
+            for j in range(row.size):
+                row[j] *= s2
+    for i in range(members.size):
+        u, left = members[i], i * rows
+        for k in range(rows):
+            source = b.jacobian[left + k]
+            for j in range(f):
+                b.block[j, k] = source[j]
+        for q in range(i + 1):
+            top = q * rows
+            multiply(
+                b.gain[top : top + rows, u * f : (u + 1) * f],
+                b.block,
+                b.innovation[top : top + rows, left : left + rows],
+            )
+        for k in range(left, left + rows):
+            trace += b.innovation[k, k]
+            for q in range(p):
+                value = d[q] * b.nuisance[k, q]
+                if value != 0.0:
+                    for t in range(k + 1):
+                        b.innovation[t, k] += value * b.nuisance[t, q]
+            b.innovation[k, k] += 1.0
+    return trace
+
+
+@njit
+def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers) -> None:
+    """The Gauss-Newton step into ``x`` and ``g``, with L in place of S."""
+    f = free.size
+    rows = b.jacobian.shape[0] // x.shape[0]
+    m = members.size * rows
+    for k in range(m):
+        b.v[k] = b.y[k]
+    solve_lower_vector(b.innovation, b.v, m)
+    solve_lower_transposed_vector(b.innovation, b.v, m)
+    for j in range(b.gradient.size):
+        b.gradient[j] = 0.0
+    for k in range(m):
+        value, row = b.v[k], b.gain[k]
+        for j in range(row.size):
+            b.gradient[j] += value * row[j]
+    for u in range(x.shape[0]):
+        for i in range(f):
+            x[u, free[i]] = b.gradient[u * f + i]
+    for q in range(g.size):
+        total = 0.0
+        for k in range(m):
+            total += b.nuisance[k, q] * b.v[k]
+        g[q] = -d[q] * total
+
+
+@njit
+def noise_variance(m: int, d: Float, b: Buffers, out: Float) -> None:
+    """What the noise of ``m`` equations and the nuisances put into the estimate, diag(K (I + H d Hᵀ) Kᵀ)
+    with Kᵀ = L⁻ᵀ V, into ``out`` (U f,). V and L are at hand."""
+    n = out.size
+    for k in range(m):
+        for j in range(n):
+            b.weights[k, j] = b.whitened[k, j]
+    solve_lower_transposed(b.innovation, b.weights, m, n)
+    for j in range(n):
+        out[j] = 0.0
+    for k in range(m):
+        row = b.weights[k]
+        for j in range(n):
+            out[j] += row[j] * row[j]
+    for q in range(d.size):
+        for j in range(n):
+            b.gradient[j] = 0.0
+        for k in range(m):
+            value, row = b.nuisance[k, q], b.weights[k]
+            if value != 0.0:
+                for j in range(n):
+                    b.gradient[j] += value * row[j]
+        for j in range(n):
+            out[j] += d[q] * b.gradient[j] * b.gradient[j]
+
+
+@njit
+def deviations(
+    m: int, c: Float, s2: float, noise: Float, doubt: float, share: float, std: Float, core: Float, b: Buffers
+) -> None:
+    """Deviations (U, f) from the variance of the posterior, s² C − Vᵀ V, V being at hand: what is ``noise``
+    (U f,) counts whole, the rest, which the prior alone speaks of, ``doubt`` times in ``std`` and ``share``
+    times in ``core``."""
+    n, f = noise.size, std.shape[1]
+    told = b.gradient
+    for j in range(n):
+        told[j] = 0.0
+    for k in range(m):
+        row = b.whitened[k]
+        for j in range(n):
+            told[j] += row[j] * row[j]
+    for j in range(n):
+        unseen = max(max(s2 * c[j, j] - told[j], 0.0) - noise[j], 0.0)
+        std[j // f, j % f] = math.sqrt(noise[j] + doubt * unseen)
+        core[j // f, j % f] = math.sqrt(noise[j] + share * unseen)
+
+
+@njit
+def chord_step(
+    members: Index,
+    free: Index,
+    c: Float,
+    s2: float,
+    h: Float,
+    d: Float,
+    x: Float,
+    g: Float,
+    step: Float,
+    b: Buffers,
+) -> tuple[float, float]:
+    """The chord step with the factors at hand: from r and Jᵀ at ``x`` in ``b`` to ``step`` (U f + p,); RMS
+    and largest of its U f coordinates."""
+    f, p = free.size, g.size
+    equations = b.r.shape[1]
+    rows = b.jacobian.shape[0] // x.shape[0]
+    m, n = members.size * rows, b.gradient.size
+    for j in range(n):
+        b.gradient[j] = 0.0
+    for q in range(p):
+        step[n + q] = -g[q]
+    for i in range(members.size):
+        u = members[i]
+        for k in range(equations):
+            value = b.r[u, k]
+            for q in range(p):
+                value -= h[u, k, q] * g[q]
+            b.e[k] = value
+            for q in range(p):
+                step[n + q] += d[q] * h[u, k, q] * value
+        for j in range(f):
+            b.gradient[u * f + j] = dot(b.jt[u, free[j]], b.e)
+    for u in range(x.shape[0]):
+        for i in range(f):
+            step[u * f + i] = -x[u, free[i]]
+    for i in range(members.size):
+        u = members[i]
+        for j in range(u * f, (u + 1) * f):
+            value, row = s2 * b.gradient[j], c[j]
+            for t in range(n):
+                step[t] -= value * row[t]
+    for i in range(members.size):
+        u, top = members[i], i * rows
+        for k in range(top, top + rows):
+            value = dot(b.jacobian[k], step[u * f : (u + 1) * f])
+            for q in range(p):
+                value -= b.nuisance[k, q] * step[n + q]
+            b.v[k] = value
+    solve_lower_vector(b.innovation, b.v, m)
+    solve_lower_transposed_vector(b.innovation, b.v, m)
+    for k in range(m):
+        value, row = b.v[k], b.gain[k]
+        for j in range(n):
+            step[j] -= value * row[j]
+    for q in range(p):
+        total = 0.0
+        for k in range(m):
+            total += b.nuisance[k, q] * b.v[k]
+        step[n + q] += d[q] * total
+    square, top = 0.0, 0.0
+    for j in range(n):
+        square += step[j] * step[j]
+        top = max(top, abs(step[j]))
+    return math.sqrt(square / n), top

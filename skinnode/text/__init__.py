@@ -1,0 +1,1 @@
+"""Text for people and machines: plural forms, printable characters, JSON values."""

@@ -1,0 +1,68 @@
+"""Makes untrusted text printable: the one place that decides what may reach a terminal, a log or a page.
+
+Untrusted is any text from a device, a file, a recording or the command line. The rules:
+
+* Text from a bus or a data sheet is made printable, on one line and of limited length, where it is decoded
+  (:func:`printable`). The bytes themselves are preserved: in ``od --json``, in a DCF, in comparisons.
+* Names in hand.toml are refused unless they are printable (``skinnode.config``).
+* The output of every command passes through :class:`PrintableStream`, and rich output through the console of
+  ``skinnode.cli``: a safety net for everything echoed, such as file names and arguments.
+* Pages also escape HTML, and untrusted text is never interpreted as markup.
+
+Printable is defined by :meth:`str.isprintable`: no control characters (C0, DEL, C1), no format characters
+(such as those that reverse the direction of text, or have no width), no surrogates. Other characters are
+shown as Python escapes: ``\\x1b``, ``\\u202e``.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Final, TextIO
+
+MOST: Final = 200
+"""Maximum characters shown of an untrusted text: more than any name needs, few enough for one line."""
+
+_SUSPECT: Final = re.compile(r"[^ -~]")
+_SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
+
+
+def printable(text: str | bytes, most: int = MOST) -> str:
+    """Return ``text`` on one line of at most ``most`` characters and ``…``, without control sequences. Bytes
+    are a VISIBLE_STRING: one character a byte, without trailing NULs."""
+    if isinstance(text, bytes):
+        text = text.rstrip(b"\0").decode("latin-1")
+    shown = text[: most + 1]
+    shown = shown if shown.isprintable() else _SUSPECT.sub(_escaped, shown)
+    return shown if len(shown) <= most and len(text) <= most else shown[:most] + "…"
+
+
+def printable_lines(text: str) -> str:
+    """Return ``text`` without control sequences, at its full length and with its line ends and tabs; for
+    messages with untrusted parts."""
+    return text if text.isprintable() else _SUSPECT_IN_LINES.sub(_escaped, text)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    character = found[0]
+    return character if character.isprintable() else repr(character)[1:-1]
+
+
+class PrintableStream:
+    """A text stream, such as stdout, that escapes control characters instead of passing them on. Output of
+    rich must bypass it, and does so by the attribute ``rich_proxied_file``."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.rich_proxied_file = stream
+
+    def write(self, text: str) -> int:
+        if not isinstance(text, str):
+            raise TypeError(f"write() argument must be str, not {type(text).__name__}")
+        self.rich_proxied_file.write(printable_lines(text))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.rich_proxied_file, name)

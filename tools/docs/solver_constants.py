@@ -25,7 +25,7 @@ _NOT_TUNED: Final = {
 def constants() -> str:
     """Make one row for each numeric constant that has a docstring."""
     rows = [
-        (md.code(f"{module.__name__.rpartition('.')[2]}.{name}"), f"{value:g}", text)
+        (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), f"{value:g}", text)
         for module in _modules()
         for name, value, text in _documented(module)
     ]

@@ -10,8 +10,7 @@
      │  └ NodeError                one node misbehaves
      │     ├ NodeTimeout(TimeoutError)
      │     └ SdoAbort              code and text of CiA 301
-     ├ CodecError(ValueError)      a payload that is not what its COB-ID promises
-     └ SolveError                  only where the caller asked to raise
+     └ CodecError(ValueError)      a payload that is not what its COB-ID promises
 
 A lost chunk, a stale patch or a solve that did not converge are normal life: they are statuses and
 counters, never exceptions. Arguments of the wrong shape are plain ``ValueError``.
@@ -19,7 +18,7 @@ counters, never exceptions. Arguments of the wrong shape are plain ``ValueError`
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 from skinnode.text.words import counted
 
@@ -66,7 +65,7 @@ class ProfileError(ConfigError):
 class BusLoadError(ConfigError):
     """A plan that needs more of a bus than it may use: ``needed`` and ``available``, shares of the bus."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - one argument for each part of the message
         self, key: str, got: object, allowed: str, *, needed: float, available: float, where: str = ""
     ) -> None:
         self.needed, self.available = needed, available
@@ -106,11 +105,3 @@ class CodecError(SkinError, ValueError):
         super().__init__(
             f"COB-ID 0x{cob_id:03X}: got {counted(len(self.data), 'byte')} ({shown}), allowed: {allowed}"
         )
-
-
-class SolveError(SkinError):
-    """A solve that did not converge, where the caller asked for an exception. Carries the result."""
-
-    def __init__(self, message: str, result: Any) -> None:
-        self.result = result
-        super().__init__(message)

@@ -29,13 +29,17 @@ def test_layers_of_the_map_are_those_of_the_contract() -> None:
         {name.strip("() ") for name in re.split(r"[|:]", layer)} - {"moved"}
         for layer in contract("Layers")["layers"]
     ]
-    drawn = [{name.removesuffix(".py") for number, name in ROWS if int(number) == n + 1} for n in range(len(layers))]
+    drawn = [
+        {name.removesuffix(".py") for number, name in ROWS if int(number) == n + 1}
+        for n in range(len(layers))
+    ]
     assert drawn == layers
 
 
 def test_users_of_the_simulator_are_those_of_the_contract() -> None:
     allowed = {
-        line.split(" -> ")[0].replace(".", "/") + ".py" for line in contract("does not know")["ignore_imports"]
+        line.split(" -> ")[0].replace(".", "/") + ".py"
+        for line in contract("does not know")["ignore_imports"]
     }
     sentence = TEXT.split("in these files only:")[1].split("\n\n")[0]
     named = {

@@ -7,8 +7,9 @@ from collections import Counter
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtState
 
-_BOOT_UP_DATA: Final = b"\0"
+_BOOT_UP_DATA: Final = bytes((NmtState.INITIALISING,))
 
 
 class Kind(enum.StrEnum):

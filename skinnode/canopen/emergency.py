@@ -4,12 +4,39 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Final
 
 from skinnode.text.words import counted
 
-OVERRUN: Final = 0x8110
-"""CAN overrun; of a skinnode patch also: scans skipped."""
+
+class EmcyCode(IntEnum):
+    """Error codes that a skinnode patch sends."""
+
+    RESET = 0x0000
+    HARDWARE = 0x5000
+    DATA_SET = 0x6300
+    CAN_OVERRUN = 0x8110
+    CAN_PASSIVE = 0x8120
+    HEARTBEAT = 0x8130
+    BUS_OFF_RECOVERED = 0x8140
+    CAN_ID_COLLISION = 0x8150
+    SYNC_WINDOW = 0x8200
+    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
+    301 has no code for it, so this is the generic code of protocol errors."""
+    PDO_NOT_PROCESSED = 0x8210
+    PDO_LENGTH_EXCEEDED = 0x8220
+    SYNC_LENGTH = 0x8240
+    RPDO_TIMEOUT = 0x8250
+    SOURCE = 0xFF00
+    """The analogue source gave no reading. Detail: :class:`~skinnode.node.source.SourceFault`, and u16 how
+    often so far."""
+
+    @property
+    def register_bit(self) -> int:
+        """Bit of the error register: 4 is communication, 7 the manufacturer's own."""
+        return 0x10 if self >> 12 == 8 else 0x80
+
 
 TOO_SLOW: Final = 1
 """Third byte of the detail of 0x8110, after the u16 count of skipped scans. 1: chunks left later than the
@@ -29,14 +56,14 @@ _CODES: Final = {
     0x8240: "SYNC of unexpected length",
     0x8250: "RPDO timed out",
 }
-_OWN_CODES: Final = {
-    0x5000: "wire open or shorted",
-    0x6300: "stored data",
-    0x8110: "overrun: messages or scans lost",
-    0x8150: "CAN-ID collision: another node has this node-ID",
-    0x8200: "synchronous PDO too late",
-    0x8210: "PDO not processed: too short",
-    0xFF00: "no reading from the converter",
+_OWN_CODES: Final[dict[int, str]] = {
+    EmcyCode.HARDWARE: "wire open or shorted",
+    EmcyCode.DATA_SET: "stored data",
+    EmcyCode.CAN_OVERRUN: "overrun: messages or scans lost",
+    EmcyCode.CAN_ID_COLLISION: "CAN-ID collision: another node has this node-ID",
+    EmcyCode.SYNC_WINDOW: "synchronous PDO too late",
+    EmcyCode.PDO_NOT_PROCESSED: "PDO not processed: too short",
+    EmcyCode.SOURCE: "no reading from the converter",
 }
 """Meaning of the codes when a skinnode patch sends them."""
 _CLASSES: Final = {
@@ -107,7 +134,7 @@ def history_text(entry: int, *, ours: bool) -> str:
 def says_too_slow(code: int, detail: bytes) -> bool:
     """Return whether an emergency with ``detail`` says that scans were skipped because the computer that runs
     the node, or its bus, was too slow, which is no fault of the skin."""
-    return code == OVERRUN and detail[:2] != b"\0\0" and detail[2:3] == bytes((TOO_SLOW,))
+    return code == EmcyCode.CAN_OVERRUN and detail[:2] != b"\0\0" and detail[2:3] == bytes((TOO_SLOW,))
 
 
 def register_text(register: int) -> str:
@@ -121,31 +148,31 @@ def _detail_text(code: int, detail: bytes) -> str:
     first, second = detail[0], detail[1]
     word = first | second << 8
     match code:
-        case 0x5000 if first < len(_WIRE_FAULTS):
+        case EmcyCode.HARDWARE if first < len(_WIRE_FAULTS):
             count = int.from_bytes(detail[2:4], "little") if len(detail) >= 4 else 1
             return f"{_WIRE_FAULTS[first]} {second}" + (f", {count} wires in all" if count > 1 else "")
-        case 0x6300:
+        case EmcyCode.DATA_SET:
             return _DATA_FAULTS.get(first, "")
-        case 0x8110 if word:
+        case EmcyCode.CAN_OVERRUN if word:
             skipped = f"{counted(word, 'scan')} skipped so far"
             slow = says_too_slow(code, detail)
             return f"{skipped} because the computer that runs the node is too slow" if slow else skipped
-        case 0x8130 if first:
+        case EmcyCode.HEARTBEAT if first:
             return f"node {first} restarted" if second else f"of node {first}"
-        case 0x8130:
+        case EmcyCode.HEARTBEAT:
             return "of the master"
-        case 0x8210 | 0x8220 if len(detail) >= 3:
+        case EmcyCode.PDO_NOT_PROCESSED | EmcyCode.PDO_LENGTH_EXCEEDED if len(detail) >= 3:
             return f"RPDO{first}, {counted(second, 'byte')} in place of {detail[2]}"
-        case 0x8210 | 0x8220:
+        case EmcyCode.PDO_NOT_PROCESSED | EmcyCode.PDO_LENGTH_EXCEEDED:
             return f"RPDO{first}, {counted(second, 'byte')}"
-        case 0x8240:
+        case EmcyCode.SYNC_LENGTH:
             return f"{counted(first, 'byte')} in place of {second}"
-        case 0x8200 if word:
+        case EmcyCode.SYNC_WINDOW if word:
             return f"TPDO{word}"
-        case 0x8250:
+        case EmcyCode.RPDO_TIMEOUT:
             return f"RPDO{word}"
-        case 0x8150:
+        case EmcyCode.CAN_ID_COLLISION:
             return f"0x{word:03X}"
-        case 0xFF00:
+        case EmcyCode.SOURCE:
             return _SOURCE_FAULTS.get(first, "")
     return ""

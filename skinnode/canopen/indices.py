@@ -19,7 +19,14 @@ UNCHECKED_REVISION_NUMBER: Final = 0x0001_0000
 """Revision of the patches whose scan summaries carry no check."""
 DEVICE_NAME: Final = "skinnode patch"
 
+MAX_NODE_ID: Final = 127
+"""Largest node-ID; the smallest is 1."""
+
 # --- COB-IDs: the pre-defined connection set of CiA 301
+FUNCTION_MASK: Final = 0x780
+"""Bits of a COB-ID that hold the function code."""
+NODE_ID_MASK: Final = 0x7F
+"""Bits of a COB-ID that hold the node-ID."""
 NMT_COB_ID: Final = 0x000
 SYNC_COB_ID: Final = 0x080
 TIME_COB_ID: Final = 0x100
@@ -74,6 +81,13 @@ def heartbeat_cob_id(node_id: int) -> int:
     return 0x700 + node_id
 
 
+def predefined_cob_ids(node_id: int) -> frozenset[int]:
+    """Return the COB-IDs that the pre-defined connection set gives to a node."""
+    pdos = {cob_id(number, node_id) for cob_id in (tpdo_cob_id, rpdo_cob_id) for number in range(4)}
+    services = {emcy_cob_id(node_id), sdo_response_cob_id(node_id), sdo_request_cob_id(node_id)}
+    return frozenset(pdos | services | {heartbeat_cob_id(node_id)})
+
+
 BIT_RATES_BPS: Final = (125_000, 250_000, 500_000, 1_000_000)
 """What the bit rate of a patch may be set to."""
 
@@ -113,6 +127,8 @@ TPDO2_MAPPING: Final = 0x1A01
 """Those of the n-th PDO, counted from 0, are n further on."""
 MAX_PDOS: Final = 512
 """Each way: 0x1400 to 0x15FF and so on."""
+PDO_MAPPING_OFFSET: Final = 0x200
+"""From the index of a PDO's communication parameter to that of its mapping."""
 PDO_INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID that switches it off."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6

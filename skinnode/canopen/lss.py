@@ -23,6 +23,9 @@ BIT_RATES_BPS: Final = {
 LSS_DONE: Final = 0
 """Error code of a configuration service that was carried out."""
 
+LSS_MANUFACTURER_ERROR: Final = 0xFF
+"""Error code of a configuration service whose next byte is an error code of the manufacturer."""
+
 RESET_SCAN: Final = 0x80
 """Of a fastscan, as the bit to check: every node without a node-ID answers, and begins at the vendor-ID."""
 

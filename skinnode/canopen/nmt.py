@@ -16,8 +16,18 @@ objects their defaults, reset communication (130) those from 0x1000 to 0x1FFF; t
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Final
 
 from skinnode.text.words import counted
+
+ALL_NODES: Final = 0
+"""Node-ID of an NMT command to every node of a bus."""
+
+STATE_MASK: Final = 0x7F
+"""Bits of a heartbeat or guarding response that hold the state."""
+
+GUARD_TOGGLE: Final = 0x80
+"""Bit of a guarding response that changes with each response."""
 
 
 class NmtState(IntEnum):
@@ -45,11 +55,38 @@ class NmtCommand(IntEnum):
     RESET_COMMUNICATION = 130
 
 
-AFTER_COMMAND = {
+STATE_NAMES: Final[dict[int, str]] = {
+    NmtState.INITIALISING: "booting",
+    NmtState.STOPPED: "stopped",
+    NmtState.OPERATIONAL: "operational",
+    NmtState.PRE_OPERATIONAL: "pre-operational",
+}
+"""Names of the states for display."""
+
+AFTER_COMMAND: Final = {
     NmtCommand.START: NmtState.OPERATIONAL,
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
+
+
+def state_name(state: int) -> str:
+    """Return the name of a state for display, ``state N`` for a number that CiA 301 does not define.
+
+    Args:
+        state: the state byte of a heartbeat, without the toggle bit.
+    """
+    return STATE_NAMES.get(state, f"state {state}")
+
+
+def encode(command: NmtCommand, node_id: int) -> bytes:
+    """Return the data of an NMT frame, which travels on COB-ID 0.
+
+    Args:
+        command: the command specifier.
+        node_id: 1 to 127, or :data:`ALL_NODES`.
+    """
+    return bytes((command, node_id))
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:

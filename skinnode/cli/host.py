@@ -93,11 +93,11 @@ def _run(plan: HandConfig, seconds: float | None, report: _Report, told: threadi
 
 def operational(running: Host) -> str:
     """Who runs by its heartbeat: on the bus of another master, or where one is waited for, not all need."""
-    from skinnode.host.health import OPERATIONAL
+    from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
     healths = [running.health(patch.name) for patch in patches]
-    others = [f"{h.patch} {h.condition}" for h in healths if h.nmt_state != OPERATIONAL]
+    others = [f"{h.patch} {h.condition}" for h in healths if h.nmt_state != NmtState.OPERATIONAL]
     if not others:
         return f"{counted(len(patches), 'patch', 'patches')} of {name!r} operational"
     up = len(patches) - len(others)
@@ -126,7 +126,7 @@ def verdict(running: Host) -> tuple[list[str], list[str]]:
     A node that skips scans because its own computer is too slow sends EMCY 0x8110. What is missing of it, or
     came too late, is then a note, and so is that emergency at the end. Frames that were wrong stay a fault.
     """
-    from skinnode.canopen.emergency import OVERRUN
+    from skinnode.canopen.emergency import EmcyCode
     from skinnode.host.accounting import losses_of_bus, losses_of_lane
 
     _let_overruns_end(running)
@@ -144,7 +144,7 @@ def verdict(running: Host) -> tuple[list[str], list[str]]:
         health = running.health(name)
         condition = health.condition
         due = stats.sync.sent + stats.sync.received > _FIRST_SCANS
-        overrun = health.last_emergency == OVERRUN and health.defect is None
+        overrun = health.last_emergency == EmcyCode.CAN_OVERRUN and health.defect is None
         slow_still = condition == "faulty" and overrun and health.slow_overruns > 0
         if slow_still:
             notes.append(f"{name}: {condition} at the end{reason(health, ': ')}")

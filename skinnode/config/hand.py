@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
+from skinnode.canopen.indices import MAX_NODE_ID
 from skinnode.config.buses import BringUpConfig, BusConfig, SyncConfig
 from skinnode.config.explain import first_error, key_path, short
 from skinnode.config.patches import PatchConfig
@@ -17,9 +18,6 @@ from skinnode.config.table import Allowed, Name, Table
 from skinnode.config.toml_text import Document, read_toml
 from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.model.layout_file import impossible
-
-NODE_IDS: Final = 127
-"""Number of node-IDs on a bus (CiA 301 v4.2, 7.3.2)."""
 
 MOST_BUSES: Final = 64
 """Maximum buses of a hand, far more than one machine has interfaces."""
@@ -92,10 +90,10 @@ class HandConfig(Table):
             if isinstance(buses, list) and len(buses) > MOST_BUSES:
                 raise ConfigError("buses", Shown(f"{len(buses)} of them"), f"at most {MOST_BUSES}")
             if isinstance(patches, list) and isinstance(buses, list):
-                most = NODE_IDS * len(buses)
+                most = MAX_NODE_ID * len(buses)
                 if len(patches) > most > 0:
                     on = "it has" if len(buses) == 1 else f"{len(buses)} have"
-                    allowed = f"at most {most}: a bus has node-IDs 1 to {NODE_IDS}, and {on} no more"
+                    allowed = f"at most {most}: a bus has node-IDs 1 to {MAX_NODE_ID}, and {on} no more"
                     raise ConfigError("patches", Shown(f"{len(patches)} of them"), allowed)
         return table
 

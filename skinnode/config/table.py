@@ -8,6 +8,8 @@ from typing import Annotated, Any, Final, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
+from skinnode.canopen.indices import MAX_NODE_ID
+
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
@@ -49,7 +51,7 @@ def _printable(value: str) -> str:
 
 Name = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable), Allowed(_NAME)]
 Count = Annotated[int, Field(ge=1, le=254), Allowed("an integer from 1 to 254")]
-NodeId = Annotated[int, Field(ge=1, le=127), Allowed("an integer from 1 to 127")]
+NodeId = Annotated[int, Field(ge=1, le=MAX_NODE_ID), Allowed(f"an integer from 1 to {MAX_NODE_ID}")]
 Length = Annotated[
     float, Field(ge=1e-6, le=1.0, allow_inf_nan=False), Allowed("a number of metres from 1e-6 to 1")
 ]

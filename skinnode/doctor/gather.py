@@ -15,6 +15,7 @@ import numpy as np
 
 from skinnode.bus_load.plan import SCAN_SHARE, inhibit_time_100us
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtCommand, encode
 from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.doctor.capture import Capture
 from skinnode.doctor.facts import BusFacts, PatchFacts
@@ -40,7 +41,6 @@ DEFAULT_NOISE: Final = 3e-6
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
 """Before each time a node is asked: a host reads a baseline in 0.1 to 0.3 s."""
 
-_START, _PRE_OPERATIONAL = 1, 128
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
     {od.NMT_COB_ID, od.SYNC_COB_ID, od.TIME_COB_ID, od.LSS_REQUEST_COB_ID, od.LSS_RESPONSE_COB_ID}
@@ -182,7 +182,7 @@ def _listen(
     start = [node_id for node_id, state in states.items() if active and state == "pre-operational"]
     running = [node_id for node_id, state in states.items() if state == "operational"] + start
     for node_id in start:
-        line.link.send(od.NMT_COB_ID, bytes((_START, node_id)))
+        line.link.send(od.NMT_COB_ID, encode(NmtCommand.START, node_id))
     if not running:
         return False, 0.0
     try:
@@ -205,7 +205,7 @@ def _listen(
         return ours, load
     finally:
         for node_id in start:
-            line.link.send(od.NMT_COB_ID, bytes((_PRE_OPERATIONAL, node_id)))
+            line.link.send(od.NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
@@ -249,7 +249,9 @@ def _commands_of_others(heard: Heard, node_ids: Collection[int]) -> int:
     return sum(
         count
         for data, count in dict(heard.nmt).items()
-        if len(data) != 2 or data[0] not in (_START, _PRE_OPERATIONAL) or data[1] not in node_ids
+        if len(data) != 2
+        or data[0] not in (NmtCommand.START, NmtCommand.ENTER_PRE_OPERATIONAL)
+        or data[1] not in node_ids
     )
 
 
@@ -257,8 +259,7 @@ def _foreign(heard: Heard, node_ids: Collection[int], bus: BusConfig) -> dict[in
     """Count the frames of COB-IDs that neither the services, nor the nodes, nor ``others`` of the hand file
     explain. COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the
     device; those of a patch of the hand that does not answer come from a host that polls it."""
-    kinds = {0x080, *range(0x180, 0x680, 0x80), 0x700}
-    explained = {kind + node_id for kind in kinds for node_id in node_ids} | _KNOWN_TO_ALL
+    explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}
     return {cob_id: count for cob_id, count in dict(heard.cob_ids).items() if cob_id not in explained}
 

@@ -16,6 +16,8 @@ import numpy as np
 
 from skinnode.bus_load.plan import inhibit_time_100us
 from skinnode.canopen import indices as od
+from skinnode.canopen import nmt
+from skinnode.canopen.abort import AbortCode
 from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
 from skinnode.host.hand_files import load_baseline
@@ -31,18 +33,6 @@ BOOT_DEADLINE_S: Final = 3.0
 
 HEARTBEATS_WATCHED: Final = 3
 """Heartbeats of the host that a node may miss before it falls silent, where the host sends one."""
-
-_NMT_START: Final = 0x01
-_NMT_PRE_OPERATIONAL: Final = 0x80
-_INVALID: Final = 1 << 31
-"""Bit of a PDO's COB-ID that switches it off while its parameters are changed."""
-
-_NO_OBJECT: Final = 0x0602_0000
-_NO_COMMAND: Final = 0x0504_0001
-"""Abort codes: object does not exist; command specifier (such as that of a block transfer) unknown."""
-
-_INCOMPATIBLE: Final = 0x0604_0043
-"""SDO abort code of 0x1016: another entry has the same node-ID."""
 
 _POLL_S: Final = 0.02
 
@@ -245,7 +235,7 @@ class Bringer:
             )
             if not master and all(remote.read(index, sub, size) == value for sub, size, value in wanted):
                 continue
-            remote.configure(index, od.PDO_COB_ID, "u32", cob_id | _INVALID)
+            remote.configure(index, od.PDO_COB_ID, "u32", cob_id | od.PDO_INVALID)
             for sub, size, value in wanted:
                 remote.configure(index, sub, size, value)
 
@@ -301,7 +291,7 @@ class Bringer:
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
         except SdoAbort as abort:
-            if abort.code not in (_NO_OBJECT, _NO_COMMAND):
+            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.UNKNOWN_COMMAND):
                 raise
             return self._read_baseline_singly(profile, remote)
         if len(data) != 4 * profile.n_codes:
@@ -333,12 +323,12 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
     """NMT: go operational."""
-    send(od.NMT_COB_ID, bytes([_NMT_START, node_id]))
+    send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.START, node_id))
 
 
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
     """NMT: go pre-operational; the node falls silent but for its heartbeat and SDO."""
-    send(od.NMT_COB_ID, bytes([_NMT_PRE_OPERATIONAL, node_id]))
+    send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.ENTER_PRE_OPERATIONAL, node_id))
 
 
 def _open_window(remote: RemoteOd) -> None:
@@ -347,7 +337,7 @@ def _open_window(remote: RemoteOd) -> None:
     try:
         remote.configure(od.SYNC_WINDOW, 0, "u32", 0)
     except SdoAbort as abort:
-        if abort.code != _NO_OBJECT:
+        if abort.code != AbortCode.NO_OBJECT:
             raise
 
 
@@ -357,7 +347,7 @@ def _watch_master(remote: RemoteOd, watched: int) -> None:
     try:
         remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
     except SdoAbort as abort:
-        if abort.code != _INCOMPATIBLE:
+        if abort.code != AbortCode.INCOMPATIBLE:
             raise
         for subindex in range(2, int(remote.read(od.HEARTBEAT_CONSUMER, 0, "u8")) + 1):
             entry = int(remote.read(od.HEARTBEAT_CONSUMER, subindex, "u32"))

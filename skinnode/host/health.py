@@ -14,17 +14,12 @@ from typing import Final
 
 from skinnode.canopen.emergency import error_text, register_text, says_too_slow
 from skinnode.canopen.indices import emcy_cob_id, heartbeat_cob_id
+from skinnode.canopen.nmt import STATE_MASK, STATE_NAMES, NmtState
 from skinnode.errors import CodecError
 from skinnode.host.code_watch import CodeWatch, WireFault
 from skinnode.transport.bus_state import BusState
 
 _log = logging.getLogger(__name__)
-
-PRE_OPERATIONAL: Final = 127
-OPERATIONAL: Final = 5
-STOPPED: Final = 4
-BOOT_UP: Final = 0
-"""NMT states as a heartbeat carries them (CiA 301, 7.2.8.3.2.2)."""
 
 HEARTBEATS_MISSED: Final = 3
 """Heartbeat periods without one after which a node counts as lost. CiA 301 leaves it to the integrator; one
@@ -135,7 +130,7 @@ class PatchHealth:
             case Condition.RESTARTING:
                 return f"node {self.node_id} restarts by itself in a loop; {self.boot_ups} boot-ups so far"
             case Condition.BOOTING:
-                state = _STATES.get(self.nmt_state or 0, f"in NMT state {self.nmt_state}")
+                state = STATE_NAMES.get(self.nmt_state or 0, f"in NMT state {self.nmt_state}")
                 booting = f"node {self.node_id} is {state}, not operational yet"
                 return f"{booting}; {self.complaint}" if self.complaint else booting
             case Condition.FAULTY:
@@ -155,14 +150,6 @@ class PatchHealth:
         if self.last_emergency is None:
             return register
         return f"{register}; newest emergency 0x{self.last_emergency:04X} {self.emergency_text}"
-
-
-_STATES: Final = {
-    BOOT_UP: "booting",
-    PRE_OPERATIONAL: "pre-operational",
-    OPERATIONAL: "operational",
-    STOPPED: "stopped",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,8 +231,8 @@ class NodeMonitor:
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
-        state = data[0] & 0x7F  # bit 7 is the toggle bit of node guarding
-        if state == BOOT_UP:
+        state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
+        if state == NmtState.INITIALISING:
             self._boot_ups += 1
             self._on_register(0)  # as after any reset; an error that is still there is told anew
             if self.running:
@@ -315,7 +302,9 @@ class NodeMonitor:
         passed_age_s = scan_age_s if t_passed_ns is None else age_s(t_passed_ns or None)
         late_scans = None if passed_age_s is None else passed_age_s / scan_s
         in_a_loop = self._in_a_loop(now_ns)
-        settled = in_a_loop and self.nmt_state == OPERATIONAL and now_ns - self._restarts[-1] > SETTLED_NS
+        settled = (
+            in_a_loop and self.nmt_state == NmtState.OPERATIONAL and now_ns - self._restarts[-1] > SETTLED_NS
+        )
         condition = judge(
             nmt_state=self.nmt_state,
             late_heartbeats=None if heartbeat_age_s is None else heartbeat_age_s / heartbeat_s,
@@ -394,7 +383,7 @@ def judge(
         return Condition.LOST
     if restarting:
         return Condition.RESTARTING
-    if nmt_state != OPERATIONAL:
+    if nmt_state != NmtState.OPERATIONAL:
         return Condition.BOOTING
     if error_register:
         return Condition.FAULTY

@@ -17,9 +17,11 @@ from collections.abc import Callable
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen import nmt
 from skinnode.canopen.lss import (
     BIT_RATES_BPS,
     LSS_DONE,
+    LSS_MANUFACTURER_ERROR,
     NOT_CONFIGURED,
     RESET_SCAN,
     LssAddress,
@@ -52,8 +54,6 @@ _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
 """Addresses of skinnode patches, which fastscan tries first: three or four requests in place of 96."""
-
-_NMT_RESET_COMMUNICATION: Final = 0x82
 
 
 class LssFailed(BusError):
@@ -90,7 +90,7 @@ class LssMaster:
             finally:  # a slave without a node-ID boots when it is let go
                 self.release()
             if active not in (None, node_id):
-                self._send(od.NMT_COB_ID, bytes((_NMT_RESET_COMMUNICATION, active)))
+                self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
             return True
 
     # --- who is there
@@ -232,5 +232,5 @@ class LssMaster:
 
 def _require_done(answer: bytes, what: str) -> None:
     if answer[1] != LSS_DONE:
-        detail = f" (the maker's own code {answer[2]})" if answer[1] == 0xFF else ""
+        detail = f" (the maker's own code {answer[2]})" if answer[1] == LSS_MANUFACTURER_ERROR else ""
         raise LssFailed(f"{what}: got error code {answer[1]}{detail}, allowed: 0 (done)")

@@ -17,10 +17,12 @@ import canopen
 from canopen.sdo.client import ReadableStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
+from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.indices import DEVICE_TYPE
+from skinnode.canopen.sdo import SEGMENT_BYTES
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host.containment import one_line
-from skinnode.host.sdo_streams import SEGMENT_BYTES, BlockDownload, BlockUpload, Client, Download
+from skinnode.host.sdo_streams import BlockDownload, BlockUpload, Client, Download
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
@@ -29,9 +31,15 @@ ATTEMPTS: Final = 3
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
 """What canopen says where nothing came, the second after it asked for segments again."""
 
-_OUT_OF_STEP: Final = (0x0503_0000, 0x0504_0000, 0x0504_0001, 0x0504_0002, 0x0504_0003, 0x0504_0004)
-"""SDO abort codes of a node that missed a frame of the transfer: toggle bit, time-out, command specifier,
-block size, sequence number, CRC. The transfer is retried."""
+_OUT_OF_STEP: Final = (
+    AbortCode.TOGGLE_BIT,
+    AbortCode.TIMED_OUT,
+    AbortCode.UNKNOWN_COMMAND,
+    AbortCode.INVALID_BLOCK_SIZE,
+    AbortCode.INVALID_SEQUENCE,
+    AbortCode.CRC,
+)
+"""SDO abort codes of a node that missed a frame of the transfer, which is then retried."""
 
 MOST_BYTES: Final = 4 * 254 * 254
 """Maximum length of a value in bytes: the baseline of the largest patch."""

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.host.code_watch import CodeWatch
 from skinnode.host.containment import Defects
 from skinnode.host.dealer import Dealer
-from skinnode.host.health import BOOT_UP, NodeMonitor
+from skinnode.host.health import NodeMonitor
 from skinnode.host.pipeline import Lane
 from skinnode.host.publish import Publisher
 from skinnode.host.rhythm import Rhythm
@@ -95,7 +96,7 @@ def receive_patch(
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)
-        if len(data) == 1 and data[0] & 0x7F == BOOT_UP:
+        if len(data) == 1 and data[0] & STATE_MASK == NmtState.INITIALISING:
             lane.withhold()  # what it sends from here on is not as it was configured
 
     dealer.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, defects)

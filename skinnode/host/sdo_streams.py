@@ -30,15 +30,9 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import BlockDownloadStream, BlockUploadStream, SdoClient, WritableStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.indices import sdo_request_cob_id, sdo_response_cob_id
-
-SEGMENT_BYTES: Final = 7
-
-ABORT: Final = 0x80
-"""Command specifier of an abort, in the first byte."""
-
-TIMED_OUT: Final = 0x0504_0000
-"""Abort code: SDO protocol timed out (CiA 301, 7.2.4.3.17)."""
+from skinnode.canopen.sdo import ABORT
 
 _QUIET_S: Final = 0.02
 """Silence after an abort, in s, that shows that no response to the old transfer is still to come."""
@@ -59,9 +53,9 @@ class Client(SdoClient):
         super().__init__(*cob_ids, empty())  # type: ignore[no-untyped-call]  # as all of canopen
         self.network = network
         network.subscribe(self.tx_cobid, self.on_response)
-        self._abort_code = TIMED_OUT
+        self._abort_code: int = AbortCode.TIMED_OUT
 
-    def abort(self, abort_code: int = TIMED_OUT) -> None:
+    def abort(self, abort_code: int = AbortCode.TIMED_OUT) -> None:
         """Remember the code for :meth:`give_up`, which knows the object."""
         self._abort_code = abort_code
 
@@ -95,7 +89,7 @@ class Client(SdoClient):
     def give_up(self, index: int, subindex: int) -> None:
         """Abort the transfer of this object at the node, and discard late responses. Raises BusError if the
         abort cannot be sent."""
-        code, self._abort_code = self._abort_code, TIMED_OUT
+        code, self._abort_code = self._abort_code, AbortCode.TIMED_OUT
         self.send_request(struct.pack("<BHBI", ABORT, index, subindex, code))  # type: ignore[no-untyped-call]
         end_s = time.monotonic() + _SETTLE_S
         with contextlib.suppress(queue.Empty):

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from typing import Final
 
+from skinnode.canopen.nmt import NmtState
 from skinnode.config import Missing, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
 from skinnode.host import bringup
-from skinnode.host.health import OPERATIONAL
 from skinnode.host.network import Abandoned
 from skinnode.host.pipeline import Solver
 from skinnode.host.station import Station
@@ -129,12 +129,13 @@ def start_all(ready: dict[Station, Solver]) -> None:
     naps = round(START_DEADLINE_S / _POLL_S)
     for station in ready:
         patch, monitor = station.patch, station.monitor
-        while not station.is_guest and not monitor.said_since(OPERATIONAL, t_start_ns):
+        while not station.is_guest and not monitor.said_since(NmtState.OPERATIONAL, t_start_ns):
             if naps == 0:
                 raise NodeTimeout(
                     patch.node_id,
                     f"patch {patch.name!r} on {patch.bus}: got NMT state {known(monitor.nmt_state)} after "
-                    f"the start command, allowed: {OPERATIONAL} (operational) within {START_DEADLINE_S:g} s",
+                    f"the start command, allowed: {NmtState.OPERATIONAL:d} (operational) within "
+                    f"{START_DEADLINE_S:g} s",
                 )
             naps -= 1
             if naps % _START_AGAIN_NAPS == 0:

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtState
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.bringup import Bringer, NodeFacts
 from skinnode.host.containment import Defects
-from skinnode.host.health import OPERATIONAL, STOPPED
 from skinnode.host.link import BusLink
 from skinnode.host.lss import LssMaster
 from skinnode.host.pipeline import Solver
@@ -91,7 +91,7 @@ class Station:
         """Bring the node up and learn what it is; scans are withheld meanwhile. Raises as
         :meth:`Bringer.bring_up`."""
         self.boot_ups = self.monitor.boot_ups
-        if self.monitor.running and self.monitor.nmt_state == STOPPED and not self.is_guest:
+        if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.is_guest:
             bringup.stand_by(self.link.send, self.patch.node_id)  # one of ours that somebody stopped is deaf
 
         def answered(patch: PatchConfig) -> None:
@@ -164,7 +164,9 @@ class Station:
             raise NodeError(node_id, f"{said}: the host is a guest there")
         if self.patch.baseline is not None:  # it would be written back at once
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
-        if not self.monitor.running or self.monitor.nmt_state != OPERATIONAL:  # PDOs are heard by no other
+        if (
+            not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
+        ):  # PDOs are heard by no other
             raise NodeError(node_id, f"{said}: it is not operational")
         self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
 

@@ -35,10 +35,11 @@ from typing import Final, Self
 import numpy as np
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtState
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout
 from skinnode.host import bringup
 from skinnode.host.containment import Defects, keep_on
-from skinnode.host.health import HEARTBEATS_MISSED, OPERATIONAL, STOPPED
+from skinnode.host.health import HEARTBEATS_MISSED
 from skinnode.host.network import Abandoned
 from skinnode.host.station import Station
 from skinnode.host.supervised import Joined, NodeStats, Phase, Supervised
@@ -163,7 +164,7 @@ class Supervisor:
             node_id = link.config.heartbeat_node_id
             assert node_id is not None  # of these
             try:
-                link.send(od.heartbeat_cob_id(node_id), bytes([OPERATIONAL]))
+                link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
             except BusError:  # nodes that miss it report that themselves
                 continue
             except Exception as error:
@@ -258,10 +259,10 @@ class Supervisor:
         station = node.station
         if station.monitor.boot_ups != station.boot_ups:
             self._begin(node, now_ns)
-        elif station.monitor.said_since(OPERATIONAL, node.since_ns):
+        elif station.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif station.link.t_dealt_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            silent = station.monitor.nmt_state == OPERATIONAL  # its state before the command
+            silent = station.monitor.nmt_state == NmtState.OPERATIONAL  # its state before the command
             self._fail(node, _not_started(station, silent=silent), now_ns, refused=not silent)
         elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: it may have been lost
             node.probe_ns = now_ns + _PROBE_NS
@@ -311,9 +312,13 @@ class Supervisor:
         if monitor.boot_ups != station.boot_ups:
             self._begin(node, now_ns)
             return
-        if not station.is_guest and monitor.nmt_state != OPERATIONAL and said_ns > node.since_ns:
+        if not station.is_guest and monitor.nmt_state != NmtState.OPERATIONAL and said_ns > node.since_ns:
             self._begin(node, now_ns)
-            if node.phase is Phase.RUNNING and monitor.nmt_state == STOPPED and now_ns >= node.probe_ns:
+            if (
+                node.phase is Phase.RUNNING
+                and monitor.nmt_state == NmtState.STOPPED
+                and now_ns >= node.probe_ns
+            ):
                 node.probe_ns = now_ns + _PROBE_NS  # a job waits for a response that it does not send
                 with contextlib.suppress(BusError):
                     bringup.stand_by(station.link.send, station.patch.node_id)
@@ -322,7 +327,7 @@ class Supervisor:
                     "node %d (%s) left NMT state %d for %s without the host's doing",
                     station.patch.node_id,
                     station.patch.name,
-                    OPERATIONAL,
+                    NmtState.OPERATIONAL,
                     monitor.nmt_state,
                 )
             return
@@ -440,4 +445,5 @@ def _not_started(station: Station, *, silent: bool) -> str:
     node = f"node {station.patch.node_id}"
     if silent:
         return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command, allowed: one"
-    return f"{node}: got NMT state {known(station.monitor.nmt_state)} after the start command, allowed: 5"
+    state = known(station.monitor.nmt_state)
+    return f"{node}: got NMT state {state} after the start command, allowed: {NmtState.OPERATIONAL:d}"

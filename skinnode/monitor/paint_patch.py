@@ -9,10 +9,11 @@ from typing import Final
 from rich.segment import Segment
 from rich.style import Style
 
+from skinnode.canopen.nmt import STATE_NAMES
 from skinnode.monitor import maps
 from skinnode.monitor.look import Look, Ui, beside, centred, pad, spread
 from skinnode.monitor.maps import Line
-from skinnode.monitor.state import NMT_STATES, PatchView
+from skinnode.monitor.state import PatchView
 
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
 """Conditions in which the newest field is an old one."""
@@ -221,7 +222,9 @@ def facts(patch: PatchView, look: Look, width: int) -> list[Line]:
     }
     losses = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
     fact("losses", losses or "none", look.note if losses else look.good)
-    state = "unknown" if health.nmt_state is None else NMT_STATES.get(health.nmt_state, str(health.nmt_state))
+    state = (
+        "unknown" if health.nmt_state is None else STATE_NAMES.get(health.nmt_state, str(health.nmt_state))
+    )
     age = "" if health.heartbeat_age_s is None else f", heard {_span(health.heartbeat_age_s)} ago"
     fact("NMT", f"{state}{age}")
     fact("boots", f"{health.boot_ups} heard, {health.rejoins} rejoins")

@@ -26,10 +26,6 @@ from skinnode.monitor.touches import Touch, touches_of
 Level = Literal["good", "note", "bad"]
 """How much it matters: all is well, worth a look, a fault."""
 
-NMT_STATES: Final = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
-"""As a heartbeat carries them (CiA 301, 7.2.8.3.2.2)."""
-
-
 HISTORY_NS: Final = 2_000_000_000
 """Rates and latencies are of this long."""
 

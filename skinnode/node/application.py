@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
-from skinnode.canopen.emergency import TOO_SLOW
+from skinnode.canopen.emergency import TOO_SLOW, EmcyCode
 from skinnode.model.layout import PRESET_IDS, Float, PatchLayout
 from skinnode.node.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.clock import NO_DEADLINE_NS, Pacing
 from skinnode.node.device import Services
-from skinnode.node.emcy import EmcyCode
 from skinnode.node.memory import Fault
 from skinnode.node.od import ObjectStore
 from skinnode.node.self_test import self_test

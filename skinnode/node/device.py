@@ -15,10 +15,11 @@ from typing import Final, Protocol
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.dictionary import Object
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress
 from skinnode.canopen.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.lss import BitRateChange, LssSlave
 from skinnode.node.memory import Memory
@@ -111,7 +112,7 @@ class CanopenDevice:
         kind: str,
         set_bit_rate: Callable[[int], None] | None,
     ) -> None:
-        if not (1 <= node_id <= 127 or node_id == NOT_CONFIGURED):
+        if not (1 <= node_id <= od.MAX_NODE_ID or node_id == NOT_CONFIGURED):
             raise ValueError(f"node_id: got {node_id}, must be 1 to 127, or {NOT_CONFIGURED} for none")
         if not 0 <= serial < 1 << 32:
             raise ValueError(f"serial: got {serial}, must be an unsigned number of 32 bits")

@@ -7,11 +7,11 @@ import contextlib
 import struct
 from collections import deque
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
@@ -20,34 +20,6 @@ from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
 _WAITING: Final = 16
 """Messages kept while inhibit time, a stopped node or the bus hold them back; the oldest give way."""
 _RESERVED_BIT: Final = 1 << 30
-
-
-class EmcyCode(IntEnum):
-    """Emergency error codes this node uses."""
-
-    RESET = 0x0000
-    HARDWARE = 0x5000
-    DATA_SET = 0x6300
-    CAN_OVERRUN = 0x8110
-    CAN_PASSIVE = 0x8120
-    HEARTBEAT = 0x8130
-    BUS_OFF_RECOVERED = 0x8140
-    CAN_ID_COLLISION = 0x8150
-    SYNC_WINDOW = 0x8200
-    """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
-    301 has no code for it, so this is the generic code of protocol errors."""
-    PDO_NOT_PROCESSED = 0x8210
-    PDO_LENGTH_EXCEEDED = 0x8220
-    SYNC_LENGTH = 0x8240
-    RPDO_TIMEOUT = 0x8250
-    SOURCE = 0xFF00
-    """The analogue source gave no reading. Detail: :class:`~skinnode.node.source.SourceFault`, and u16 how
-    often so far."""
-
-    @property
-    def register_bit(self) -> int:
-        """Bit of the error register: 4 is communication, 7 the manufacturer's own."""
-        return 0x10 if self >> 12 == 8 else 0x80
 
 
 class EmcyProducer:

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import NmtState
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from skinnode.node.od import ObjectStore

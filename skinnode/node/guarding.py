@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
 
 from skinnode.canopen import indices as od
-from skinnode.canopen.nmt import NmtState
+from skinnode.canopen.emergency import EmcyCode
+from skinnode.canopen.nmt import GUARD_TOGGLE, NmtState
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.od import ObjectStore
-
-_TOGGLE: Final = 0x80
 
 
 class Guarding:
@@ -37,7 +35,7 @@ class Guarding:
         """What to send on a remote frame with the COB-ID of error control. Starts life guarding, or goes on
         with it."""
         answer = bytes((state | self._toggle,))
-        self._toggle ^= _TOGGLE
+        self._toggle ^= GUARD_TOGGLE
         self._guarded = True
         self._start(t_ns)
         return answer

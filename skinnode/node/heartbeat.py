@@ -8,12 +8,12 @@ from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import NmtState
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.od import ObjectStore
 
-_LAST_NODE: Final = 127
 _BOOTED: Final = 1
 """Second byte of an emergency's detail: the monitored node was not silent, but started anew."""
 
@@ -83,7 +83,7 @@ class HeartbeatConsumer:
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
         for item in wanted:
-            if 0 < item.node_id <= _LAST_NODE and item.within_ns:
+            if 0 < item.node_id <= od.MAX_NODE_ID and item.within_ns:
                 old = before.get(item.node_id)
                 same = old is not None and old.within_ns == item.within_ns
                 self._monitored[item.node_id] = old if old is not None and same else item

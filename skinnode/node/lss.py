@@ -12,6 +12,7 @@ import operator
 from collections.abc import Callable, Collection
 from typing import Final
 
+from skinnode.canopen.indices import MAX_NODE_ID
 from skinnode.canopen.lss import (
     BIT_RATES_BPS,
     LSS_DONE,
@@ -177,7 +178,7 @@ class LssSlave:
         match command:
             case LssCommand.CONFIGURE_NODE_ID:
                 node_id = data[1]
-                if not (1 <= node_id <= 127 or node_id == NOT_CONFIGURED):
+                if not (1 <= node_id <= MAX_NODE_ID or node_id == NOT_CONFIGURED):
                     return _frame(command, _OUT_OF_RANGE)
                 self.pending_node_id = node_id
                 return _frame(command, LSS_DONE)

@@ -19,6 +19,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
+from skinnode.canopen.indices import MAX_NODE_ID
 from skinnode.canopen.lss import BIT_RATES_BPS, NOT_CONFIGURED
 from skinnode.errors import SkinError
 from skinnode.files.file_lock import lock_file
@@ -220,7 +221,7 @@ def unpack(data: bytes) -> Kept:
             raise MemoryFault(Fault.DAMAGED, "the checksum is wrong")
         return Kept(
             str(content["patch"]),
-            _one_of(content["node_id"], (None, *range(1, 128), NOT_CONFIGURED)),
+            _one_of(content["node_id"], (None, *range(1, MAX_NODE_ID + 1), NOT_CONFIGURED)),
             _one_of(content["bit_rate_bps"], (None, *BIT_RATES_BPS.values())),
             _parameters_from_json(content["communication"]),
             _parameters_from_json(content["application"]),
@@ -245,7 +246,7 @@ def _parameters_from_json(group: dict[str, Any]) -> Parameters:
     for name, text in group["values"].items():
         index, subindex = name.split(":")
         values[int(index, 16), int(subindex)] = bytes.fromhex(text)
-    return Parameters(_one_of(group["node_id"], range(128)), values)
+    return Parameters(_one_of(group["node_id"], range(MAX_NODE_ID + 1)), values)
 
 
 def _one_of(value: Any, allowed: Collection[int | None]) -> Any:

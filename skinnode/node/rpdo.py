@@ -14,9 +14,10 @@ import functools
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import Refused
 from skinnode.canopen.data_length import fd_length
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.od import ObjectStore
 from skinnode.node.pdo import PdoRecords
 from skinnode.node.rejected import Rejected, RejectedFrames

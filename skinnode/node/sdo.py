@@ -12,6 +12,7 @@ from enum import IntEnum
 from typing import Final
 
 from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.sdo import ABORT, SEGMENT_BYTES
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.od import ObjectStore
 from skinnode.node.sdo_block import BlockDownload, BlockUpload
@@ -21,8 +22,6 @@ TIMEOUT_NS: Final = 1_000_000_000
 """A client that does not go on for this long has its transfer aborted. CiA 301 leaves the time to the
 device."""
 
-_ABORT: Final = 0x80
-_SEGMENT_BYTES: Final = 7
 _TOGGLE: Final = 0x10
 
 
@@ -77,7 +76,7 @@ class SdoServer:
     def on_request(self, request: bytes, t_ns: int) -> None:
         """Take a frame of the client, eight bytes. Nothing is said to an abort."""
         transfer = self._transfer
-        if request[0] == _ABORT:
+        if request[0] == ABORT:
             self._transfer = None
         elif transfer is not None and transfer.wants(request):
             try:
@@ -114,7 +113,7 @@ class SdoServer:
 
     def _abort(self, index: int, subindex: int, code: AbortCode) -> None:
         self._transfer = None
-        self._channel.send(MULTIPLEXER_U32.pack(_ABORT, index, subindex, code))
+        self._channel.send(MULTIPLEXER_U32.pack(ABORT, index, subindex, code))
 
     def _upload(self, index: int, subindex: int, t_ns: int) -> None:
         self._start_upload(index, subindex, self._channel.store.read(index, subindex), t_ns)
@@ -163,13 +162,13 @@ class _Upload(Transfer):
     def on_request(self, request: bytes, t_ns: int) -> bool:
         if request[0] & _TOGGLE != self._toggle:
             raise Refused(AbortCode.TOGGLE_BIT)
-        segment = self._data[self._at : self._at + _SEGMENT_BYTES]
-        self._at += _SEGMENT_BYTES
+        segment = self._data[self._at : self._at + SEGMENT_BYTES]
+        self._at += SEGMENT_BYTES
         over = self._at >= len(self._data)
-        command = self._toggle | (_SEGMENT_BYTES - len(segment)) << 1 | over
+        command = self._toggle | (SEGMENT_BYTES - len(segment)) << 1 | over
         self._toggle ^= _TOGGLE
         self._await_client(t_ns)
-        self._channel.send(bytes((command,)) + segment.ljust(_SEGMENT_BYTES, b"\0"))
+        self._channel.send(bytes((command,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
         return over
 
 

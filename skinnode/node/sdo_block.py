@@ -13,12 +13,9 @@ from enum import Enum, IntEnum, auto
 from typing import Final
 
 from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.sdo import MAX_BLOCK_SEGMENTS, SEGMENT_BYTES
 from skinnode.errors import BusError
 from skinnode.node.sdo_transfer import MULTIPLEXER_U32, Channel, Incoming, Transfer
-
-SEGMENT_BYTES: Final = 7
-MAX_SEGMENTS: Final = 127
-"""Segments of the longest block, and of those this server asks for."""
 
 SEGMENT_NS: Final = 500_000
 """Shortest mean time between two segments. PDOs may take 70 % of a bus; of 1 Mbit/s that leaves at least 2200
@@ -167,7 +164,7 @@ class BlockDownload(Transfer):
         self._received = 0  # segments of the present block without a gap
         self._last: bytes | None = None  # the last segment of all, not known yet how much of it is data
         self._previous = b""  # the last request, if it was acknowledged
-        channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, index, subindex, MAX_SEGMENTS))
+        channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, index, subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:
         """Whatever comes while blocks do is a segment."""
@@ -190,11 +187,11 @@ class BlockDownload(Transfer):
                 self._last = request[1:]
             else:
                 self._incoming.extend(request[1:])
-        if last or number == MAX_SEGMENTS:
+        if last or number == MAX_BLOCK_SEGMENTS:
             acknowledged, self._received = self._received, 0
             self._previous = request
             self._await_client(t_ns)
-            self._channel.send(bytes((0xA2, acknowledged, MAX_SEGMENTS)) + _FIVE_ZEROS)
+            self._channel.send(bytes((0xA2, acknowledged, MAX_BLOCK_SEGMENTS)) + _FIVE_ZEROS)
         return False
 
     def _end(self, request: bytes, last: bytes) -> None:
@@ -211,6 +208,6 @@ def _is_end(request: bytes) -> bool:
 
 
 def _checked(block_size: int) -> int:
-    if not 1 <= block_size <= MAX_SEGMENTS:
+    if not 1 <= block_size <= MAX_BLOCK_SEGMENTS:
         raise Refused(AbortCode.INVALID_BLOCK_SIZE)
     return block_size

@@ -13,8 +13,9 @@ from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.node.clock import Clock
-from skinnode.node.emcy import EmcyCode, EmcyProducer
+from skinnode.node.emcy import EmcyProducer
 from skinnode.node.memory import Fault, Kept, Memory, MemoryFault, Parameters
 from skinnode.node.od import ObjectStore
 
@@ -229,7 +230,7 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
     allowed, which stays at its default: of a mapping all of it."""
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
-    pdos = {index & ~0x200 for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
+    pdos = {index & ~od.PDO_MAPPING_OFFSET for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
     defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
     for pdo, default in defaults.items():  # all of them first: one may have another one's default COB-ID
         _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
@@ -249,14 +250,16 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
 def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
     """Write the two records of the PDO with parameters at ``pdo``; yields what was refused. ``default``: its
     COB-ID, where there is no other."""
-    cob_id, count = (pdo, od.PDO_COB_ID), (pdo + 0x200, 0)
+    cob_id, count = (pdo, od.PDO_COB_ID), (pdo + od.PDO_MAPPING_OFFSET, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)
-    mapped = sorted(item for item in values.items() if item[0][0] == pdo + 0x200 and item[0] != count)
+    mapped = sorted(
+        item for item in values.items() if item[0][0] == pdo + od.PDO_MAPPING_OFFSET and item[0] != count
+    )
     off = _switched_off(default)
     if mapped or count in values:
         entries = values.get(count) or store.raw(*count)
         if not _accepted(store, [(cob_id, off), (count, bytes(1)), *mapped, (count, entries)]):
-            store.restore(pdo + 0x200, pdo + 0x200)
+            store.restore(pdo + od.PDO_MAPPING_OFFSET, pdo + od.PDO_MAPPING_OFFSET)
             yield count
     for item in own:
         if not _accepted(store, [(cob_id, off), item]):

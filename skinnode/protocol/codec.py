@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.canopen.indices import TARE_SIGNATURE
+from skinnode.canopen import indices as od
 from skinnode.errors import CodecError, ConfigError
 from skinnode.model.layout import Float
 from skinnode.protocol.profile import DEFAULT_CODE_HI, DEFAULT_CODE_LO, PatchProfile
@@ -33,6 +33,9 @@ MISSING: Final = 0xFFFF_FFFF
 PDO_BYTES: Final = 8
 """Of a classic chunk and of every summary."""
 _CODE_BITS: Final = (16, 24)
+_CHUNK_COB_ID: Final = od.chunk_cob_id(0)
+_SUMMARY_COB_ID: Final = od.summary_cob_id(0)
+_COMMAND_COB_ID: Final = od.command_cob_id(0)
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,7 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
     return bytes((chunk, scan)) + body.ljust(PDO_BYTES - 2, b"\0")
 
 
-def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = 0x180) -> Chunk:
+def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _CHUNK_COB_ID) -> Chunk:
     """The chunk in the payload of TPDO1. Raises CodecError, naming ``cob_id``, unless it is 8 bytes long."""
     _require_length(data, PDO_BYTES, cob_id, "chunk")
     width = bits // 8
@@ -376,7 +379,7 @@ def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
     return payload[:4] + (device_time_us & 0xFFFF_FFFF).to_bytes(4, "little") + payload[4:]
 
 
-def unpack_summary(data: bytes, *, cob_id: int = 0x280) -> Summary:
+def unpack_summary(data: bytes, *, cob_id: int = _SUMMARY_COB_ID) -> Summary:
     """Unpack a summary, of either form, from the payload of TPDO2. Raises CodecError, naming ``cob_id``,
     unless it is 8 bytes long."""
     _require_length(data, PDO_BYTES, cob_id, "scan summary")
@@ -452,7 +455,7 @@ class Command(NamedTuple):
     """A command as it is on the wire."""
 
     tare: int
-    """:data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare, anything else does nothing."""
+    """:data:`~skinnode.canopen.indices.od.TARE_SIGNATURE` to tare, anything else does nothing."""
     single_scan: int
     send_mode: int
 
@@ -464,10 +467,10 @@ def pack_command(
     *, tare: bool = False, single_scan: bool = False, send_mode: SendMode = SendMode.FULL
 ) -> bytes:
     """Payload of RPDO1. It always carries the send mode, which stays until told otherwise."""
-    return _COMMAND.pack(TARE_SIGNATURE if tare else 0, single_scan, send_mode)
+    return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 
 
-def unpack_command(data: bytes, *, cob_id: int = 0x200) -> Command:
+def unpack_command(data: bytes, *, cob_id: int = _COMMAND_COB_ID) -> Command:
     """The command in the payload of RPDO1, of which bytes beyond the mapped six are ignored (CiA 301).
 
     Raises CodecError, naming ``cob_id``, when it is shorter.

@@ -371,7 +371,7 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
 
     Raises ConfigError for a node-ID that is not 1 to 127 or a bit rate that a patch does not have.
     """
-    if not 1 <= node_id <= 127:
+    if not 1 <= node_id <= od.MAX_NODE_ID:
         raise ConfigError("node_id", node_id, "1 to 127")
     if bitrate_bps not in od.BIT_RATES_BPS:
         raise ConfigError("bitrate_bps", bitrate_bps, f"one of {', '.join(map(str, od.BIT_RATES_BPS))}")

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen import nmt
 from skinnode.canopen.lss import LssAddress
+from skinnode.canopen.sdo import upload_request
 from skinnode.errors import ConfigError
 from skinnode.host.lss import LssFailed
 from skinnode.technician.line import Line
@@ -18,8 +20,7 @@ BOOT_S: Final = 5.0
 """How long a node may take to boot at its new node-ID."""
 
 _ASKED_S: Final = 0.15
-_RESET_COMMUNICATION: Final = 130
-_ASK_DEVICE_TYPE: Final = bytes((0x40, 0x00, 0x10, 0x00))
+_ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ def commission(
     if node_id is not None and node_id != before:
         if before is not None:
             time.sleep(0.01)  # the switch to waiting comes first
-            line.link.send(od.NMT_COB_ID, bytes((_RESET_COMMUNICATION, before)))
+            line.link.send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, before))
         booted = line.wait_until(lambda: line.heard.node(node_id).boot_ups > boot_ups, BOOT_S)
         if not booted:
             faults.append(f"no boot-up message of node {node_id} within {BOOT_S:g} s")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode
 from skinnode.conformance.eds import SIGNED, UNSIGNED, Eds, EdsEntry, number
 from skinnode.errors import ConfigError, SdoAbort
 from skinnode.host.network import MOST_BYTES, RemoteOd
@@ -35,8 +36,6 @@ _TYPES: Final = {
 _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
-_NO_OBJECT, _NO_SUBINDEX, _NO_DATA = 0x0602_0000, 0x0609_0011, 0x0800_0024
-"""SDO abort codes: object does not exist, sub-index does not exist, no data available."""
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
 """What a node says of itself, whatever its EDS has for a default."""
 _LONGEST_SHOWN: Final = 16
@@ -65,7 +64,7 @@ class Reading:
     def content(self) -> bytes | None:
         """Value as bytes, None if the node refused. Many nodes refuse to read an empty string for lack of
         data: its content is empty."""
-        if self.refused_code == _NO_DATA and self.data_type in _STRINGS:
+        if self.refused_code == AbortCode.NO_DATA and self.data_type in _STRINGS:
             return b""
         return self.data
 
@@ -150,7 +149,7 @@ def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MOST_BYTES)
     except SdoAbort as abort:
-        why = "no data" if abort.code == _NO_DATA else f"refused: {abort_text(abort)}"
+        why = "no data" if abort.code == AbortCode.NO_DATA else f"refused: {abort_text(abort)}"
         return Reading(*named, None, None, why, abort.code)
     return Reading(*named, decode(entry, data), data, "")
 
@@ -201,12 +200,12 @@ def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
     try:
         count = remote.read_bytes(index, 0)
     except SdoAbort as abort:
-        if abort.code == _NO_OBJECT:
+        if abort.code == AbortCode.NO_OBJECT:
             return
         count = b""
     for entry in standard_entries(index, count[0] if count and has_subindices(index) else 0):
         reading = read_entry(remote, entry)
-        if reading.refused_code != _NO_SUBINDEX:  # an object may leave some out
+        if reading.refused_code != AbortCode.NO_SUBINDEX:  # an object may leave some out
             yield reading
 
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
 """Messages of a kind and node that are kept: more than half a minute of heartbeats four times a second."""
-
-BOOT_UP: Final = 0
 
 
 class Beat(NamedTuple):
@@ -91,7 +90,7 @@ class Heard:
                 self._note(frame)
 
     def _note(self, frame: Frame) -> None:
-        kind, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
+        kind, node_id = frame.can_id & od.FUNCTION_MASK, frame.can_id & od.NODE_ID_MASK
         if frame.can_id == od.NMT_COB_ID:
             self.nmt[frame.data if len(frame.data) == 2 else b""] += 1
         if node_id == 0:
@@ -99,8 +98,8 @@ class Heard:
         data, t_ns = frame.data, frame.t_ns
         if kind == od.heartbeat_cob_id(0) and len(data) == 1:
             node = self._nodes.setdefault(node_id, NodeHeard())
-            node.boot_ups += data[0] == BOOT_UP
-            node.beats.append(Beat(t_ns, data[0] & 0x7F))
+            node.boot_ups += data[0] == NmtState.INITIALISING
+            node.beats.append(Beat(t_ns, data[0] & STATE_MASK))
         elif kind == od.emcy_cob_id(0) and len(data) == 8:
             code = int.from_bytes(data[:2], "little")
             node = self._nodes.setdefault(node_id, NodeHeard())

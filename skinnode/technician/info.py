@@ -190,9 +190,9 @@ def _history(read: _Reader, *, ours: bool) -> tuple[str, ...]:
 
 def _watched(read: _Reader) -> tuple[str, ...]:
     entries = []
-    for sub in range(1, min(read.number(od.HEARTBEAT_CONSUMER) or 0, 127) + 1):
+    for sub in range(1, min(read.number(od.HEARTBEAT_CONSUMER) or 0, od.MAX_NODE_ID) + 1):
         entry = read.number(od.HEARTBEAT_CONSUMER, sub) or 0
-        if entry & 0xFFFF and 1 <= entry >> 16 & 0xFF <= 127:
+        if entry & 0xFFFF and 1 <= entry >> 16 & 0xFF <= od.MAX_NODE_ID:
             entries.append(f"node {entry >> 16 & 0xFF} within {entry & 0xFFFF} ms")
     return tuple(entries)
 

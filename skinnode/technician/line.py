@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Final, NamedTuple, Self
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import state_name
 from skinnode.config import BusConfig
 from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
@@ -16,9 +17,6 @@ from skinnode.host.lss import LssMaster
 from skinnode.host.mainline import Mainline
 from skinnode.host.network import RemoteOd
 from skinnode.technician.heard import Beat, Heard
-
-STATES: Final = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
-"""NMT states as a heartbeat carries them (CiA 301, 7.2.8.3.2.2)."""
 
 LONGEST_HEARTBEAT_S: Final = 2.5
 """How long a heartbeat is waited for; nodes that beat more seldom are not known to be there by it."""
@@ -39,11 +37,6 @@ class State(NamedTuple):
 
     def __str__(self) -> str:
         return "unknown" if self.state is None else state_name(self.state)
-
-
-def state_name(state: int) -> str:
-    """The state in words."""
-    return STATES.get(state, f"state {state}")
 
 
 def no_answer(wrong: str) -> str:

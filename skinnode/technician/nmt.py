@@ -9,7 +9,8 @@ from enum import StrEnum
 from typing import Final
 
 from skinnode.canopen import indices as od
-from skinnode.technician.line import Line, State, state_name
+from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, state_name
+from skinnode.technician.line import Line, State
 
 FOLLOW_S: Final = 1.5
 """How long a node may take to say that it is in its new state, beyond its heartbeat period."""
@@ -17,7 +18,6 @@ FOLLOW_S: Final = 1.5
 BOOT_S: Final = 5.0
 """How long a node may take to boot."""
 
-_ALL_NODES: Final = 0
 _GUARD_EACH_S: Final = 0.1
 
 
@@ -36,13 +36,12 @@ class Command(StrEnum):
 
 
 _SPECIFIERS: Final = {
-    Command.START: 1,
-    Command.STOP: 2,
-    Command.PRE_OPERATIONAL: 128,
-    Command.RESET_NODE: 129,
-    Command.RESET_COMMUNICATION: 130,
+    Command.START: NmtCommand.START,
+    Command.STOP: NmtCommand.STOP,
+    Command.PRE_OPERATIONAL: NmtCommand.ENTER_PRE_OPERATIONAL,
+    Command.RESET_NODE: NmtCommand.RESET_NODE,
+    Command.RESET_COMMUNICATION: NmtCommand.RESET_COMMUNICATION,
 }
-_STATES: Final = {Command.START: 5, Command.STOP: 4, Command.PRE_OPERATIONAL: 127}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +72,8 @@ def command_nodes(line: Line, node_ids: Sequence[int], command: Command, *, at_o
     see what they do. Raises BusError."""
     watches = [_watch(line, node_id) for node_id in node_ids]
     sent_ns = time.monotonic_ns()
-    for node_id in [_ALL_NODES] if at_once else node_ids:
-        line.link.send(od.NMT_COB_ID, bytes((_SPECIFIERS[command], node_id)))
+    for node_id in [ALL_NODES] if at_once else node_ids:
+        line.link.send(od.NMT_COB_ID, encode(_SPECIFIERS[command], node_id))
     return [
         _booted(line, w, sent_ns) if command.resets else _followed(line, w, command, sent_ns) for w in watches
     ]
@@ -90,7 +89,7 @@ def _watch(line: Line, node_id: int) -> _Watch:
 
 def _followed(line: Line, watch: _Watch, command: Command, sent_ns: int) -> Change:
     """Whether the node says that it is in the state it was told to enter."""
-    wanted, since_ns = _STATES[command], sent_ns
+    wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
     end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:
         now = line.state(watch.node_id, watch.heartbeat_s, guarding=watch.guarding, since_ns=since_ns)

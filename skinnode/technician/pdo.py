@@ -57,7 +57,7 @@ def read_pdo(remote: RemoteOd, direction: Direction, number: int) -> Pdo | None:
     cob_id = _optional(remote, index, od.PDO_COB_ID, "u32")
     if cob_id is None:
         return None
-    mapping = index + 0x200
+    mapping = index + od.PDO_MAPPING_OFFSET
     count = _optional(remote, mapping, 0, "u8") or 0
     mapped = tuple(int(remote.read(mapping, sub, "u32")) for sub in range(1, min(count, 64) + 1))
     return Pdo(

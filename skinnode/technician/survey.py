@@ -13,6 +13,7 @@ from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.lss import LssAddress
+from skinnode.canopen.sdo import upload_request
 from skinnode.errors import NodeError
 from skinnode.technician.line import Line
 from skinnode.text.printable import printable
@@ -37,8 +38,8 @@ OTHERS_S: Final = 1.0
 
 _QUIET_S: Final = 0.1
 _THREADS: Final = 16
-_ASK_DEVICE_TYPE: Final = bytes((0x40, 0x00, 0x10, 0x00))
-_ASK_SERIAL: Final = bytes((0x40, 0x18, 0x10, od.IDENTITY_SERIAL))
+_ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
+_ASK_SERIAL: Final = upload_request(od.IDENTITY, od.IDENTITY_SERIAL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +141,7 @@ def _let_others_finish(line: Line) -> None:
 
 
 def _sdo_frames(line: Line) -> int:
-    first, end = od.sdo_response_cob_id(1), od.sdo_request_cob_id(128)
+    first, end = od.sdo_response_cob_id(1), od.sdo_request_cob_id(od.MAX_NODE_ID + 1)
     return sum(count for cob_id, count in dict(line.heard.cob_ids).items() if first <= cob_id < end)
 
 
@@ -167,7 +168,7 @@ def _sweep(line: Line) -> dict[int, int]:
     answers: dict[int, int] = {}
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()
-        for node_id in range(1, 128):
+        for node_id in range(1, od.MAX_NODE_ID + 1):
             if node_id not in answers:
                 line.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE.ljust(8, b"\0"))
                 time.sleep(PACE_S)

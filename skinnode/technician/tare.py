@@ -16,6 +16,8 @@ from typing import Final
 import numpy as np
 
 from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode
+from skinnode.canopen.nmt import NmtState
 from skinnode.config import BusConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, SdoAbort
 from skinnode.host.network import RemoteOd
@@ -36,8 +38,6 @@ OTHERS_S: Final = 4.0
 
 _ATTEMPTS: Final = 3
 _POLL_S: Final = 0.02
-_HARDWARE: Final = 0x0606_0000
-"""SDO abort code: access failed because of a hardware error (CiA 301, table 22)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +105,9 @@ def _tare(
     try:
         remote.write(od.ACQUISITION, od.TARE, "u32", od.TARE_SIGNATURE)
     except SdoAbort as abort:
-        if abort.code != _HARDWARE:
+        if abort.code != AbortCode.HARDWARE:
             raise
-        raise NodeError(node_id, "its converter gave no reading (SDO abort 0x06060000)") from None
+        raise NodeError(node_id, f"its converter gave no reading (SDO abort 0x{abort.code:08X})") from None
     runs = _runs(line, node_id)
     progress(f"{who}: reading its baseline")
     _let_others_finish(line, node_id, at_least_s=HOST_BEGINS_S + sync_period_s if runs else 0.0)
@@ -124,7 +124,7 @@ def _tare(
 def _runs(line: Line, node_id: int) -> bool:
     """Return whether a host has started the node: it then sends chunks, or operational heartbeats."""
     beat = line.heard.newest_beat(node_id)
-    operational = beat is not None and beat.state == 5
+    operational = beat is not None and beat.state == NmtState.OPERATIONAL
     return operational or line.heard.cob_ids[od.chunk_cob_id(node_id)] > 0
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skinnode.canopen.emergency import error_text, history_text, register_text
-from skinnode.node.emcy import EmcyCode
+from skinnode.canopen.emergency import EmcyCode, error_text, history_text, register_text
 
 
 def test_every_code_of_the_node_has_words_of_its_own() -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 import skinnode.doctor
+from skinnode.canopen.emergency import EmcyCode
 from skinnode.doctor.causes import RULES
 from skinnode.host import events
 from skinnode.host.code_watch import WireState
 from skinnode.host.health import BusHealth, Condition, PatchHealth
-from skinnode.node.emcy import EmcyCode
 
 from .blocks import DOCS
 

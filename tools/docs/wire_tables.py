@@ -14,8 +14,7 @@ from skinnode.bus_load.timing import fd_worst_case_bits, worst_case_bits
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.dictionary import Entry, Object, highest
-from skinnode.canopen.emergency import error_text
-from skinnode.node.emcy import EmcyCode
+from skinnode.canopen.emergency import EmcyCode, error_text
 from skinnode.node.rejected import Rejected
 from skinnode.protocol.codec import (
     CodeScale,

@@ -1,0 +1,25 @@
+"""Service data objects on the wire (CiA 301 v4.2, 7.2.4.3): what client and server both must know."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+SEGMENT_BYTES: Final = 7
+"""Data bytes of a segment."""
+
+MAX_BLOCK_SEGMENTS: Final = 127
+"""Segments of the longest block."""
+
+ABORT: Final = 0x80
+"""First byte of an abort, from either side."""
+
+UPLOAD: Final = 0x40
+"""First byte of a request to read an object."""
+
+_MULTIPLEXER: Final = struct.Struct("<BHB")
+
+
+def upload_request(index: int, subindex: int) -> bytes:
+    """Return the eight bytes of a request to read an object."""
+    return _MULTIPLEXER.pack(UPLOAD, index, subindex).ljust(8, b"\0")

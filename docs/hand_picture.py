@@ -19,7 +19,7 @@ from matplotlib.patches import Circle, FancyBboxPatch
 from matplotlib.transforms import Affine2D
 
 import skinnode as sk
-from skinnode.model.config import HandConfig, load_hand
+from skinnode.config import HandConfig, load_hand
 from vcan_sim.fleet import Fleet
 
 ROOT: Final = Path(__file__).parents[1]

@@ -100,7 +100,7 @@ def test_generated_tables_have_what_they_are_made_of(site: Path) -> None:
     for table in HandConfig.model_json_schema()["$defs"].values():
         for key in table["properties"]:
             assert f"<code>{key}</code>" in hand, key
-    wire = (site / "wire.html").read_text(encoding="utf-8")
+    wire = (site / "protocol.html").read_text(encoding="utf-8")
     for item in REFERENCE_PROFILES[0].objects():
         assert item.name in wire or f"{item.index:04X}" in wire or item.name[-1].isdigit(), item.name
     assert not re.search("generated:", hand + wire)

@@ -170,12 +170,12 @@ def _sweep(line: Line) -> dict[int, int]:
         asked_ns = time.monotonic_ns()
         for node_id in range(1, od.MAX_NODE_ID + 1):
             if node_id not in answers:
-                line.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE.ljust(8, b"\0"))
+                line.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE)
                 time.sleep(PACE_S)
         line.wait_until(lambda: False, ANSWER_S)
         for node_id, heard in line.heard.nodes.items():
             count = sum(
-                t_ns >= asked_ns and data[1:4] == _ASK_DEVICE_TYPE[1:]
+                t_ns >= asked_ns and data[1:4] == _ASK_DEVICE_TYPE[1:4]
                 for t_ns, data in list(heard.sdo_answers)
             )
             if count and node_id not in answers:
@@ -235,7 +235,7 @@ def _only_heard(line: Line, node_id: int, asked_ns: int) -> FoundNode | None:
 def _two_serials(line: Line, node_id: int) -> str:
     """What speaks for two nodes; empty where the second answer was a late one to the sweep before."""
     answers = line.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
-    answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:]]
+    answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
     if len(answers) < 2:
         return ""
     serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})

@@ -1,8 +1,8 @@
-"""The picture of `skinnode monitor` in these pages: four simulated patches, one of which was unplugged.
+"""Draw the picture of `skinnode monitor` in these pages: four simulated patches, one of them unplugged.
 
     python docs/monitor.py          writes docs/img/monitor.svg
 
-The screen is that of the program; only who looks at it is not a terminal.
+The screen is that of the program, without a terminal.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ PRESSED_M = 4e-4
 LONGEST_S = 30.0
 
 
-async def look(source: HostSource, fleet: Fleet) -> str:
-    """The screen, when a patch has been missed for a while and the others are pressed."""
+async def screenshot(source: HostSource, fleet: Fleet) -> str:
+    """Return the screen as SVG, once a patch has been lost for a while and the others are pressed."""
     app = MonitorApp(source, folder=Path(), colours="rgb")
     async with app.run_test(size=SIZE):
         await asyncio.sleep(4.0)
@@ -46,7 +46,7 @@ async def look(source: HostSource, fleet: Fleet) -> str:
 
 
 def without_addresses(svg: str) -> str:
-    """The picture with the fonts of whoever looks at it, in place of some from elsewhere."""
+    """Replace downloaded fonts by fonts of the reader's machine."""
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
     svg = re.sub(r"font-family: (Fira Code|arial)", "font-family: DejaVu Sans Mono, Menlo, Consolas", svg)
     return re.sub(r"<!--.*?-->", "", svg)
@@ -57,7 +57,7 @@ def main() -> None:
     solver = hand.solver.model_copy(update={"method": "posterior"})
     hand = hand.model_copy(update={"name": "hand", "solver": solver})
     with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
-        svg = asyncio.run(look(source, fleet))
+        svg = asyncio.run(screenshot(source, fleet))
     PICTURE.write_text(without_addresses(svg), encoding="utf-8")
 
 

@@ -2,9 +2,9 @@
 
     .venv/bin/python docs/wrong_models.py [SEEDS]
 
-Three tables. First the wrong models of ``skinnode bench stability`` (case 13), once with nothing told to the
-solvers and once with ``model_error``. Then presses on a layer of rubber that is bonded to a rigid base, which
-the posterior takes for a half-space. Then untouched patches whose resistances are all off by one gain.
+Print three tables: wrong models of ``skinnode bench stability`` (case 13), without and with ``model_error``;
+presses on a layer of rubber bonded to a rigid base, which the posterior takes for a half-space; and untouched
+patches whose resistances are all wrong by one gain.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Float = NDArray[np.float64]
 WAVES = 6000
 """Wave numbers of the integrals: a layer of 1 m then moves as a half-space to 0.3 % of the press."""
 SHARPEST = 40.0
-"""Greatest wave number, in units of one over the smaller of contact radius and thickness."""
+"""Largest wave number, times the smaller of contact radius and thickness."""
 DEEP = 20.0
-"""k t from which on the bottom of the layer is not felt: e⁻²⁰."""
+"""k t from which the bottom of the layer has no effect: e⁻²⁰."""
 NOISE = 1e-5
 SHARES = (1 / 3, 2 / 3, 1.0)
 
 
 def layer_response(k: Float, thickness_m: float, shear_modulus_pa: float) -> tuple[Float, Float]:
-    """Displacement of the surface of an incompressible layer, bonded below, by a pressure of wave number k.
+    """Return the surface displacement of an incompressible bonded layer under a pressure of wave number k.
 
     A pressure cos(k x) moves the surface by U sin(k x) along it and W cos(k x) along its normal, m/Pa. With
     Z = k z the displacement is (−f′ sin, f cos), which keeps the volume, and f = C Z sinh Z +
@@ -57,7 +57,7 @@ def layer_response(k: Float, thickness_m: float, shear_modulus_pa: float) -> tup
 def hertz_displacement(
     points_m: Float, center_m: Float, radius_m: float, thickness_m: float, rubber: Rubber
 ) -> Float:
-    """(P, 3) displacement of the surface by the pressure √(1 − r²/a²), 1 Pa at most, on a bonded layer."""
+    """Return the (P, 3) surface displacement of a bonded layer under the pressure √(1 − r²/a²), peak 1 Pa."""
     k = (np.arange(WAVES) + 0.5) * SHARPEST / min(radius_m, thickness_m) / WAVES
     # Hankel transform of the pressure, times k dk
     load = (np.sin(k * radius_m) - k * radius_m * np.cos(k * radius_m)) / (k**2 * radius_m) * (k[1] - k[0])
@@ -69,7 +69,7 @@ def hertz_displacement(
 
 
 def press_layers(seeds: int) -> None:
-    """One line a depth and thickness, means over ``seeds`` presses by bodies as blunt as a fingertip."""
+    """Print a line for each depth and thickness: means over ``seeds`` presses by fingertip-like bodies."""
     layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     rubber = Rubber()
     points = layout.upper_m[..., :2].reshape(-1, 2)
@@ -110,7 +110,7 @@ def press_layers(seeds: int) -> None:
 
 
 def _error(field: sk.FieldFrame, truth: Float) -> tuple[float, float, float, float, float]:
-    """Error, share of wires converged, deviation, coverage, and number of wires wrong."""
+    """Return error, share of CONVERGED wires, standard deviation, coverage, and number of wrong wires."""
     used = np.array([status is sk.Status.CONVERGED for status in field.status])
     if not used.any():
         return np.nan, 0.0, np.nan, np.nan, np.nan
@@ -122,7 +122,7 @@ def _error(field: sk.FieldFrame, truth: Float) -> tuple[float, float, float, flo
 
 
 def _force(field: sk.FieldFrame, true_n: float) -> tuple[float, float]:
-    """Normal force of all contacts and its deviation, over the true one; NaN where none was found."""
+    """Return normal force and its standard deviation, divided by the true force; NaN without contacts."""
     if not field.contacts:
         return np.nan, np.nan
     std = np.sqrt(sum(contact.normal_force_std_n**2 for contact in field.contacts))
@@ -130,7 +130,7 @@ def _force(field: sk.FieldFrame, true_n: float) -> tuple[float, float]:
 
 
 def drift_gains() -> None:
-    """One line a gain and solver: what an untouched patch seems to do when all of R is off by it."""
+    """Print a line for each gain and solver: the apparent displacement of an untouched patch."""
     layout = sk.PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     rest = sk.resistance_ohm(layout, layout.upper_m)
     solvers: dict[str, sk.Tracker | sk.Posterior] = {

@@ -1,19 +1,19 @@
-"""The fenced blocks of a page, and terminals that run them as a reader would.
+"""Fenced blocks of a page, and terminals that run them as a reader would.
 
-The title of a block says how it runs, to reader and test alike:
+The title of a block tells reader and test how it runs:
 
 ==============================  ============================================================================
-none                            runs, a line after the other; Python of its own must print something
-``terminal N``                  runs in that terminal; what still runs there is ended with Ctrl-C first
-``prints``                      text: each of its lines, but for the numbers, was printed by the block before
+none                            runs line by line; a Python block must print something
+``terminal N``                  runs in that terminal, after Ctrl-C to the program that runs there
+``prints``                      text: the block before printed each of these lines, apart from the numbers
 ``prints, to the digit``        the same with the numbers
 ``NAME.py``, ``NAME.toml`` …    is written into that file
-``in CI on vcan0``              runs where the kernel has vcan0
+``in CI on vcan0``              runs if the kernel has vcan0
 ``run by .ci/run``              .ci/run has the same line
 ``not run in CI: WHY``          does not run
 ==============================  ============================================================================
 
-A line ending in ``# exit status N`` must end with N, any other with 0.
+A line that ends in ``# exit status N`` must exit with N, any other line with 0.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ PRINTS, PRINTS_EXACTLY = "prints", "prints, to the digit"
 
 _FENCE = re.compile(r'^ *```(\w*)(?: title="([^"]*)")?\n(.*?)^ *```$', flags=re.MULTILINE | re.DOTALL)
 _READY = "Ctrl-C ends"
-"""What a program that runs until told to says when it is ready."""
+"""Printed by a program that runs until Ctrl-C, once it is ready."""
 _LONGEST_S = 60.0
-"""That a command may take; compiling comes before."""
+"""Maximum time of a command. Kernels are compiled before."""
 
 
 @dataclass(frozen=True)
@@ -54,16 +54,16 @@ class Block:
 
     @property
     def file(self) -> str | None:
-        """The file that it is, if it is one."""
+        """Name of the file to write, or None."""
         return self.title if re.fullmatch(r"[\w-]+\.\w+", self.title) else None
 
     def lines(self) -> Iterator[tuple[str, int]]:
-        """Commands, and the exit status each must end with."""
+        """Iterate over the commands, each with its expected exit status."""
         for line in self.code.replace("\\\n", " ").splitlines():
             command, _, comment = line.partition("  # ")
-            told = re.match(r"exit status (\d)", comment)
+            expected = re.match(r"exit status (\d)", comment)
             if command.strip():
-                yield command, int(told[1]) if told else 0
+                yield command, int(expected[1]) if expected else 0
 
 
 def blocks_of(page: Path) -> list[Block]:
@@ -71,7 +71,7 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 class Terminal:
-    """Runs one command after the other in ``folder``."""
+    """Runs commands one after the other in ``folder``."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
         self._folder, self._environment = folder, environment
@@ -79,10 +79,10 @@ class Terminal:
         self._reader = threading.Thread()
         self._command, self._status, self._before = "", 0, 0
         self.output: list[str] = []
-        """Lines printed since it was last emptied."""
+        """Lines printed since the list was last cleared."""
 
     def run(self, command: str, status: int) -> None:
-        """To its end; a program that runs until told to is started, and seen to be ready."""
+        """Run a command to its end, or until a program that runs until Ctrl-C is ready."""
         self.end()
         self._command, self._status, self._before = command, status, len(self.output)
         self._program = subprocess.Popen(
@@ -100,7 +100,7 @@ class Terminal:
             self._finish()
 
     def _ready(self) -> bool:
-        """False when the program has ended by itself, or does not within the longest time."""
+        """Wait until the program is ready; False if it ended by itself or the time is over."""
         end_s = time.monotonic() + _LONGEST_S
         while self._reader.is_alive() and time.monotonic() < end_s:
             if any(_READY in line for line in self.output[self._before :]):
@@ -109,7 +109,7 @@ class Terminal:
         return False
 
     def wait_for(self, shape: str, *, exactly: bool) -> None:
-        """Until a line was printed that has ``shape`` in it, but for the numbers unless ``exactly``."""
+        """Wait for a line that contains ``shape``, with any numbers unless ``exactly``."""
         pattern, end_s = _pattern(shape, exactly=exactly), time.monotonic() + _LONGEST_S
         while True:
             over = not self._reader.is_alive() or time.monotonic() > end_s
@@ -119,13 +119,13 @@ class Terminal:
             time.sleep(0.02)
 
     def end(self) -> None:
-        """Ctrl-C, if something runs."""
+        """Send Ctrl-C, if a program runs."""
         if self._program is not None:
             os.killpg(self._program.pid, signal.SIGINT)
             self._finish()
 
     def kill(self) -> None:
-        """The page failed: whatever runs must not be left behind."""
+        """Kill the program, if one runs, after the page failed."""
         if self._program is not None:
             os.killpg(self._program.pid, signal.SIGKILL)
             self._program.wait(_LONGEST_S)
@@ -149,7 +149,7 @@ _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
 
 def _pattern(shape: str, *, exactly: bool) -> re.Pattern[str]:
-    """``shape`` with any spaces, and any numbers unless ``exactly``; an ellipsis stands for anything."""
+    """Compile ``shape``: any spaces, any numbers unless ``exactly``; an ellipsis matches anything."""
     made = ""
     for part in re.split(rf"({_NUMBER}|\s+|…)", shape.strip()):
         if part == "…":

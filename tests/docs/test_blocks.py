@@ -1,4 +1,4 @@
-"""Every command and code block of docs/ runs, in its order, and prints what the page says it prints."""
+"""Every command and code block of docs/ runs, in order, and prints what the page says."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from .blocks import (
 )
 
 GROUP = re.compile(r"239\.74\.163\.(\d+)")
-"""Where the nodes of the pages and examples are; each test gives them groups of its own."""
+"""Multicast groups of the pages and examples; each test replaces them by its own."""
 
 MOST_NOT_RUN = 7
-"""Blocks that need hardware, root, a terminal or much time. More of them want a good reason."""
+"""Maximum number of blocks that need hardware, root, a terminal or much time."""
 
 WIDEST = 104
-"""Columns of code that a page shows without scrolling."""
+"""Columns of code that fit on a page without scrolling."""
 
 SLOWED = {"first-ten-minutes.md", "monitor.md"}
-"""Pages whose simulated hand scans three times less often, so that a busy machine keeps up."""
+"""Pages whose simulated hand scans at a third of the rate, so that a busy machine keeps up."""
 
 _PRINTED = (PRINTS, PRINTS_EXACTLY)
 
 
 def _sandbox(folder: Path, change: Callable[[str], str]) -> None:
-    """What a reader has in the folder of the repository, with ``change`` done to the examples."""
+    """Copy what a reader has in the repository, with ``change`` applied to the examples."""
     shutil.copytree(REPOSITORY / "examples", folder / "examples")
     for file in (folder / "examples").glob("*.toml"):
         file.write_text(change(file.read_text(encoding="utf-8")), encoding="utf-8")
@@ -69,27 +69,27 @@ def _run(blocks: list[Block], folder: Path, *, slowed: bool = False) -> None:
         "COLUMNS": "120",
     }
     terminals: dict[str, Terminal] = {}
-    told: Terminal | None = None
+    latest: Terminal | None = None
     try:
         for block in blocks:
             code = private(block.code)
             if block.file is not None:
                 (folder / block.file).write_text(code, encoding="utf-8")
             elif block.language == "sh":
-                told = terminals.setdefault(block.title, Terminal(folder, environment))
-                told.output.clear()
+                latest = terminals.setdefault(block.title, Terminal(folder, environment))
+                latest.output.clear()
                 for command, status in block.lines():
-                    told.run(private(command), status)
+                    latest.run(private(command), status)
             elif block.language == "python":
                 (folder / "_block.py").write_text(code, encoding="utf-8")
-                told = terminals.setdefault("python", Terminal(folder, environment))
-                told.output.clear()
-                told.run(f"{sys.executable} -W error _block.py", 0)
-                assert told.output, f"prints nothing:\n{code}"
+                latest = terminals.setdefault("python", Terminal(folder, environment))
+                latest.output.clear()
+                latest.run(f"{sys.executable} -W error _block.py", 0)
+                assert latest.output, f"prints nothing:\n{code}"
             elif block.title in _PRINTED:
-                assert told is not None
+                assert latest is not None
                 for line in code.splitlines():
-                    told.wait_for(line, exactly=block.title == PRINTS_EXACTLY)
+                    latest.wait_for(line, exactly=block.title == PRINTS_EXACTLY)
         for terminal in reversed(terminals.values()):
             terminal.end()
     finally:
@@ -104,7 +104,7 @@ def _runs(block: Block, *, on_vcan: bool) -> bool:
 
 
 def _to_run(page: Path, *, on_vcan: bool) -> list[Block]:
-    """Blocks of a page that run on this lane. What a block that does not run prints is not looked at."""
+    """Blocks of a page that run here, without the output of blocks that do not run."""
     chosen, runs = [], False
     for block in blocks_of(page):
         if block.title not in _PRINTED:

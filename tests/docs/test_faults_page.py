@@ -1,4 +1,4 @@
-"""The page of faults names every condition, event, emergency and finding that there is."""
+"""The page of faults names every condition, event, emergency and finding of the code, and no others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FINDINGS = set(re.findall(r"doctor: ([^;|]*[^;| ])", PAGE))
 
 
 def _calls() -> Iterator[ast.Call]:
-    """All calls of functions by their plain name, in the doctor's source."""
+    """All calls by plain name in the doctor's source."""
     for file in sorted(Path(skinnode.doctor.__path__[0]).glob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
@@ -32,7 +32,7 @@ def _calls() -> Iterator[ast.Call]:
 
 
 def _text(what: ast.expr) -> str | None:
-    """A literal with an ellipsis for what is filled in; None for what is no literal."""
+    """Text of a literal, with an ellipsis for each inserted value; None for other expressions."""
     if isinstance(what, ast.Constant) and isinstance(what.value, str):
         return what.value
     if isinstance(what, ast.JoinedStr):
@@ -43,7 +43,7 @@ def _text(what: ast.expr) -> str | None:
 
 
 def _filled(part: ast.expr) -> str:
-    """What the page has for a value: an ellipsis, and the plural of what is counted."""
+    """How the page shows an inserted value: an ellipsis, and the plural of a counted noun."""
     match part:
         case ast.FormattedValue(value=ast.Call(func=ast.Name(id="_crossings"))):
             return "… crossings"
@@ -55,8 +55,8 @@ def _filled(part: ast.expr) -> str:
 
 
 def findings() -> set[str]:
-    """The names of all findings in the doctor's source: the third argument of Finding; of functions called
-    ``found`` the first, or the second where that is a place."""
+    """Names of all findings in the doctor's source: the third argument of ``Finding``, the first argument of
+    ``found``, or its second if the first is a place."""
     names = set()
     for call in _calls():
         assert isinstance(call.func, ast.Name)
@@ -69,7 +69,7 @@ def findings() -> set[str]:
 
 
 def _is(name: str, finding: str) -> bool:
-    """Whether ``finding`` is ``name`` with anything for its ellipses."""
+    """Whether ``finding`` matches ``name``, whose ellipses stand for any text."""
     return re.fullmatch(re.escape(name).replace("…", ".*"), finding) is not None
 
 

@@ -1,4 +1,4 @@
-"""What the pages of docs/ name exists, and has the value they give."""
+"""Commands, options, files, statuses and fields named on the pages exist."""
 
 from __future__ import annotations
 

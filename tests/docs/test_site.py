@@ -1,4 +1,4 @@
-"""The documentation as a site: it builds strictly, whole, and loads nothing from outside."""
+"""The site of the documentation builds strictly, has every page, and loads nothing from outside."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .blocks import PAGES, REPOSITORY
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where a strict build put it."""
+    """Folder of a site built in strict mode."""
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
@@ -36,7 +36,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class _Loads(HTMLParser):
-    """What a browser fetches by itself when it shows a page; links to follow are not among it."""
+    """Collects what a browser fetches to show a page; links to click are not among it."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Every command with its arguments and options, from the commands themselves."""
+"""Reference of the commands: arguments and options, read from the Typer applications."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vcan_sim.cli import app as vcan_sim
 
 
 def commands() -> str:
-    """One section a command."""
+    """Make one section for each command."""
     programs = {"skinnode": get_command(skinnode), "vcan-sim": get_command(vcan_sim)}
     return "\n\n".join(text for name, command in programs.items() for text in _sections(name, command))
 

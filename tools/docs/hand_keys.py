@@ -1,4 +1,4 @@
-"""Every key of hand.toml, from the models that read it: what it is for, type, unit, default, allowed."""
+"""Reference of hand.toml: purpose, type, unit, default and range of each key, from its models."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _UNITS: Final = {
 
 
 def keys_of_a_hand() -> str:
-    """One section a table of the file, in the order of the models."""
+    """Make one section for each table of the file, in the order of the models."""
     return "\n\n".join(_sections("", HandConfig, listed=False))
 
 
@@ -64,7 +64,7 @@ def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
 
 
 def _kind(annotation: Any) -> str:
-    """The type in the words of TOML."""
+    """Name the type as TOML does."""
     origin, inside = get_origin(annotation), [part for part in get_args(annotation) if part is not type(None)]
     if origin in (Union, types.UnionType, Annotated):
         return _kind(inside[0])

@@ -1,4 +1,4 @@
-"""The conditions of a patch and the faults of a simulated node, from their definitions."""
+"""Tables of the conditions of a patch and of the faults of a simulated node, read from their definitions."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from skinnode.host.health import Condition
 from vcan_sim.faults import OF_CHUNKS, OF_SCANS, OF_WIRES, Faults
 
 _PLAIN: Final = {
-    "NEVER_SEEN": "Nothing was heard of it since the host started.",
+    "NEVER_SEEN": "No frame has arrived from it since the host started.",
     "OPERATIONAL": "All is well.",
 }
-"""Of members that say it by their name."""
+"""Meanings of the members that have no docstring."""
 
 
 def conditions() -> str:
@@ -29,7 +29,7 @@ def _without_reference(text: str) -> str:
 
 
 def faults() -> str:
-    """What `vcan-sim --fault` can do."""
+    """Make the table of the faults that `vcan-sim --fault` can inject."""
     docs = md.member_docs(Faults)
     kinds = {"bool": "on or off", "int": "integer", "int | None": "integer"}
     rows = []

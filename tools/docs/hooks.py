@@ -10,13 +10,13 @@ from typing import Any
 import command_pages
 import hand_keys
 import health_tables
+import protocol_tables
 import solver_constants
-import wire_tables
 from mkdocs.exceptions import PluginError
 
 TABLES: dict[str, Callable[[], str]] = {
     **hand_keys.TABLES,
-    **wire_tables.TABLES,
+    **protocol_tables.TABLES,
     **health_tables.TABLES,
     **command_pages.TABLES,
     **solver_constants.TABLES,

@@ -1,4 +1,4 @@
-"""Markdown as the generators write it."""
+"""Markdown helpers of the generators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A pipe table; bars in cells are escaped, but for those in code."""
+    """Make a pipe table; bars are escaped in cells, except in code."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
 
@@ -20,24 +20,24 @@ def _cell(text: str) -> str:
 
 
 def code(text: object) -> str:
-    """``text`` as code; empty for an empty one."""
+    """Mark ``text`` as code; an empty text stays empty."""
     shown = str(text)
     return f"`{shown}`" if shown else ""
 
 
 def prose(docstring: str) -> str:
-    """A docstring in one line of Markdown: its roles and double backticks become code."""
+    """Turn a docstring into one line of Markdown; roles and double backticks become code."""
     text = re.sub(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`", r"`\1`", docstring)
     return " ".join(text.replace("``", "`").split())
 
 
 def c_hex(value: int, digits: int = 4) -> str:
-    """0x and capitals."""
+    """Write a number as 0x and capital digits."""
     return f"0x{value:0{digits}X}"
 
 
 def member_docs(kind: type) -> dict[str, str]:
-    """What stands below each member of a class in its source."""
+    """Read the docstring below each member of a class from its source."""
     (body,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(body, ast.ClassDef)
     docs: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""The wire reference, from the modules that read and write what it describes."""
+"""Tables of the protocol page, made from the modules that implement the protocol."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Sub-index 0 of nearly every object; it says what the rows below it show."""
+"""Name of sub-index 0 of nearly every object. Left out: the rows below it show the same."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Entries alike that are still listed one by one."""
+"""Maximum number of equal entries that are listed one by one."""
 
 
 def cob_ids() -> str:
-    """Every identifier a patch uses, lowest first: that is the order in which they win the bus."""
+    """List the identifiers of a patch, lowest first: the order in which they win the bus."""
     rows = (
         ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "master → node", 2),
         ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "master → node", "1 (counter)"),
@@ -70,7 +70,7 @@ def cob_ids() -> str:
 
 
 def formats() -> str:
-    """The four wire formats of the reference patch side by side."""
+    """Compare the four formats of the reference patch."""
     rows = []
     for profile in REFERENCE_PROFILES:
         frame_s = worst_case_bits(8) / _BITRATE_BPS
@@ -102,7 +102,7 @@ def formats() -> str:
 
 
 def example_scan() -> str:
-    """The frames of one press as bytes, made by the codec."""
+    """Show the frames of one press as bytes, made by the codec."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -129,19 +129,19 @@ def example_scan() -> str:
     return (
         "```text\n" + "\n".join(lines) + "\n```\n\n"
         f"Resistances of {resistance[0, 0]:g}, {resistance[0, 1]:g} and infinite ohm over a baseline of "
-        f"{baseline[0, 0]:g} ohm are the codes {values}; on the wire the low byte comes first. "
-        f"{scale.open} is the code of an open wire, {scale.short} of a short, {scale.over_range} of a value "
-        "out of range."
+        f"{baseline[0, 0]:g} ohm are the codes {values}; on the bus the low byte comes first. "
+        f"An open wire has the code {scale.open}, a short {scale.short}, a value out of range "
+        f"{scale.over_range}."
     )
 
 
 def summary_flags() -> str:
-    """Bits of the second byte of a summary."""
+    """List the bits in the second byte of a summary."""
     return _enum_table(SummaryFlag, ("bit", "name", "meaning"), 2)
 
 
 def pdos() -> str:
-    """PDO parameters after a reset."""
+    """List the PDO parameters after a reset."""
     objects = {item.index: item for item in PROFILE.objects()}
     names = {(e.index, e.subindex): e.name for item in objects.values() for e in item.entries}
     rows = []
@@ -178,17 +178,17 @@ def manufacturer() -> str:
 
 
 def emergencies() -> str:
-    """The error codes that a node sends."""
+    """List the error codes that a node sends."""
     rows = (
         (md.c_hex(code), error_text(code, ours=True), md.c_hex(code.register_bit, 2))
         for code in EmcyCode
         if code
     )
-    return md.table(("code", "what happened", "bit of 0x1001 beside bit 0"), rows)
+    return md.table(("code", "meaning", "bit of 0x1001, beside bit 0"), rows)
 
 
 def aborts() -> str:
-    """The abort codes of the SDO server."""
+    """List the abort codes of the SDO server."""
     rows = (
         (md.c_hex(code, 8), SdoAbortedError.CODES.get(code, code.name.replace("_", " ").capitalize()))
         for code in AbortCode
@@ -197,11 +197,11 @@ def aborts() -> str:
 
 
 def rejected() -> str:
-    """Sub-indices of 0x2040."""
+    """List the sub-indices of 0x2040."""
     names = {entry.subindex: entry.name for entry in _find(PROFILE, od.REJECTED_FRAMES).entries}
     docs = md.member_docs(Rejected)
     rows = ((str(kind.value), names[kind.value], docs[kind.name]) for kind in Rejected)
-    return md.table(("sub", "counts", "frames that are"), rows)
+    return md.table(("sub", "counter", "counts frames that are"), rows)
 
 
 def _enum_table(kind: type[enum.IntFlag], head: tuple[str, ...], digits: int) -> str:
@@ -220,12 +220,12 @@ def _shape(item: Object) -> list[tuple[object, ...]]:
 
 
 def _family(item: Object) -> str:
-    """The name without a number at its end: `Codes of upper wire` of each of them."""
+    """Name of an object without its final number, such as `Codes of upper wire`."""
     return item.name.rstrip("0123456789")
 
 
 def _dictionary(objects: Iterable[Object]) -> str:
-    """Rows for every entry; neighbours that are alike become one row, and so do neighbouring objects."""
+    """Make a row for each entry; equal neighbours share a row, and so do equal neighbouring objects."""
     runs: list[list[Object]] = []
     for item in objects:
         if runs and _family(item) == _family(runs[-1][-1]) and _shape(item) == _shape(runs[-1][0]):
@@ -252,7 +252,7 @@ def _dictionary(objects: Iterable[Object]) -> str:
 
 
 def _and_on(first: str, last: str) -> str:
-    """Names that differ in their last word."""
+    """Join two names that differ in their last word."""
     return f"{first} … {last.rpartition(' ')[2]}"
 
 

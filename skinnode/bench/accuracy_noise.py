@@ -19,7 +19,7 @@ from skinnode.bench import methods
 from skinnode.bench.cases import Case, preset
 from skinnode.bench.score import bound_std_m
 from skinnode.bench.truth import Converter, Press, Skin, Stream, random_press, stream
-from skinnode.model.frames import Z_95, FieldFrame
+from skinnode.model.frames import Z_95_TWO_SIDED, FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
 from skinnode.solve.posterior.estimate import PRIOR_DOUBT, SMOOTH_SHARE
@@ -192,12 +192,12 @@ class Forces:
             error, std, size = np.array(values).T
             figures[f"{name}_error"] = float(np.sqrt(np.mean((error / size) ** 2)))
             figures[f"{name}_reported"] = float(np.sqrt(np.mean((std / size) ** 2)))
-            figures[f"{name}_coverage"] = float(np.mean(np.abs(error) <= Z_95 * std))
+            figures[f"{name}_coverage"] = float(np.mean(np.abs(error) <= Z_95_TWO_SIDED * std))
         if self._place:
             off, std = np.array(self._place).T
             figures["centroid_error_m"] = float(np.sqrt(np.mean(off**2)))
             figures["centroid_reported_m"] = float(np.sqrt(np.mean(std**2)))
-            figures["centroid_coverage"] = float(np.mean(np.abs(off) <= Z_95 * std))
+            figures["centroid_coverage"] = float(np.mean(np.abs(off) <= Z_95_TWO_SIDED * std))
         return figures
 
 

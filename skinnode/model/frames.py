@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
 
-Z_95: Final = 1.959964
-"""97.5 % of the normal distribution lie below."""
+Z_95_TWO_SIDED: Final = 1.959964
+"""Normal deviate within which 95 % of a normal distribution lie: 97.5 % lie below."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class FieldFrame:
     @property
     def half_width_95_m(self) -> Float:
         """(U, N, 3) half of the width of the 95 % interval around the displacement."""
-        return Z_95 * (self.displacement_std_m if self.core_std_m is None else self.core_std_m)
+        return Z_95_TWO_SIDED * (self.displacement_std_m if self.core_std_m is None else self.core_std_m)
 
     @property
     def trusted(self) -> bool:

@@ -24,37 +24,22 @@ from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.branch import (
-    AGREE,
-    BLIND,
-    JUMP,
-    REFEREE_NOISE,
-    Smoothness,
-    exact_deviation,
-    folded_wires,
-    wire_deviations,
-)
+from skinnode.solve import roots
+from skinnode.solve.cramer_rao import patch_std
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
 from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.smoothness import Smoothness
 from skinnode.solve.wires import frame
 from skinnode.solve.wires.problem import PatchProblem
 
 METHODS: Final = ("auto", "exact", "posterior")
-EXACT_SHARE: Final = 0.0025
+EXACT_STD: Final = 0.0025
 """Deviation of the exact inverse at rest, in clearances, up to which ``auto`` takes it: 2.5 % of a press of a
 tenth of the layer. 16-bit codes leave 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
-NONLINEAR: Final = 0.003
-"""Deviation of the exact inverse, in clearances, from which on F is not linear within its noise: a root is
-then as doubtful as near a fold."""
-LARGE: Final = 0.03
-"""Displacement, in clearances, from which on its roughness is looked at: folds lie at larger ones still."""
 PAUSE: Final = 16
 """Frames in which the posterior is not asked again, after it did not answer by the deadline: to ask in vain
 with every frame takes 2 ms of the time of patches that wait for the same thread."""
-ROUGH: Final = 1.2
-"""Roughness of a displacement over its size, in the units of :class:`Smoothness`, above which it is put to
-the posterior. Presses have 0.5 to 1 and up to 1.7 where they move one electrode, wrong roots 1 to 2."""
 
 
 class Tracker:
@@ -133,18 +118,18 @@ class Tracker:
             codes=codes,
         )
         problem = PatchProblem.of(layout, baseline_ohm)
-        self._rough_limit = ROUGH / problem.step_limit
+        self._rough_limit = roots.ROUGH_IN_STREAM / problem.step_limit
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
-        self._far_m, self._jump_m = LARGE * clearance_m, JUMP * clearance_m
+        self._far_m, self._jump_m = roots.LARGE * clearance_m, roots.JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # frames until the posterior is asked again
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
         self._apart = np.zeros((len(problem.rest), 1, 1))  # what its confirmation left open of a wire
         self._any_apart = False
-        self._blind = wire_deviations(layout, 1.0, normal_only) > BLIND
-        rough_noise = exact_deviation(layout, relative_noise, normal_only) > NONLINEAR
-        self._folded = folded_wires(layout, normal_only) | rough_noise
+        self._blind = roots.blind_wires(layout, normal_only)
+        rough_noise = roots.nonlinear_in_noise(layout, relative_noise, normal_only)
+        self._folded = roots.folded_wires(layout, normal_only) | rough_noise
         its = self._exact.arrays
         whitening = np.array(Smoothness(problem).whitening, order="C")
         self._judgement = Bundle(
@@ -211,7 +196,7 @@ class Tracker:
                     self._posterior.reset()  # annealed anew: what follows a wrong root would confirm it
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
-                noise = np.maximum(its.noise, REFEREE_NOISE)
+                noise = np.maximum(its.noise, roots.REFEREE_NOISE)
                 guide = self._posterior.update(its.ohm.copy(), its.valid.copy(), noise)
                 if Status.DEADLINE in guide.status:
                     self._pause = PAUSE
@@ -234,9 +219,7 @@ class Tracker:
         )
         if found & frame.SOME_ROUGH:
             if self._confirmed is not None:  # what was confirmed a moment ago is not asked again
-                moved = self._exact.arrays.outcome_m[0]
-                change = np.abs(moved - self._confirmed).max(axis=(1, 2))
-                self._rough &= change > 0.2 * np.abs(moved).max(axis=(1, 2))
+                self._rough &= ~roots.still_confirmed(self._exact.arrays.outcome_m[0], self._confirmed)
             self._unsure |= self._rough
         return found & frame.SOME_DOUBT != 0 or bool(found & frame.SOME_ROUGH and self._rough.any())
 
@@ -284,7 +267,7 @@ class Tracker:
         converged = np.array(field.status) == Status.CONVERGED
         spread = np.hypot(field.displacement_std_m, guide.displacement_std_m)
         gap = np.abs(field.displacement_m - guide.displacement_m)
-        agreed = ~self._blind & doubtful & converged & known & (gap <= AGREE * spread).all(axis=(1, 2))
+        agreed = ~self._blind & doubtful & converged & known & roots.agrees(gap, roots.AGREE * spread)
         if agreed.any():
             if self._confirmed is None:
                 self._confirmed = np.full_like(field.displacement_m, np.inf)
@@ -351,9 +334,9 @@ def _choose(
     unknowns = layout.unknowns // 3 if normal_only else layout.unknowns
     if layout.shape[1] < unknowns:
         return "posterior", f"{layout.shape[1]} lower wires for {unknowns} unknowns an upper wire"
-    share = exact_deviation(layout, relative_noise, normal_only)
-    chosen = "exact" if share <= EXACT_SHARE else "posterior"
+    share = patch_std(layout, relative_noise, normal_only)
+    chosen = "exact" if share <= EXACT_STD else "posterior"
     return chosen, (
         f"the noise leaves the exact inverse a deviation of {100 * share:.2g} % of the clearance between the "
-        f"layers at rest, where {100 * EXACT_SHARE:g} % is the limit"
+        f"layers at rest, where {100 * EXACT_STD:g} % is the limit"
     )

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import skinnode as sk
-from skinnode.solve.paths.path_tracker import Walk
+from skinnode.solve.paths.corrector import Accuracy
+from skinnode.solve.paths.path_tracker import PathTracker
+from skinnode.solve.paths.root_selection import keep_likeliest
 from skinnode.solve.paths.step_control import shortest_cycle
 from skinnode.solve.wires.problem import PatchProblem
 
@@ -221,15 +223,15 @@ def test_a_step_that_leaves_the_branch_is_taken_back():
     layout = staggered(1.0)
     problem = PatchProblem.of(layout)
     truth = hertz_press(layout, 0.5)
-    walk = Walk(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
+    tracker = PathTracker(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
     everywhere, there = np.ones(10, bool), np.zeros(10)
-    arrived = walk.step(everywhere, there, 1e-9, 6)
+    arrived = tracker.step(everywhere, there, Accuracy(1e-9, 6))
     assert 0 < arrived.sum() < 10
-    at = problem.displacement_m(walk.solver.x)
+    at = problem.displacement_m(tracker.solver.x)
     np.testing.assert_array_equal(at[~arrived], 0)
     np.testing.assert_allclose(at[arrived], truth[arrived], atol=1e-9)
-    halfway = walk.predict(np.full(10, -0.5)) - problem.rest  # as if the step had never been tried
-    fresh = Walk(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
+    halfway = tracker.predict(np.full(10, -0.5)) - problem.rest  # as if the step had never been tried
+    fresh = PathTracker(problem, frame_ohm(layout, truth)[None] * problem.gain, 2)
     expected = fresh.predict(np.full(10, -0.5)) - problem.rest
     np.testing.assert_array_equal(halfway[~arrived], expected[~arrived])
 
@@ -248,17 +250,21 @@ def test_the_likelier_of_two_roots_is_kept_and_neither_of_equals_is_believed(sec
     pitches = (truth / layout.pitch_m).reshape(10, -1)
     doubted = {}
     for weight in (1, -1, 0):
-        walk = Walk(problem, samples * problem.gain, OPERATORS.index("dogleg"))
-        sk.Uniform().follow(walk)
-        assert (walk.status == sk.Status.CONVERGED).all()
-        walk.second_tries = second_tries
+        tracker = PathTracker(problem, samples * problem.gain, OPERATORS.index("dogleg"))
+        sk.Uniform().follow(tracker)
+        assert (tracker.end.status == sk.Status.CONVERGED).all()
+        tracker.second_tries = second_tries
         none = np.zeros((0, *pitches.shape))
-        walk.weigh_rivals(
-            none, lambda moved, w=weight: w * 1e9 * ((moved - pitches) ** 2).sum(), np.ones(10), 1e-9, 100
+        keep_likeliest(
+            tracker,
+            none,
+            lambda moved, w=weight: w * 1e9 * ((moved - pitches) ** 2).sum(),
+            np.ones(10),
+            Accuracy(1e-9, 100),
         )
-        at = problem.displacement_m(walk.solver.x)
+        at = problem.displacement_m(tracker.solver.x)
         stayed = np.abs(at - truth).max(axis=(1, 2)) < 1e-9 * layout.height_m
-        doubted[weight] = walk.status != sk.Status.CONVERGED
+        doubted[weight] = tracker.end.status != sk.Status.CONVERGED
         if weight == -1 and second_tries:
             assert 4 < np.count_nonzero(~stayed) < 10
             np.testing.assert_allclose(frame_ohm(layout, at), samples[-1], rtol=1e-8)  # a root too

@@ -17,7 +17,7 @@ import skinnode.solve
 _NOT_TUNED: Final = {
     *("DECODE", "TAKE", "CHOOSE", "SOLVE", "REACH", "FINISH", "ALL_GOOD", "INCOMPLETE"),
     *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
-    *("ROWS", "TILE", "REST", "TINY", "A_MIN", "A_MAX", "NOISE_MAX"),
+    *("ROWS", "TILE", "REST", "TINY", "SQUARE_FLOOR", "A_MIN", "A_MAX", "NOISE_MAX"),
 }
 """Names of task flags, tile sizes and overflow limits: no result depends on their values."""
 

@@ -28,6 +28,7 @@ from skinnode.solve.exact.patch_stream import TOLERANCE, Frame, PatchStream
 from skinnode.solve.exact.recovery import recover
 from skinnode.solve.linalg.factorisations import Index
 from skinnode.solve.operators import steps as op
+from skinnode.solve.roots import Z_REFUSE
 from skinnode.solve.wires import driver as wires
 from skinnode.solve.wires.follow import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.frame import DEADLINE, STALE
@@ -56,7 +57,7 @@ class LeftOut:
         # limits of χ² by degrees of freedom
         self._chi2_hold, self._chi2_widen, self._chi2_refuse = (
             np.array([chi2_quantile(max(dof, 1), z) for dof in range(layout.shape[1] + 1)])
-            for z in (Z_HOLD, Z_WIDEN, wires.Z_REFUSE)
+            for z in (Z_HOLD, Z_WIDEN, Z_REFUSE)
         )
 
     def reset(self) -> None:

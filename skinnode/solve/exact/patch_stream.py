@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.factorisations import Index
 from skinnode.solve.operators import steps as op
+from skinnode.solve.roots import on_rest_branch
 from skinnode.solve.wires import driver as wires
 from skinnode.solve.wires.frame import FrameArrays
 from skinnode.solve.wires.patch_solver import PatchSolver
@@ -106,9 +107,10 @@ class PatchStream:
     def roots(self) -> NDArray[np.bool_]:
         """(U,) wires that the solver brought to a root on the branch of the rest position, within reach."""
         solver = self.solver
-        converged = solver.report[:, wires.STATUS] == op.CONVERGED
-        same_branch = solver.report[:, wires.BRANCH] * self._rest_branch >= 0
-        return np.asarray(converged & same_branch & ~self.problem.out_of_reach(solver.x))
+        report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
+        return on_rest_branch(
+            report[:, wires.STATUS], report[:, wires.BRANCH], self._rest_branch, out_of_reach
+        )
 
     def solvable(self) -> NDArray[np.bool_]:
         """(U,) wires with enough usable resistances in the frame for their unknowns."""

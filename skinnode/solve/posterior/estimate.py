@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
+from skinnode.solve import roots
 from skinnode.solve.linalg.cholesky import (
     cholesky,
     inverse_diagonal,
@@ -83,8 +84,6 @@ SMOOTH_SHARE: Final = 0.25
 """So much of the prior's part is in the 95 % interval. Independent loads on cells are rougher than bodies:
 measured, 0.0 to 0.13 of that variance is in the errors of spheres, 0.02 to 0.5 in those of Gaussian dents.
 The tail of that is the deviation's, its body the interval's."""
-NEAR: Final = 0.25
-"""Share of the clearance a first correction may move an electrode by; beyond, the solve is annealed."""
 
 
 @dataclass
@@ -122,7 +121,7 @@ class Estimator:
         self._blur = _blur(prior.shape)
         self._b = kernels.buffers(wires, equations, coordinates, free.size, nuisances)
         self._rows = min(equations, free.size + nuisances)
-        self._reach = NEAR * float(problem.clearance.min())
+        self._reach = roots.NEAR * float(problem.clearance.min())
         self._enough = math.inf  # RMS of a correction that is small against the deviation
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)

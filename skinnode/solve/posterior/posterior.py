@@ -21,7 +21,7 @@ from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
-from skinnode.solve.branch import REFEREE_NOISE, folded_wires
+from skinnode.solve import roots
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
 from skinnode.solve.posterior.contacts import ContactFinder
 from skinnode.solve.posterior.estimate import Data, Estimator, Index
@@ -36,8 +36,6 @@ QUIET_CHANCE: Final = 0.005
 QUIET_DEVIATIONS: Final = 3.7
 """Or where a single coordinate would have to move by more than this: one in 15 unmoved frames of 300
 coordinates."""
-IMPOSSIBLE_CHANCE: Final = 1e-9
-"""A wire that obeys the model is called INCONSISTENT with at most this chance a frame."""
 NOISE_LEAST: Final = 1e-6
 """Least relative noise: a fifth of a 16-bit code. Less forces the field onto a root of F = b, and there are
 wrong ones, on layouts with folds from ten times as much on; and the forward model is no better than that."""
@@ -61,17 +59,6 @@ REFINEMENTS: Final = 3
 """Most times a frame refines where loads are expected; each costs as much as two solves."""
 KEPT: Final = 50
 """Frames for which a wire that moved against what the others said has its equations used."""
-SUSPICIOUS: Final = 3.0
-"""Prior deviations of a nuisance from which on the field is held against the annealed, and never held still:
-a drift or a model error can take the place of a displacement, and a stream would stay there."""
-BELIEVABLE: Final = 5.0
-"""Beyond, nothing was explained: the frame is INCONSISTENT."""
-FAR: Final = 0.1
-"""Share of the clearance by which an electrode may go before the field is held against the one annealed from
-rest: folds were passed by presses of 0.3 and more, frame by frame, and never noticed afterwards."""
-LIKELIER: Final = 4.0
-"""Twice the log by which a field annealed again must be the likelier. With less it is the same maximum, drawn
-nearer to what was found; the wrong one that was met lost by 23."""
 NOISE_WORTH: Final = 20.0
 """The noise given counts as much as 20 resistances when it is estimated."""
 NOISE_STEP: Final = math.log(1.1)
@@ -149,11 +136,11 @@ class Posterior:
         self._estimator = Estimator(self._problem, self._prior, self._free, self._d.size)
         self._contacts = ContactFinder(self._prior, layout) if contacts else None
         self._quiet, self._impossible = (
-            chi_square_limits(layout.shape[1], chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
+            chi_square_limits(layout.shape[1], chance) for chance in (QUIET_CHANCE, roots.IMPOSSIBLE_CHANCE)
         )
-        self._folded = float(folded_wires(layout, normal_only).mean()) > 0.5
-        self._noise_least = REFEREE_NOISE if self._folded else NOISE_LEAST
-        self._far = FAR * float(self._problem.clearance.min())
+        self._folded = float(roots.folded_wires(layout, normal_only).mean()) > 0.5
+        self._noise_least = roots.REFEREE_NOISE if self._folded else NOISE_LEAST
+        self._far = roots.FAR * float(self._problem.clearance.min())
         height = float(np.median(self._problem.clearance))
         self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
         self._signal = self._estimator.signal()
@@ -295,7 +282,7 @@ class Posterior:
         two noises, its own and the one that was solved into the field."""
         if not (self._hold and self._known and np.array_equal(data.weight > 0, self._seen)):
             return False  # fewer resistances know less of the field, more know more
-        if self._strained(data, SUSPICIOUS):
+        if self._strained(data, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
         noises[self._members] = 2.0
@@ -356,7 +343,7 @@ class Posterior:
                 self._kept[surprised] = KEPT
                 wanted = np.union1d(wanted, surprised)
                 continue
-            if self._strained(data, BELIEVABLE):
+            if self._strained(data, roots.BELIEVABLE):
                 return self._give_up(Status.INCONSISTENT)
             excess = total / self._impossible[data.count]
             if (excess <= 1.0).all():
@@ -386,7 +373,7 @@ class Posterior:
         hurry = self._seconds < math.inf  # annealing takes several frames' worth of time
         if (self._known or hurry) and estimator.track(data, members):
             gone = float(np.abs(estimator.moved - self._compared).max())
-            far = gone >= self._far or self._strained(data, SUSPICIOUS)
+            far = gone >= self._far or self._strained(data, roots.SUSPICIOUS)
             if not far or hurry or self._anneal_and_compare(data, members):
                 return True
         estimator.spread(self._fixed_scale or self._scale_rest)
@@ -398,7 +385,7 @@ class Posterior:
     def _strained(self, data: Data, deviations: float) -> bool:
         """Whether a nuisance is beyond so many of its prior deviations: it then stands in for something
         else."""
-        return bool((np.abs(self._estimator.g) > deviations * np.sqrt(data.d)).any())
+        return roots.beyond_prior(self._estimator.g, data.d, deviations)
 
     def _anneal_and_compare(self, data: Data, members: Index) -> bool:
         """Far from where that was last asked, the next maximum need not be the right one: the better of it
@@ -421,7 +408,7 @@ class Posterior:
         and the one annealed with the loads expected where they were found."""
         estimator = self._estimator
         first, before = (estimator.moved.copy(), estimator.g.copy()), estimator.objective(data)
-        if estimator.anneal(data, members) and estimator.objective(data) < before - LIKELIER:
+        if estimator.anneal(data, members) and estimator.objective(data) < before - roots.LIKELIER:
             return self._adapt(data, a, noise, usable, members, local=True)
         estimator.moved[:], estimator.g[:] = first
         estimator.track(data, members)

@@ -43,6 +43,7 @@ from skinnode.solve.operators.steps import (
     propose,
     shorten,
 )
+from skinnode.solve.roots import Z_REFUSE
 from skinnode.solve.wires.follow import FRESH, chi2_quantile_part, deviations, follow, step_back, within_noise
 
 # The arrays of a solver, by their number in its bundle
@@ -105,10 +106,8 @@ HELD_UNITS: Final = 0.25
 DATA_ROUNDING: Final = 2.0
 """Relative error of an a F, in eps: R, the gain, their product and F are rounded to half an eps each."""
 
-# Normal deviates of the quantiles used
-Z_95: Final = 1.645
-Z_REFUSE: Final = 5.998
-"""1 − 1e-9: once in four months at 100 frames/s, and below what a wrong root or a wrong value causes."""
+Z_95_ONE_SIDED: Final = 1.645
+"""Normal deviate below which 95 % of a normal distribution lie."""
 
 
 @njit_part
@@ -364,7 +363,7 @@ def solve_wires(
                         spare = count - unknowns
                         scale = sigma
                         if spare > 0 and sigma > 0.0:
-                            if square > chi2_quantile_part(spare, Z_95):  # Birge's ratio
+                            if square > chi2_quantile_part(spare, Z_95_ONE_SIDED):  # Birge's ratio
                                 scale *= math.sqrt(square / spare)
                             if not square <= chi2_quantile_part(spare, Z_REFUSE):
                                 status = ILL_CONDITIONED

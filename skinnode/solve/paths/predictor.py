@@ -1,0 +1,62 @@
+"""Predictors of a path tracker: where the next point of a path lies, from the points solved."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skinnode.compiled.jit import njit
+from skinnode.model.layout import Float
+
+SQUARE_FLOOR: Final = 1e-300
+"""Least square of a change that is divided by."""
+
+
+def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
+    """Predict positions by Euler's step along ∂x/∂R.
+
+    Args:
+        x: (U, n) last solution of each wire, pitches.
+        inverse: (U, n, K) ∂x/∂r there.
+        a_solved: (U, K) R · gain there.
+        a: (U, K) R · gain at the next point.
+
+    Returns:
+        (U, n) positions, pitches.
+    """
+    change = a / a_solved - 1.0
+    return np.asarray(x - np.einsum("ujk,uk->uj", inverse, change))
+
+
+@njit
+def secant(
+    x_before: Float, a_before: Float, x: Float, a: Float, a_next: Float, reach: float, out: Float
+) -> None:
+    """Predict positions on the secant through the last two points solved.
+
+    The share of the last move is the share of the last change of ``a`` in the next one. A wire whose
+    prediction is not finite stays at ``x``.
+
+    Args:
+        x_before: (U, n) position at the point before the last, pitches.
+        a_before: (U, K) R · gain there.
+        x: (U, n) position at the last point, pitches.
+        a: (U, K) R · gain there.
+        a_next: (U, K) R · gain at the next point.
+        reach: Largest move of a coordinate, pitches.
+        out: (U, n) predicted positions, pitches.
+    """
+    for u in range(x.shape[0]):
+        along, square, longest = 0.0, SQUARE_FLOOR, reach
+        for k in range(a.shape[1]):
+            change = a[u, k] / a_before[u, k] - 1.0
+            along += change * (a_next[u, k] / a[u, k] - 1.0)
+            square += change * change
+        share = along / square
+        for j in range(x.shape[1]):
+            longest = max(longest, abs(share * (x[u, j] - x_before[u, j])))
+        for j in range(x.shape[1]):
+            move = share * (x[u, j] - x_before[u, j]) * (reach / longest)
+            out[u, j] = x[u, j] + (move if math.isfinite(move) else 0.0)

@@ -1,0 +1,205 @@
+"""Root selection at the end of a path: second tries, and which of the roots found is believed.
+
+The thresholds are in :mod:`skinnode.solve.roots`. All functions work on :attr:`PathTracker.end` and the
+solver's positions in place. A root that is refused becomes ILL_CONDITIONED.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from skinnode.solve import roots
+from skinnode.solve.operators import steps as op
+from skinnode.solve.paths.corrector import Accuracy
+from skinnode.solve.paths.path_tracker import PathTracker
+from skinnode.solve.roots import Mask
+from skinnode.solve.starts import guided_start, near_twin
+from skinnode.solve.wires import driver as wires
+
+GUIDED_STEPS: Final = 100
+"""Maximum steps from a guided start: it is next to its root, 1 to 20 steps, or next to none."""
+TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchEstimate:
+    """Estimate of the whole patch that roots are compared with."""
+
+    x: Float
+    """(U, n) positions, pitches."""
+    std: Float
+    """(U, n) standard deviations, pitches."""
+
+    def agrees(self, x: Float) -> Mask:
+        """Return the wires (U,) whose position (U, n), pitches, the estimate confirms."""
+        return roots.agrees(np.abs(x - self.x), roots.AGREE * self.std)
+
+
+def doubtful(tracker: PathTracker) -> Mask:
+    """Return the wires (U,) without a root, with one too rough for a press, or that took a step back."""
+    return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
+
+
+def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
+    """Solve the last sample again from the smoothest displacement that explains it; keep the smoother root.
+
+    If that leads to a root across a fold, its twin on this side is solved for. A wire on which neither is a
+    root is not CONVERGED afterwards.
+
+    Args:
+        tracker: At the end of its path.
+        todo: (U,) wires to solve again.
+        accuracy: Of the last sample.
+    """
+    if not todo.any():
+        return
+    solver, end, smoothness = tracker.solver, tracker.end, tracker.smoothness
+    x, kept, last_a = solver.x.copy(), end.copy(), tracker.last_a
+    evaluations = np.zeros(tracker.wires, np.int64)
+    for u in np.flatnonzero(todo).tolist():
+        solver.x[u], evaluations[u] = guided_start(tracker.problem, u, last_a[u], smoothness.covariance[u])
+    tracker.corrector.log_start(todo, evaluations)
+    accuracy = Accuracy(accuracy.tolerance, min(accuracy.max_steps, GUIDED_STEPS))
+    tracker.take(todo, accuracy, op.LEVENBERG_MARQUARDT)
+    across = todo & (solver.report[:, wires.STATUS] == op.CONVERGED) & ~tracker.on_branch()
+    beyond = smoothness.roughness(solver.x)
+    for u in np.flatnonzero(across).tolist():
+        solver.x[u] = near_twin(tracker.problem, solver.x[u], last_a[u], end.inverse[u])
+    if across.any():
+        tracker.take(across, accuracy, op.LEVENBERG_MARQUARDT)
+        end.doubt(across & (beyond < roots.TWIN_ROUGHNESS * smoothness.roughness(solver.x)))
+    smoother = smoothness.roughness(solver.x) < smoothness.roughness(x)
+    found = end.converged
+    back = todo & kept.converged & ~(found & smoother)
+    solver.x[back] = x[back]
+    end.restore(back, kept)
+    end.doubt(back & ~found)
+
+
+def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
+    """Refuse a rough root that is not the smoothest to be found, and move no wire."""
+    end = tracker.end
+    todo = _rough(tracker) & end.converged
+    x, kept = tracker.solver.x.copy(), end.copy()
+    guide(tracker, todo, accuracy)
+    size = roots.distance(x, tracker.problem.rest)
+    apart = roots.distance(tracker.solver.x, x) > roots.SAME_ROOT * size
+    refused = todo & (apart | ~end.converged)
+    tracker.solver.x[:] = x
+    tracker.end = kept
+    kept.status[refused] = op.ILL_CONDITIONED
+
+
+def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accuracy: Accuracy) -> None:
+    """Compare every root with an estimate of the whole patch.
+
+    A wire that the estimate does not confirm, or that has no root, is solved from the estimate. The new root
+    may lie across a fold, which the skin itself can pass, if the samples led to the same root.
+    """
+    solver, end = tracker.solver, tracker.end
+    todo = ~(estimate.agrees(solver.x) & end.converged)
+    if not todo.any():
+        return
+    root, converged = solver.x.copy(), end.converged
+    if not tracker.second_tries:
+        end.doubt(todo)
+        return
+    solver.x[todo] = estimate.x[todo]
+    tracker.take(todo, accuracy, op.LEVENBERG_MARQUARDT, tracker.at_path_end)
+    found = end.converged & estimate.agrees(solver.x)
+    end.doubt(todo & ~found)
+    back = todo & converged & ~found
+    solver.x[back] = root[back]
+    end.status[back] = op.ILL_CONDITIONED
+
+
+def keep_likeliest(
+    tracker: PathTracker,
+    starts: Float,
+    energy: Callable[[Float], float],
+    unlikely: Float,
+    accuracy: Accuracy,
+) -> None:
+    """Look for other roots, from their twins and from ``starts``, and keep the likeliest.
+
+    A root is CONVERGED only if no other comes within ``unlikely`` of its energy.
+
+    Args:
+        tracker: At the end of its path.
+        starts: (S, U, n) positions, pitches.
+        energy: −2 log of the density of a displacement field (U, n), pitches, to a constant.
+        unlikely: (U,) energy by which other roots must be less likely.
+        accuracy: Of the root that is kept.
+    """
+    solver, end, rest = tracker.solver, tracker.end, tracker.problem.rest
+    found = solver.x.copy()
+    first = np.where(end.converged[:, None], _twins(tracker), found)
+    root = found.copy()
+    size, least = roots.distance(root, rest), energy(root - rest)
+    close, better = np.zeros(tracker.wires, bool), np.zeros(tracker.wires, bool)
+    for start in (first, *starts):
+        todo = end.converged
+        solver.x[:] = start
+        tracker.try_root(todo, TWIN)
+        other = roots.distance(solver.x, root) > roots.SAME_ROOT * size
+        other &= todo & (solver.report[:, wires.STATUS] == op.CONVERGED)
+        for u in np.flatnonzero(other & ~tracker.out_of_reach()).tolist():
+            rival = root.copy()
+            rival[u] = solver.x[u]
+            gain = least - energy(rival - rest)
+            close[u] = abs(gain) < unlikely[u] or (close[u] and gain < 0)
+            if gain > 0:
+                root[u], better[u] = rival[u], True
+                least -= gain
+    if not tracker.second_tries:
+        end.doubt(close | better)
+        solver.x[:] = found
+        return
+    solver.x[:] = root
+    if better.any():
+        tracker.take(better, accuracy, op.LEVENBERG_MARQUARDT)
+    end.doubt(close)
+
+
+def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
+    """Refuse a root that has a twin as smooth on the other side of a fold.
+
+    If there is an ``estimate`` of the patch, a twin that it does not confirm is ignored.
+    """
+    layout = tracker.problem.layout
+    if layout.shape[1] != layout.unknowns:
+        return  # more equations than unknowns: a fold leaves no second root
+    solver, end, smoothness = tracker.solver, tracker.end, tracker.smoothness
+    root, twins = solver.x.copy(), _twins(tracker)
+    size = roots.distance(root, tracker.problem.rest)
+    todo = roots.distance(twins, root) < roots.TWIN_REACH * size
+    solver.x[todo] = twins[todo]
+    if todo.any():
+        tracker.try_root(todo, TWIN)
+        other = todo & roots.crossed_fold(solver.report[:, wires.BRANCH], end.side)
+        other &= ~tracker.out_of_reach()
+        if estimate is not None:
+            other &= estimate.agrees(solver.x)
+        smooth = smoothness.roughness(solver.x) < roots.TWIN_ROUGHNESS * smoothness.roughness(root)
+        end.status[other & smooth] = op.ILL_CONDITIONED
+    solver.x[:] = root
+
+
+def _twins(tracker: PathTracker) -> Float:
+    """(U, n) estimates of the roots across the nearest folds, NaN for wires that are not CONVERGED."""
+    x, end, last_a = tracker.solver.x, tracker.end, tracker.last_a
+    twins = np.full_like(x, math.nan)
+    for u in np.flatnonzero(end.converged).tolist():
+        twins[u] = near_twin(tracker.problem, x[u], last_a[u], end.inverse[u])
+    return twins
+
+
+def _rough(tracker: PathTracker) -> Mask:
+    x, problem = tracker.solver.x, tracker.problem
+    return roots.rough_at_path_end(tracker.smoothness.roughness(x), x - problem.rest, problem.step_limit)

@@ -1,0 +1,138 @@
+"""Starts of a solve at a sample of a path, or at a frame, to which no earlier solution leads.
+
+guided_start   the smooth displacement that explains the resistances: the maximum a posteriori estimate,
+               followed from much noise to none (data-space Gauss-Newton, Tarantola 2005, section 3.4)
+near_twin      if J is close to singular, a second root lies close by, on the other side of the fold. To
+               second order along the direction v that J maps onto the least, σ α + ½ α² wᵀF″[v, v] = 0 has
+               the twin at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer 1985, chapter I.3)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skinnode.compiled.jit import njit
+from skinnode.model.kernels import potential_jacobian
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index, dot, largest, lu_factor, lu_solve_transposed, padded
+from skinnode.solve.wires.problem import PatchProblem
+
+NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
+"""Standard deviations of r that the guided start goes through, 0.1 to 3e-8, one step each. Whole decades lose
+one wire in a hundred more at h = 1 and 50 %."""
+POWER_STEPS: Final = 8
+"""Number of inverse iterations: singular values next to the least one are some 3 times larger."""
+DIFFERENCE: Final = 1e-4
+"""Step of the second derivative, pitches: about eps^(1/3) and far below any clearance."""
+
+
+def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
+    """Find a position near the likeliest root of a F = 1.
+
+    Args:
+        problem: The patch.
+        wire: Index of the upper wire.
+        a: (K,) R · gain of the wire.
+        covariance: (n, n) prior covariance of the displacement, pitches². Any will do; the covariance of
+            elastic rubber would know the neighbouring wires as well.
+
+    Returns:
+        (n,) position, pitches, the rest position if the iteration runs into an electrode; and the number of
+        evaluations of F with J.
+    """
+    n, equations = problem.rest.shape[1], a.size
+    x = problem.rest[wire].copy()
+    y, (jt, spread) = np.empty(equations), np.empty((2, n, equations))
+    inner, pivot = padded(equations + 3, equations), np.empty(equations, np.int64)
+    evaluations = _follow_noise(
+        x, problem.rest[wire], problem.lower, a, covariance, NOISE_LEVELS, y, jt, spread, inner, pivot
+    )
+    return x, evaluations
+
+
+@njit
+def _follow_noise(
+    x: Float,
+    rest: Float,
+    lower: Float,
+    a: Float,
+    covariance: Float,
+    noises: Float,
+    y: Float,
+    jt: Float,
+    spread: Float,
+    inner: Float,
+    pivot: Index,
+) -> int:
+    """Take one Gauss-Newton step a noise level, C Jᵀ (J C Jᵀ + σ²)⁻¹ y with y = J (x − rest) − r, into ``x``.
+
+    All arguments after ``noises`` are scratch, ``inner`` with zeros as :func:`lu_factor` needs it. Returns
+    the number of evaluations.
+    """
+    n, equations = jt.shape
+    for level in range(noises.size):
+        potential_jacobian(x, lower, y, jt)
+        for k in range(equations):
+            y[k] = 1.0 - a[k] * y[k]
+        for i in range(n):
+            row, moved = jt[i], x[i] - rest[i]
+            for k in range(equations):
+                row[k] *= a[k]
+                y[k] += moved * row[k]
+        inner[:equations, :equations] = 0.0
+        for i in range(n):
+            target, source = spread[i], jt[i]
+            target[:] = 0.0
+            for j in range(n):
+                share = covariance[i, j]
+                if share != 0.0:
+                    row = jt[j]
+                    for k in range(equations):
+                        target[k] += share * row[k]
+            for k in range(equations):
+                row = inner[k]
+                for m in range(equations):
+                    row[m] += source[k] * target[m]
+        for k in range(equations):
+            inner[k, k] += noises[level] * noises[level]
+        found = lu_factor(inner, pivot) != 0
+        if found:
+            lu_solve_transposed(inner, pivot, y)
+            for i in range(n):
+                x[i] = rest[i] + dot(spread[i], y)
+        if not (found and largest(x) < math.inf):
+            for i in range(n):
+                x[i] = rest[i]
+            return level + 1
+    return noises.size
+
+
+def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
+    """Estimate the root on the other side of the nearest fold, at the cost of two Jacobians.
+
+    Args:
+        problem: The patch.
+        x: (n,) root of a wire, pitches.
+        a: (K,) R · gain of the wire.
+        inverse: (n, K) ∂x/∂r there.
+
+    Returns:
+        (n,) position, pitches; not finite if there is no fold to second order.
+    """
+    w = np.ones(a.size)
+    for _ in range(POWER_STEPS):
+        w = (inverse @ w) @ inverse
+        w /= math.sqrt(w @ w)
+    v = inverse @ w
+    least = 1.0 / math.sqrt(v @ v)
+    v *= least
+    f, jt = np.empty(a.size), np.empty((x.size, a.size))
+    slopes = []
+    for side in (DIFFERENCE, -DIFFERENCE):
+        potential_jacobian(x + side * v, problem.lower, f, jt)
+        slopes.append(v @ (jt * a))
+    curvature = w @ (slopes[0] - slopes[1]) / (2.0 * DIFFERENCE)
+    return np.asarray(x - 2.0 * least / curvature * v)

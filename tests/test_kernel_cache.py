@@ -16,6 +16,8 @@ import pytest
 
 from skinnode.compiled import kernel_cache
 
+pytestmark = pytest.mark.long
+
 PROGRAM = """
 from skinnode.compiled.jit import njit
 

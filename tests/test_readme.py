@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 COMMANDS = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
 
@@ -15,6 +17,7 @@ def python_blocks() -> list[str]:
     return re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
+@pytest.mark.long
 def test_the_first_example_prints_what_it_claims() -> None:
     done = subprocess.run(
         [sys.executable, "-c", python_blocks()[0]], capture_output=True, text=True, timeout=100, check=True
@@ -32,6 +35,7 @@ def test_pages_and_pictures_of_the_front_page_are_there() -> None:
         assert (Path(__file__).parents[1] / name).is_file(), name
 
 
+@pytest.mark.long
 def test_commands_of_the_table_exist() -> None:
     commands = set(re.findall(r"\| `(skinnode|vcan-sim)(?: (\w+))?", COMMANDS))
     assert ("skinnode", "demo") in commands
@@ -55,6 +59,7 @@ def test_the_table_has_every_command() -> None:
             assert any(word in row for row in rows), word
 
 
+@pytest.mark.long
 def test_the_second_example_runs_against_simulated_patches(multicast_group: str) -> None:
     folder = Path(__file__).parents[1]
     simulator = subprocess.Popen(

@@ -21,6 +21,7 @@ def figures(tmp_path, name: str) -> tuple[str, dict]:
     return result.output, json.loads(file.read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_kernel_compares_with_numpy(tmp_path):
     output, data = figures(tmp_path, "kernel")
     peers: dict[str, set[str]] = {}
@@ -38,6 +39,7 @@ def test_kernel_compares_with_numpy(tmp_path):
     assert all("compiled" in names for names in peers.values())
 
 
+@pytest.mark.long
 def test_solve_compares_with_every_peer_at_the_same_accuracy(tmp_path):
     output, data = figures(tmp_path, "solve")
     who = [row["who"] for row in data["rows"]]

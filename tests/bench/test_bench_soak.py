@@ -34,6 +34,7 @@ def missed(figures: dict[str, Any]) -> list[str]:
     return [row["what"] for row in figures["must"] if not row["reached"]]
 
 
+@pytest.mark.long
 def test_a_hand_under_faults_does_not_grow_and_its_sums_agree(tmp_path: Path) -> None:
     file = tmp_path / "figures.json"
     command = ["-c", "from skinnode.cli.main import main; main()", "bench", "soak", "--minutes", "0.33"]
@@ -92,6 +93,7 @@ def _children() -> set[int]:
     }
 
 
+@pytest.mark.long
 def test_what_grows_or_is_miscounted_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[Any] = []
     publish, on_summary = Publisher.publish, Lane.on_summary
@@ -113,6 +115,7 @@ def test_what_grows_or_is_miscounted_is_found(tmp_path: Path, monkeypatch: pytes
     assert "The soak failed: " in output.splitlines()[-1]
 
 
+@pytest.mark.long
 def test_a_frame_that_is_lost_uncounted_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a kind that no other counter sees."""
     send, heartbeats = FaultyPort.send, itertools.count()

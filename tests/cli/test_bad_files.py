@@ -202,30 +202,35 @@ def claims(shape: str, kind: str = "<f8", zeros: int = 0, method: int = zipfile.
     return file.getvalue()
 
 
-BOMBS = {
+BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
     "size.npz": (
-        claims("(2, 2, 3)", zeros=300),
+        lambda: claims("(2, 2, 3)", zeros=300),
         "upper_m: got 314572928 bytes, allowed: at most 3072 numbers",
     ),
-    "shape.npz": (claims("(13333333, 10, 3)"), "upper_m: got shape (13333333, 10, 3), allowed: at most 3072"),
+    "shape.npz": (
+        lambda: claims("(13333333, 10, 3)"),
+        "upper_m: got shape (13333333, 10, 3), allowed: at most 3072",
+    ),
     "type.npz": (
-        claims("(2, 2, 3)", "<U90000000"),
+        lambda: claims("(2, 2, 3)", "<U90000000"),
         "upper_m: got shape (2, 2, 3) of <U90000000, allowed: at ",
     ),
     "bzip2.npz": (
-        claims("(2, 2, 3)", zeros=300, method=zipfile.ZIP_BZIP2),
+        lambda: claims("(2, 2, 3)", zeros=300, method=zipfile.ZIP_BZIP2),
         "upper_m: got compression method 12",
     ),
-    "ints.toml": (b"a=[" + b"0," * (4 << 20) + b"]", "allowed: a file of at most 1 MiB"),
+    "ints.toml": (lambda: b"a=[" + b"0," * (4 << 20) + b"]", "allowed: a file of at most 1 MiB"),
     "long.eds": (
-        b"[DeviceInfo]\n" + b"[z]\n" * (1 << 20),
+        lambda: b"[DeviceInfo]\n" + b"[z]\n" * (1 << 20),
         "allowed: a file of at most 2 MiB",
     ),
     "compact.eds": (
-        EDS.encode()
-        + b"".join(
-            b"[%04x]\nObjectType=8\nCompactSubObj=254\nDataType=5\nAccessType=ro\n" % index
-            for index in range(0x2000, 0x6000)
+        lambda: (
+            EDS.encode()
+            + b"".join(
+                b"[%04x]\nObjectType=8\nCompactSubObj=254\nDataType=5\nAccessType=ro\n" % index
+                for index in range(0x2000, 0x6000)
+            )
         ),
         "got more than 65536 values, up to section 2101, allowed: at most 65536",
     ),
@@ -237,8 +242,8 @@ def test_a_small_file_that_needs_much_memory_is_refused_before(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    data, says = BOMBS[name]
-    Path(name).write_bytes(data)
+    content, says = BOMBS[name]
+    Path(name).write_bytes(content())
     option = ["od", "5", *BUS, "--diff", name] if name.endswith(".eds") else ["eds", "--layout", f"./{name}"]
     tracemalloc.start()
     try:

@@ -18,6 +18,8 @@ from skinnode.protocol.profile import REFERENCE_PROFILES
 
 from .blocks import PAGES, REPOSITORY
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -153,9 +153,14 @@ def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Ha
     becomes of each of them is counted in tests/sim/test_faults_in_time.py, where time stands still."""
     injected = running.suffer(Faults(miscounted=0.01))
     assert injected.miscounted > 2
-    before = running.lane().assembler
-    running.scans(5)
-    after = running.lane().assembler
+    for _ in range(20):  # until this machine was fast enough for the node
+        skipped = overruns(running.fleet, "p0")
+        running.scans(5)
+        before = running.lane().assembler
+        running.scans(5)
+        after = running.lane().assembler
+        if overruns(running.fleet, "p0") == skipped:
+            break
     assert after.scans_complete >= before.scans_complete + 4
     whole = dataclasses.replace(
         after,

@@ -198,6 +198,7 @@ def found(running: Bench) -> dict[Edge, tuple[str, int]]:
 
 
 @pytest.mark.timeout(7200)
+@pytest.mark.long
 def test_an_exception_at_any_call_of_a_bring_up_does_not_end_the_start_of_the_host(
     four: HandConfig,
     rack_of: Callable[[HandConfig], Rack],
@@ -265,6 +266,7 @@ def inject(running: Bench, edge: Edge, stimulus: str, skip: int, times: int) -> 
 
 
 @pytest.mark.timeout(7200)
+@pytest.mark.long
 def test_an_exception_at_any_call_costs_what_it_was_made_for(
     four: HandConfig,
     rack_of: Callable[[HandConfig], Rack],

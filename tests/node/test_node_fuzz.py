@@ -15,6 +15,8 @@ import pytest
 
 from skinnode.node import VolatileMemory
 
+pytestmark = pytest.mark.long
+
 MS = 1_000_000
 
 # Frames that get somewhere, so that their mutations do too.

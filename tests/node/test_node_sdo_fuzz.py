@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 FRAMES = 20_000
 SEEDS = (1, 2, 3)
 

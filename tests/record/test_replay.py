@@ -144,6 +144,7 @@ for number in range(1_000_000):
 
 
 @pytest.mark.parametrize("suffix", [".log", ".blf"])
+@pytest.mark.long
 def test_killed_at_any_moment_it_reads_up_to_the_last_second(tmp_path: Path, suffix: str) -> None:
     for attempt in range(5):
         path = tmp_path / f"run{attempt}{suffix}"

@@ -191,6 +191,7 @@ def test_adaptive_solves_presses_anywhere(height, depth):
 
 @pytest.mark.parametrize("schedule", [sk.Adaptive(), sk.Uniform()])
 @pytest.mark.parametrize("depth", [0.3, 0.5])
+@pytest.mark.long
 def test_a_wrong_root_is_never_called_converged(depth, schedule):
     """Thick layer: presses that cross a fold of F = b have another root, smooth too, on this side of it."""
     layout = staggered(1.0)

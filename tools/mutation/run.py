@@ -230,7 +230,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         import pytest
 
         failures = _Failures()
-        options = ["-q", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
+        options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
         options += ["-W", "ignore::SyntaxWarning"]  # such as "is" with a literal: no test would notice
         status = int(pytest.main([*options, *arguments], plugins=[failures]))

@@ -17,7 +17,7 @@ from skinnode.errors import BusError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, PatchNode
 from skinnode.node.clock import THRIFTY, Pacing
-from skinnode.node.source import ResistanceSource
+from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.codec import (
     SummaryFlag,
     chunk_indexer,

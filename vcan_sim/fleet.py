@@ -14,7 +14,7 @@ from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import BusError, ConfigError
 from skinnode.model.layout import Float
 from skinnode.node import NmtState, NodeRunner
-from skinnode.node.source import ResistanceSource
+from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort, Frame
 from vcan_sim.faults import NO_FAULTS, OF_WIRES, Faults, Injected

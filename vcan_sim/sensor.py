@@ -24,9 +24,9 @@ instead; inf is an open pair of wires, 0 a short."""
 class SimulatedPatch:
     """The resistances of a patch in a scene, as a converter with noise reads them.
 
-    A :class:`skinnode.node.source.ResistanceSource`. The scene lies at rest until :meth:`start` sets its
-    origin of time, so that readings at power-on (a tare) see a patch that nobody touches. The truth is a pure
-    function of time and kept nowhere: :meth:`truth_m` gives it for any time, :meth:`read_ns` that of a scan.
+    A :class:`skinnode.node.ResistanceSource`. The scene lies at rest until :meth:`start` sets its origin of
+    time, so that readings at power-on (a tare) see a patch that nobody touches. The truth is a pure function
+    of time and kept nowhere: :meth:`truth_m` gives it for any time, :meth:`read_ns` that of a scan.
 
     Args:
         scene: what happens on the skin.

@@ -29,8 +29,8 @@ class EmcyCode(IntEnum):
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     SOURCE = 0xFF00
-    """The analogue source gave no reading. Detail: :class:`~skinnode.node.source.SourceFault`, and u16 how
-    often so far."""
+    """The converter gave no reading. Detail: u8 fault (1 it failed, 2 an array of another shape), u16 count.
+    """
 
     @property
     def register_bit(self) -> int:

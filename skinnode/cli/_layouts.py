@@ -27,7 +27,7 @@ def find_layout(text: str) -> PatchLayout:
     """
     from skinnode.config import load_layout
     from skinnode.model.layout import PRESETS, PatchLayout
-    from skinnode.node.find_source import load
+    from skinnode.node.patch.find_source import load
 
     if text in PRESETS:
         return PatchLayout.preset(text)

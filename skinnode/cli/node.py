@@ -71,7 +71,7 @@ def node(
     from skinnode.files.output_file import require_writable
     from skinnode.node import NodeRunner, PatchNode
     from skinnode.node.clock import EXACT, THRIFTY
-    from skinnode.node.find_source import make_source
+    from skinnode.node.patch.find_source import make_source
     from skinnode.process.garbage_collection import short_pauses
     from skinnode.process.signals import until_told
     from skinnode.protocol.profile import PatchProfile

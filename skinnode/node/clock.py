@@ -19,7 +19,7 @@ class Pacing:
     """How late timers may be, so that one waking serves several. Frames are served at once whatever it is."""
     catch_up_ns: int
     """Lateness that the pace of chunks makes up for; 0 for a strict inhibit time. See
-    :mod:`skinnode.node.stream`."""
+    :mod:`skinnode.node.patch.scan_stream`."""
 
 
 EXACT: Final = Pacing(slack_ns=0, catch_up_ns=100_000)

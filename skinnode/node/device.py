@@ -23,14 +23,14 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.lss import BitRateChange, LssSlave
 from skinnode.node.memory import Memory
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pdo.rpdo import RpdoEngine
+from skinnode.node.pdo.tpdo import TpdoEngine
 from skinnode.node.rejected import Rejected, RejectedFrames
-from skinnode.node.rpdo import RpdoEngine
-from skinnode.node.sdo import SdoServer
+from skinnode.node.sdo.server import SdoServer
 from skinnode.node.storage import COMMUNICATION, EVERYTHING, Storage
 from skinnode.node.sync import Sync
 from skinnode.node.time_of_day import TimeConsumer
-from skinnode.node.tpdo import TpdoEngine
 from skinnode.transport.bus_state import BusState
 
 HARDWARE_VERSION: Final = "none"

@@ -14,8 +14,8 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
 """Messages kept while inhibit time, a stopped node or the bus hold them back; the oldest give way."""

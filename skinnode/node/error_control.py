@@ -18,7 +18,7 @@ from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.rejected import Rejected, RejectedFrames
 
 Handler = Callable[[bytes, int], None]

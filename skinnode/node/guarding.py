@@ -9,7 +9,7 @@ from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import GUARD_TOGGLE, NmtState
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 
 
 class Guarding:

@@ -12,7 +12,7 @@ from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import NmtState
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
 """Second byte of an emergency's detail: the monitored node was not silent, but started anew."""

@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final
 
 from skinnode.canopen import indices as od
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 
 _MOST: Final = 0xFFFF_FFFF
 

@@ -17,7 +17,7 @@ from skinnode.canopen.emergency import EmcyCode
 from skinnode.node.clock import Clock
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.memory import Fault, Kept, Memory, MemoryFault, Parameters
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 
 COMMUNICATION: Final = 0x1000, 0x1FFF
 APPLICATION: Final = 0x2000, 0x9FFF

@@ -11,8 +11,8 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyProducer
-from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, check_cob_id
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 from skinnode.node.rejected import Rejected, RejectedFrames
 
 PRODUCER_BIT: Final = 1 << 30

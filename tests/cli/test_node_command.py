@@ -20,7 +20,7 @@ from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
-from skinnode.node.find_source import GROUP, load, make_source
+from skinnode.node.patch.find_source import GROUP, load, make_source
 from skinnode.transport import CanPort, Frame
 
 ROOT = Path(__file__).parents[2]

@@ -107,7 +107,7 @@ def test_what_is_sent(alter: Alter, fail: str, pass_: str) -> None:
 def test_the_phase_of_a_cyclic_tpdo_is_the_devices_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Type 3 is every third SYNC, from whichever on: a device may send at the first, or count from an earlier
     one. What it may not do is to change its step."""
-    from skinnode.node.tpdo import Tpdo
+    from skinnode.node.pdo.tpdo import Tpdo
 
     counted = Tpdo.turn
     monkeypatch.setattr(Tpdo, "phase", 2, raising=False)

@@ -19,7 +19,7 @@ from skinnode.host import BringUpCancelled, Host
 from skinnode.host.hand_files import check_eds
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node.node import PatchNode
+from skinnode.node.patch.patch_node import PatchNode
 from skinnode.node.runner import NodeRunner
 from skinnode.protocol.profile import PatchProfile, eds_text
 from skinnode.transport import CanPort

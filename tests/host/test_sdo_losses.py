@@ -17,8 +17,8 @@ from skinnode.errors import NodeError
 from skinnode.host import sdo_streams
 from skinnode.host.network import RemoteOd, SkinNetwork
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.od import ObjectStore
-from skinnode.node.sdo import SdoServer
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.sdo.server import SdoServer
 
 DOMAIN, NUMBER = 0x2301, 0x1017
 LONG = bytes(i * 7 % 251 for i in range(1000))  # two blocks of at most 127 segments

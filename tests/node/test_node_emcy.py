@@ -12,7 +12,7 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.node import NmtState
 from skinnode.node.emcy import EmcyCode, EmcyProducer
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 from skinnode.transport.bus_state import BusState
 
 

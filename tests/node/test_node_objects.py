@@ -8,8 +8,8 @@ import pytest
 
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
-from skinnode.node.od import MAX_BYTES, ObjectStore
-from skinnode.node.sdo import SdoServer
+from skinnode.node.object_dictionary import MAX_BYTES, ObjectStore
+from skinnode.node.sdo.server import SdoServer
 
 INDEX = 0x2000
 WRITE_ONLY, READ_ONLY, NO_SUBINDEX = "01 00 01 06", "02 00 01 06", "11 00 09 06"

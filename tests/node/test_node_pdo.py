@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from skinnode.model.layout import PatchLayout
 from skinnode.node import VolatileMemory
-from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import PdoRecords
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pdo.parameters import PdoRecords
 from skinnode.protocol.profile import PatchProfile, eds_text
 
 REGISTER, COUNTER, TIME, CODE = 0x1001_0008, 0x2011_0108, 0x2011_0420, 0x2100_0110

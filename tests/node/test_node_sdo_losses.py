@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 from skinnode.errors import BusError
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.od import ObjectStore
-from skinnode.node.sdo import SdoServer
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.sdo.server import SdoServer
 
 INDEX = 0x2301
 START_NS = 10**9

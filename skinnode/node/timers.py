@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from skinnode.node.clock import NO_DEADLINE_NS
 
 
-class Alarms:
+class Timers:
     """One time for each of any number of keys. Setting, moving and taking cost O(log n), amortised."""
 
     def __init__(self) -> None:

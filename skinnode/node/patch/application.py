@@ -18,14 +18,14 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import TOO_SLOW, EmcyCode
 from skinnode.model.layout import PRESET_IDS, Float, PatchLayout
-from skinnode.node.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.clock import NO_DEADLINE_NS, Pacing
 from skinnode.node.device import Services
 from skinnode.node.memory import Fault
-from skinnode.node.od import ObjectStore
-from skinnode.node.self_test import self_test
-from skinnode.node.source import SourceFailed, SourceFault
-from skinnode.node.stream import OutgoingScan, ScanStream
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.patch.acquisition import Acquisition, Mask, WireFaults
+from skinnode.node.patch.scan_stream import OutgoingScan, ScanStream
+from skinnode.node.patch.self_test import self_test
+from skinnode.node.patch.source import SourceFailed, SourceFault
 from skinnode.protocol.codec import (
     SELF_TEST_NEVER_RUN,
     Codes,

@@ -15,7 +15,7 @@ from typing import Final
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.sdo import MAX_BLOCK_SEGMENTS, SEGMENT_BYTES
 from skinnode.errors import BusError
-from skinnode.node.sdo_transfer import MULTIPLEXER_U32, Channel, Incoming, Transfer
+from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Transfer
 
 SEGMENT_NS: Final = 500_000
 """Shortest mean time between two segments. PDOs may take 70 % of a bus; of 1 Mbit/s that leaves at least 2200

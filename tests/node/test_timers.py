@@ -1,49 +1,49 @@
-"""Alarms against a plain dictionary that is looked through."""
+"""Timers against a plain dictionary that is looked through."""
 
 from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS
+from skinnode.node.timers import Timers
 
 STEPS = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 50) | st.just(NO_DEADLINE_NS)), max_size=200)
 
 
 @given(STEPS)
 def test_the_earliest_comes_first(steps: list[tuple[int, int]]) -> None:
-    alarms, plain = Alarms(), dict[int, int]()
+    timers, plain = Timers(), dict[int, int]()
     for number, (key, t_ns) in enumerate(steps):
-        alarms.set(key, t_ns)
+        timers.set(key, t_ns)
         plain[key] = t_ns
-        assert alarms.deadline_ns == min(plain.values())
+        assert timers.deadline_ns == min(plain.values())
         if number % 7 == 6:
             now_ns = number
             due = sorted((due_ns, key) for key, due_ns in plain.items() if due_ns <= now_ns)
-            assert list(alarms.take(now_ns)) == [key for _, key in due]
+            assert list(timers.take(now_ns)) == [key for _, key in due]
             plain = {key: due_ns for key, due_ns in plain.items() if due_ns > now_ns} or {0: NO_DEADLINE_NS}
-    alarms.clear()
-    assert alarms.deadline_ns == NO_DEADLINE_NS
+    timers.clear()
+    assert timers.deadline_ns == NO_DEADLINE_NS
 
 
 def test_moving_one_for_ever_takes_no_memory() -> None:
-    alarms = Alarms()
-    alarms.set(1, 10**12)
+    timers = Timers()
+    timers.set(1, 10**12)
     for t_ns in range(100_000):
-        alarms.set(2, 10**9 + t_ns)
-        alarms.set(2, 10**9 - t_ns)
-    assert len(alarms._heap) < 50
-    assert alarms.deadline_ns == 10**9 - 99_999
+        timers.set(2, 10**9 + t_ns)
+        timers.set(2, 10**9 - t_ns)
+    assert len(timers._heap) < 50
+    assert timers.deadline_ns == 10**9 - 99_999
 
 
 def test_one_set_again_while_it_is_taken_is_taken_again() -> None:
-    alarms = Alarms()
-    alarms.set(1, 5)
-    alarms.set(2, 7)
+    timers = Timers()
+    timers.set(1, 5)
+    timers.set(2, 7)
     taken = []
-    for key in alarms.take(10):
+    for key in timers.take(10):
         taken.append(key)
         if len(taken) == 1:
-            alarms.set(1, 6)
+            timers.set(1, 6)
     assert taken == [1, 1, 2]

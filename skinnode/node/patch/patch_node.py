@@ -1,18 +1,18 @@
 """A patch as a CANopen device: the device of :mod:`skinnode.node.device` with the application of
-:mod:`skinnode.node.application`."""
+:mod:`skinnode.node.patch.application`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.node.acquisition import Acquisition
-from skinnode.node.application import PatchApplication
 from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.device import CanopenDevice, Send, Services
 from skinnode.node.memory import Memory
+from skinnode.node.patch.acquisition import Acquisition
+from skinnode.node.patch.application import PatchApplication
+from skinnode.node.patch.source import ResistanceSource
 from skinnode.node.rejected import Rejected
-from skinnode.node.source import ResistanceSource
 from skinnode.protocol.codec import CodeScale
 from skinnode.protocol.profile import PatchProfile, eds_name
 

@@ -27,11 +27,11 @@ from collections.abc import Callable, Collection
 from typing import Protocol
 
 from skinnode.canopen import indices as od
-from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
 from skinnode.node.sync import SyncWindow
+from skinnode.node.timers import Timers
 
 Send = Callable[[int, bytes], None]
 
@@ -129,7 +129,7 @@ class TpdoEngine:
         SYNC."""
         self._claims: dict[int, Owner] = {}
         self._running = False
-        self._alarms = Alarms()
+        self._timers = Timers()
         # Numbers of enabled TPDOs, ascending: those that listen to SYNC, those that events concern, and those
         # that have an owner.
         self._listening: list[int] = []
@@ -148,7 +148,7 @@ class TpdoEngine:
     @property
     def deadline_ns(self) -> int:
         """When :meth:`on_timer` has something to do."""
-        return self._alarms.deadline_ns
+        return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:
         """Leave the TPDOs whose first object is of ``index`` to ``owner``."""
@@ -206,7 +206,7 @@ class TpdoEngine:
     def stop(self) -> None:
         """The node left OPERATIONAL."""
         self._running = False
-        self._alarms.clear()
+        self._timers.clear()
 
     def count_sync(self, counter: int | None) -> frozenset[int]:
         """A SYNC came: the numbers of the synchronous TPDOs whose turn it is. ``counter`` is the SYNC
@@ -253,7 +253,7 @@ class TpdoEngine:
 
     def on_timer(self, t_ns: int) -> None:
         """Send everything that is due at ``t_ns``."""
-        for number in self._alarms.take(t_ns):
+        for number in self._timers.take(t_ns):
             tpdo = self._tpdos[number]
             if t_ns >= tpdo.timer_ns:
                 tpdo.elapse(t_ns)
@@ -299,7 +299,7 @@ class TpdoEngine:
         self._send(tpdo.parameters.cob_id, payload)  # last: a bus may refuse it
 
     def _plan(self, tpdo: Tpdo) -> None:
-        self._alarms.set(tpdo.number, tpdo.deadline_ns if self._running else NO_DEADLINE_NS)
+        self._timers.set(tpdo.number, tpdo.deadline_ns if self._running else NO_DEADLINE_NS)
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:

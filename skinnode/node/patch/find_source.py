@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
-from skinnode.node.source import ResistanceSource, SourceFailed, read_source
+from skinnode.node.patch.source import ResistanceSource, SourceFailed, read_source
 
 GROUP: Final = "skinnode.sources"
 """Entry points of this group in the metadata of any installed package are sources with a name."""
@@ -37,8 +37,8 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
     """The source ``name``, of an entry point or ``MODULE:NAME``, for a patch of ``layout``.
 
     The name stands for a class or a function that takes the layout and returns a
-    :class:`~skinnode.node.source.ResistanceSource`. It is read once, so that one that does not work is found
-    before a node is on the bus. Raises ConfigError naming ``option`` for all that can be wrong with it.
+    :class:`~skinnode.node.patch.source.ResistanceSource`. It is read once, so that one that does not work is
+    found before a node is on the bus. Raises ConfigError naming ``option`` for all that can be wrong with it.
     """
     points = registered()
     if ":" in name:

@@ -1,5 +1,5 @@
 """SDO server (CiA 301 v4.2, 7.2.4.3): which request starts what, expedited and segmented transfer. Block
-transfer is in :mod:`skinnode.node.sdo_block`.
+transfer is in :mod:`skinnode.node.sdo.block`.
 
 No bus, no clock. The canopen library's server does not abort an unknown first command, knows no time-out and
 no block transfer, therefore this one.
@@ -14,9 +14,9 @@ from typing import Final
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.sdo import ABORT, SEGMENT_BYTES
 from skinnode.node.clock import NO_DEADLINE_NS
-from skinnode.node.od import ObjectStore
-from skinnode.node.sdo_block import BlockDownload, BlockUpload
-from skinnode.node.sdo_transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Transfer
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.sdo.block import BlockDownload, BlockUpload
+from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
 """A client that does not go on for this long has its transfer aborted. CiA 301 leaves the time to the

@@ -15,13 +15,13 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import Refused
 from skinnode.canopen.data_length import fd_length
 from skinnode.canopen.emergency import EmcyCode
-from skinnode.node.alarms import Alarms
 from skinnode.node.clock import NO_DEADLINE_NS, Clock
 from skinnode.node.emcy import EmcyProducer
-from skinnode.node.od import ObjectStore
-from skinnode.node.pdo import PdoRecords
+from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.pdo.parameters import PdoRecords
 from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.node.sync import SyncWindow
+from skinnode.node.timers import Timers
 
 
 class _Rpdo:
@@ -64,7 +64,7 @@ class RpdoEngine:
         self._store, self._emcy, self._rejected, self._now = store, emcy, rejected, now
         self._window = window
         self._operational = False
-        self._alarms = Alarms()
+        self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
         self._pending: dict[int, bytes] = {}  # of synchronous ones, until the next SYNC
         # Numbers of those with an error that lasts.
@@ -82,7 +82,7 @@ class RpdoEngine:
     @property
     def deadline_ns(self) -> int:
         """When an RPDO that is watched over is missed."""
-        return self._alarms.deadline_ns
+        return self._timers.deadline_ns
 
     # --- parameters
 
@@ -90,7 +90,7 @@ class RpdoEngine:
         """All parameters may have changed at once, and all errors have been forgotten: a reset."""
         self._by_cob_id.clear()
         self._pending.clear()
-        self._alarms.clear()
+        self._timers.clear()
         self._short.clear()
         self._late.clear()
         for rpdo in self._rpdos:
@@ -103,7 +103,7 @@ class RpdoEngine:
         if rpdo in others:
             others.remove(rpdo)
         self._pending.pop(number, None)
-        self._alarms.set(number, NO_DEADLINE_NS)
+        self._timers.set(number, NO_DEADLINE_NS)
         self._set_wrong(rpdo, None, b"", self._now())
         self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
         self._load(rpdo)
@@ -120,7 +120,7 @@ class RpdoEngine:
         is late any more: the deadline is monitored in OPERATIONAL only (CiA 301 v4.2, 7.5.2.33)."""
         self._operational = operational
         self._pending.clear()
-        self._alarms.clear()
+        self._timers.clear()
         for number in tuple(self._late):
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
@@ -138,7 +138,7 @@ class RpdoEngine:
 
     def on_timer(self, t_ns: int) -> None:
         """Tell of those that have not come in time. They are waited for again from their next one on."""
-        for number in self._alarms.take(t_ns):
+        for number in self._timers.take(t_ns):
             self._late.add(number)
             self._emcy.present(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)
 
@@ -155,7 +155,7 @@ class RpdoEngine:
             return
         self._recover(self._late, rpdo.number, EmcyCode.RPDO_TIMEOUT, t_ns)
         if parameters.event_timer_ns:
-            self._alarms.set(rpdo.number, t_ns + parameters.event_timer_ns)
+            self._timers.set(rpdo.number, t_ns + parameters.event_timer_ns)
         if parameters.event_driven:
             self._execute(rpdo, data)
         elif self._window.is_open(t_ns):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
-from skinnode.node.source import ResistanceSource, read_source
+from skinnode.node.patch.source import ResistanceSource, read_source
 from skinnode.protocol.codec import Codes, CodeScale, chunk_of_code, encode
 from skinnode.protocol.profile import PatchProfile
 

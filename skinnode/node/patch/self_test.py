@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float
-from skinnode.node.acquisition import find_faults
-from skinnode.node.source import SourceFailed
+from skinnode.node.patch.acquisition import find_faults
+from skinnode.node.patch.source import SourceFailed
 from skinnode.protocol.codec import CodeScale, SelfTest, SelfTestFault, encode
 
 READINGS: Final = 16

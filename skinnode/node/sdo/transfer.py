@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.canopen.abort import AbortCode, Refused
-from skinnode.node.od import ObjectStore
+from skinnode.node.object_dictionary import ObjectStore
 
 MULTIPLEXER: Final = struct.Struct("<BHB")
 """Command, index, sub-index: how requests that start something begin, and their answers."""

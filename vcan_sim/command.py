@@ -49,7 +49,7 @@ def simulate(
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import short_pauses
-    from skinnode.process.signals import until_told
+    from skinnode.process.signals import stop_on_signal
     from vcan_sim.faults import faults_of
     from vcan_sim.fleet import Fleet
 
@@ -57,7 +57,7 @@ def simulate(
     simulated = Fleet(plan)
     for patch, faults in faults_of(fault or [], [each.name for each in plan.patches]).items():
         simulated.inject(faults, patch)
-    with until_told() as ended, simulated as fleet, short_pauses():
+    with stop_on_signal() as ended, simulated as fleet, short_pauses():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         _say(f"{counted(len(plan.patches), 'patch', 'patches')} of {plan.name!r} on {where}; Ctrl-C ends")
         _watch(fleet, ended.wait, seconds)

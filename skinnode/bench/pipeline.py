@@ -160,12 +160,12 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
         cpu_s = {group: used - before.get(group, 0.0) for group, used in _cpu_s().items()}
         stats, read = host.stats(), _read(host) - read_before
     published_ms, read_ms = reader.since(begin_ns)
-    lanes, buses = list(stats.patches.values()), list(stats.buses.values())
-    scans = sum(lane.offered + lane.withheld + lane.partial for lane in lanes)
-    seconds = hand.sync.period_s * scans / len(lanes)
+    streams, buses = list(stats.patches.values()), list(stats.buses.values())
+    scans = sum(stream.offered + stream.withheld + stream.partial for stream in streams)
+    seconds = hand.sync.period_s * scans / len(streams)
     return {
         "buses": len(buses),
-        "patches": len(lanes),
+        "patches": len(streams),
         "fd": hand.buses[0].fd,
         "stagger_ms": hand.sync.stagger_ms,
         "frames_hz": read / seconds,
@@ -174,15 +174,15 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
         "received": read,
         "kernel_dropped": sum(bus.kernel_dropped for bus in buses),
         "queue_dropped": sum(bus.dropped for bus in buses),
-        "chunks_lost": sum(lane.assembler.chunks_lost for lane in lanes),
+        "chunks_lost": sum(stream.assembler.chunks_lost for stream in streams),
         "scans": scans,
         "scans_hz": scans / seconds,
-        "scans_torn": sum(lane.assembler.scans_torn for lane in lanes),
-        "scans_missed": sum(lane.assembler.scans_missed for lane in lanes),
-        "scans_skipped": sum(lane.skipped for lane in lanes),
-        "fields": sum(lane.solved for lane in lanes),
+        "scans_torn": sum(stream.assembler.scans_torn for stream in streams),
+        "scans_missed": sum(stream.assembler.scans_missed for stream in streams),
+        "scans_skipped": sum(stream.skipped for stream in streams),
+        "fields": sum(stream.solved for stream in streams),
         "fields_read": len(read_ms),
-        "untrusted": sum(lane.untrusted for lane in lanes),
+        "untrusted": sum(stream.untrusted for stream in streams),
         "published_ms": _spread(published_ms),
         "read_ms": _spread(read_ms),
         "receive_us": 1e6 * (cpu_s["receive"] + cpu_s["mainline"]) / max(1, read),
@@ -264,7 +264,10 @@ def _settle(host: Host) -> None:
     end_s, last = time.monotonic() + SETTLE_S, None
     while time.monotonic() < end_s:
         stats = host.stats()
-        now = ([bus.read for bus in stats.buses.values()], [lane.solved for lane in stats.patches.values()])
+        now = (
+            [bus.read for bus in stats.buses.values()],
+            [stream.solved for stream in stats.patches.values()],
+        )
         if now == last:
             return
         last = now

@@ -34,7 +34,7 @@ from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError
 from skinnode.host import Condition, Host, HostStats
 from skinnode.host.accounting import discrepancies
-from skinnode.host.pipeline import check_solvable
+from skinnode.host.patch_stream import check_solvable
 from skinnode.model.frames import FieldFrame
 from skinnode.protocol.codec import TIME_STEP_US
 from skinnode.text.words import counted
@@ -171,10 +171,10 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
         wrong += sums.sent_otherwise(fleet, counter)
     finally:
         kept.setLevel(level)
-    lanes = stats.patches.values()
+    streams = stats.patches.values()
     figures["frames"] = sum(bus.received for bus in stats.buses.values())
-    figures["scans"] = sum(lane.offered + lane.withheld + lane.partial for lane in lanes)
-    figures["fields"] = sum(lane.solved for lane in lanes)
+    figures["scans"] = sum(stream.offered + stream.withheld + stream.partial for stream in streams)
+    figures["fields"] = sum(stream.solved for stream in streams)
     figures["rejoins"] = sum(node.rejoins for node in stats.nodes.values())
     figures["defects"] = [
         f"{name}: {each.newest}" for name, each in stats.defects.items() if each.newest is not None
@@ -360,7 +360,7 @@ def _standing_still(host: Host) -> HostStats:
     for _ in range(100):
         now = (
             [stats.buses[name].read for name in stats.buses],
-            [lane.solved for lane in stats.patches.values()],
+            [stream.solved for stream in stats.patches.values()],
         )
         if now == last:
             break

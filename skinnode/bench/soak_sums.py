@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from skinnode.host import HostStats
-from skinnode.host.pipeline import Solver
+from skinnode.host.patch_stream import Solver
 from skinnode.transport import Frame
 from vcan_sim.faults import Injected
 from vcan_sim.fleet import Fleet
@@ -141,9 +141,9 @@ def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> li
         for name, each in injected.items()
         if stats.patches[name].frames != each.pdos
     ]
-    lanes, buses = stats.patches.values(), stats.buses.values()
-    short = sum(lane.assembler.bad_length for lane in lanes)
-    unchecked = sum(lane.assembler.bad_form for lane in lanes)
+    streams, buses = stats.patches.values(), stats.buses.values()
+    short = sum(stream.assembler.bad_length for stream in streams)
+    unchecked = sum(stream.assembler.bad_form for stream in streams)
     for what, got, name in (
         ("remote frames", sum(bus.ignored for bus in buses), "remote"),
         ("short chunks", short, "short"),

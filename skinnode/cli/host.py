@@ -52,8 +52,8 @@ def host(
     """
     from skinnode.compiled.jit import is_cold
     from skinnode.config import load_hand
-    from skinnode.host.pipeline import check_solvable
-    from skinnode.process.signals import until_told
+    from skinnode.host.patch_stream import check_solvable
+    from skinnode.process.signals import stop_on_signal
 
     plan = load_hand(hand).on(interface, channel)
     report = _JsonReport() if as_json else _TextReport()
@@ -61,7 +61,7 @@ def host(
         report.note("compiling the kernels, once: takes some seconds")
     for patch in plan.patches:  # compiles; nothing is open yet, so Ctrl-C still ends the program by itself
         check_solvable(patch, plan.solver)
-    with until_told() as told:
+    with stop_on_signal() as told:
         status = _run(plan, seconds, report, told)
     if status:
         raise typer.Exit(status)
@@ -127,7 +127,7 @@ def verdict(running: Host) -> tuple[list[str], list[str]]:
     came too late, is then a note, and so is that emergency at the end. Frames that were wrong stay a fault.
     """
     from skinnode.canopen.emergency import EmcyCode
-    from skinnode.host.accounting import losses_of_bus, losses_of_lane
+    from skinnode.host.accounting import losses_of_bus, losses_of_stream
 
     _let_overruns_end(running)
     stats, notes = running.stats(), list[str]()
@@ -140,7 +140,7 @@ def verdict(running: Host) -> tuple[list[str], list[str]]:
             found.append(f"{name}: no SYNC of its master is heard")
         if bus.controller in ("error warning", "error passive", "bus-off"):
             found.append(f"{name}: its controller is {bus.controller} at the end")
-    for name, lane in stats.patches.items():
+    for name, stream in stats.patches.items():
         health = running.health(name)
         condition = health.condition
         due = stats.sync.sent + stats.sync.received > _FIRST_SCANS
@@ -148,11 +148,11 @@ def verdict(running: Host) -> tuple[list[str], list[str]]:
         slow_still = condition == "faulty" and overrun and health.slow_overruns > 0
         if slow_still:
             notes.append(f"{name}: {condition} at the end{reason(health, ': ')}")
-        elif condition != "operational" and (due or lane.offered > 0):
+        elif condition != "operational" and (due or stream.offered > 0):
             found.append(f"{name}: {condition} at the end{reason(health, ': ')}")
-        elif due and not lane.solved:
+        elif due and not stream.solved:
             found.append(f"{name}: no scan was solved")
-        losses = losses_of_lane(lane)
+        losses = losses_of_stream(stream)
         slow = slow_still or (condition == "operational" and health.slow_overruns > 0)
         explained = [losses.pop(counter) for counter in _OF_SLOWNESS if slow and counter in losses]
         if explained:

@@ -74,9 +74,9 @@ def monitor(
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise ConfigError("--output", output, "a folder; the first recording creates it")
     from skinnode.host import BringUpCancelled
-    from skinnode.process.signals import until_told
+    from skinnode.process.signals import stop_on_signal
 
-    with until_told() as told, ExitStack() as stack:
+    with stop_on_signal() as told, ExitStack() as stack:
         try:
             if replay is not None:
                 source = _recording(stack, replay, 1.0 if speed is None else speed)
@@ -146,7 +146,7 @@ def _running(
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
-    from skinnode.host.pipeline import check_solvable
+    from skinnode.host.patch_stream import check_solvable
     from skinnode.monitor.source import HostSource
     from skinnode.process.garbage_collection import responsive_threads, short_pauses
     from skinnode.text.words import counted

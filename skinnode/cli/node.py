@@ -73,7 +73,7 @@ def node(
     from skinnode.node.clock import EXACT, THRIFTY
     from skinnode.node.patch.find_source import make_source
     from skinnode.process.garbage_collection import short_pauses
-    from skinnode.process.signals import until_told
+    from skinnode.process.signals import stop_on_signal
     from skinnode.protocol.profile import PatchProfile
     from skinnode.transport import CanPort
 
@@ -93,7 +93,7 @@ def node(
         data_bitrate_bps=data_bitrate,
     )
     measuring = make_source(source, patch, "--source")
-    with _memory(store) as memory, until_told() as told, CanPort(bus) as port:
+    with _memory(store) as memory, stop_on_signal() as told, CanPort(bus) as port:
         board = PatchNode(
             NOT_CONFIGURED if node_id is None else node_id,
             patch,

@@ -12,7 +12,7 @@ from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from skinnode.conformance.eds import EdsEntry
-    from skinnode.host.network import RemoteOd
+    from skinnode.host.sdo_client import RemoteOd
     from skinnode.technician.dictionary import Difference, Reading
     from skinnode.technician.sheet import Sheet
 

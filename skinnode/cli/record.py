@@ -53,11 +53,11 @@ def record(
     2 if it could not run.
     """
     from skinnode.config import load_hand
-    from skinnode.process.signals import until_told
+    from skinnode.process.signals import stop_on_signal
     from skinnode.record import Recorder
 
     plan = load_hand(hand).on(interface, channel)
-    with until_told() as told, Recorder(plan, output, kind) as recorder:
+    with stop_on_signal() as told, Recorder(plan, output, kind) as recorder:
         _say(as_json, file=str(recorder.path))
         faults = (_listen if listen else _run)(plan, recorder, told, seconds, as_json)
     stats = recorder.stats()
@@ -74,7 +74,7 @@ def _run(
     """What was wrong meanwhile, a line each."""
     from skinnode.cli.host import verdict
     from skinnode.host import BringUpCancelled, Host
-    from skinnode.host.pipeline import check_solvable
+    from skinnode.host.patch_stream import check_solvable
 
     for patch in plan.patches:
         check_solvable(patch, plan.solver)

@@ -31,10 +31,10 @@ def replay(
     Exit status 1 if the recording is damaged, was not ended or lacks frames, or if what it holds lacks some:
     a scan torn or missed, a chunk or a summary lost; or has error frames. 2 if it cannot be read at all.
     """
-    from skinnode.process.signals import until_told
+    from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
 
-    with until_told() as told:
+    with stop_on_signal() as told:
         run = play(recording, speed=None if fast else speed, cancelled=told.is_set)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
@@ -83,26 +83,26 @@ def field_table(field: FieldFrame) -> dict[str, Any]:
 def _patches(run: Replay, deepest_m: dict[str, float]) -> dict[str, dict[str, Any]]:
     return {
         name: {
-            "solved": lane.solved,
-            "skipped": lane.skipped,
-            "withheld": lane.withheld,
-            "untrusted": lane.untrusted,
-            "torn": lane.assembler.scans_torn,
-            "missed": lane.assembler.scans_missed,
+            "solved": stream.solved,
+            "skipped": stream.skipped,
+            "withheld": stream.withheld,
+            "untrusted": stream.untrusted,
+            "torn": stream.assembler.scans_torn,
+            "missed": stream.assembler.scans_missed,
             "deepest_m": deepest_m[name],
         }
-        for name, lane in run.patch_stats().items()
+        for name, stream in run.patch_stats().items()
     }
 
 
 def _faults(run: Replay) -> list[str]:
-    from skinnode.host.accounting import losses_of_bus, losses_of_lane
+    from skinnode.host.accounting import losses_of_bus, losses_of_stream
 
     found = run.flaws
     for name, bus in run.bus_stats().items():
         found += [f"{name}: {text}" for text in losses_of_bus(bus).values()]
-    for name, lane in run.patch_stats().items():
-        found += [f"{name}: {text}" for text in losses_of_lane(lane).values()]
-        if not lane.offered and not run.stopped:
+    for name, stream in run.patch_stats().items():
+        found += [f"{name}: {text}" for text in losses_of_stream(stream).values()]
+        if not stream.offered and not run.stopped:
             found.append(f"{name}: no scan that could be decoded")
     return found

@@ -22,7 +22,7 @@ from skinnode.config import HandConfig, PatchConfig
 from skinnode.demo.plot import PatchTrace
 from skinnode.demo.view import BusView, PatchView, panels_in, render
 from skinnode.host import Host
-from skinnode.host.pipeline import LaneStats
+from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.process.garbage_collection import responsive_threads, short_pauses
@@ -162,7 +162,7 @@ class _Progress:
             return
         stats = host.stats()
         load, lost = (_bits(host) - bits_before) / (BITRATE_BPS * elapsed_s), _losses(host)
-        torn = {name: lane.assembler.scans_torn for name, lane in stats.patches.items()}
+        torn = {name: stream.assembler.scans_torn for name, stream in stats.patches.items()}
         latency = np.concatenate([watch.latency_ms for watch in self._watches] or [[]])
         p50, p99 = np.percentile(latency, (50, 99)) if latency.size else (math.nan, math.nan)
         received = sum(bus.received for bus in stats.buses.values())
@@ -272,11 +272,11 @@ def _losses(host: Host) -> int:
     """Losses the host itself knows of: frames its queue had no room for and chunks that never came."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
-    return dropped + sum(lane.assembler.chunks_lost for lane in stats.patches.values())
+    return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())
 
 
-def _accepted(lane: LaneStats) -> int:
-    return lane.assembler.chunks_accepted + lane.assembler.summaries_accepted
+def _accepted(stream: StreamStats) -> int:
+    return stream.assembler.chunks_accepted + stream.assembler.summaries_accepted
 
 
 def _percentile(values: Sequence[float], percent: float) -> float:

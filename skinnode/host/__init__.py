@@ -38,9 +38,9 @@ the user's  subscriptions, hand frames      that iteration                  when
 ==========  ==============================  ==============================  ==============================
 """
 
-from skinnode.host.facade import Host, HostStats
 from skinnode.host.hand_frame import HandFrame
 from skinnode.host.health import Condition, PatchHealth
+from skinnode.host.host import Host, HostStats
 from skinnode.host.publish import Subscription
 from skinnode.host.start import BringUpCancelled
 

@@ -3,9 +3,9 @@ lost. Of a host that runs, numbers are read one after the other, so ask when it 
 
 from __future__ import annotations
 
-from skinnode.host.dealer import BusStats
-from skinnode.host.facade import HostStats
-from skinnode.host.pipeline import LaneStats
+from skinnode.host.dispatcher import BusStats
+from skinnode.host.host import HostStats
+from skinnode.host.patch_stream import StreamStats
 from skinnode.protocol.assembler import AssemblerStats
 from skinnode.text.words import counted
 
@@ -25,13 +25,13 @@ def discrepancies(stats: HostStats) -> list[str]:
     found: list[str] = []
     for name, bus in stats.buses.items():
         found += [f"{name}: {text}" for text in _of_bus(bus)]
-    for name, lane in stats.patches.items():
-        found += [f"{name}: {text}" for text in _of_lane(lane)]
+    for name, stream in stats.patches.items():
+        found += [f"{name}: {text}" for text in _of_stream(stream)]
     handled = sum(bus.received - bus.foreign for bus in stats.buses.values())
-    pdos = sum(lane.frames for lane in stats.patches.values())
+    pdos = sum(stream.frames for stream in stats.patches.values())
     if pdos > handled:
         found.append(f"got {pdos} PDOs, must be at most the {handled} frames that were handled")
-    assemblers = [lane.assembler for lane in stats.patches.values()]
+    assemblers = [stream.assembler for stream in stats.patches.values()]
     rejected = sum(each.bad_length + each.bad_form for each in assemblers)
     malformed = sum(bus.malformed for bus in stats.buses.values())
     if rejected > malformed:
@@ -54,9 +54,9 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
     return {name: counted(count, *words) for name, *words in counts if (count := getattr(bus, name))}
 
 
-def losses_of_lane(lane: LaneStats) -> dict[str, str]:
+def losses_of_stream(stream: StreamStats) -> dict[str, str]:
     """The same of a patch."""
-    assembler = lane.assembler
+    assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
         ("scans_missed", "scan missed", "scans missed"),
@@ -88,21 +88,21 @@ def _of_bus(bus: BusStats) -> list[str]:
     return _unless_equal("frames read", bus.read, "those told of", told)
 
 
-def _of_lane(lane: LaneStats) -> list[str]:
-    assembler = lane.assembler
+def _of_stream(stream: StreamStats) -> list[str]:
+    assembler = stream.assembler
     return [
-        *_unless_equal("frames", lane.frames, "those told of", frames_counted(assembler)),
+        *_unless_equal("frames", stream.frames, "those told of", frames_counted(assembler)),
         *_unless_equal(
             "scans offered or withheld",
-            lane.offered + lane.withheld + lane.partial,
+            stream.offered + stream.withheld + stream.partial,
             "those assembled",
             assembler.scans_complete + assembler.scans_torn + assembler.scans_unchecked,
         ),
         *_unless_equal(
             "scans offered",
-            lane.offered,
+            stream.offered,
             "those solved, failed or skipped",
-            lane.solved + lane.failed + lane.skipped,
+            stream.solved + stream.failed + stream.skipped,
         ),
     ]
 

@@ -14,8 +14,8 @@ from skinnode.canopen.indices import SYNC_COB_ID, sdo_response_cob_id
 from skinnode.config import BusConfig
 from skinnode.errors import BusError, CodecError, SkinError
 from skinnode.host.containment import Defects, Pause, keep_on, one_line
-from skinnode.host.dealer import BusStats, Dealer, Handler
-from skinnode.host.network import RemoteOd, SkinNetwork
+from skinnode.host.dispatcher import BusStats, Dispatcher, Handler
+from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 from skinnode.transport import CanPort, Frame, Intake
 
 _log = logging.getLogger(__name__)
@@ -24,9 +24,9 @@ _REOPEN_S: Final = 0.1
 """Pause before an interface that failed is opened again."""
 
 
-class BusLink(Dealer):
+class BusLink(Dispatcher):
     """An open bus, from construction to :meth:`close` or the end of a ``with`` block. A
-    :class:`~skinnode.host.mainline.Mainline` makes it deal out what comes.
+    :class:`~skinnode.host.mainline.Mainline` makes it dispatch what comes.
 
     ``handlers`` get the data frames of their COB-IDs, on the mainline. An exception in a handler, a poller, a
     listener or a job loses that frame or call; an exception in the mainline's own work pauses the bus, while
@@ -51,8 +51,8 @@ class BusLink(Dealer):
         """Why the bus is away; None while it is there."""
         self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
         self._outages = 0
-        self.t_dealt_ns = 0
-        """What was received up to then has been dealt out, monotonic."""
+        self.t_dispatched_ns = 0
+        """What was received up to then has been dispatched, monotonic."""
         self._rests = False  # while the bus is away, and for a while after a defect
         self._rest_end_s = 0.0
         self._opening = False
@@ -64,7 +64,7 @@ class BusLink(Dealer):
         self._stop = threading.Event()
         self._port = open_port(config)
         self.intake = Intake(self._port)
-        """What is received and not dealt out yet."""
+        """What is received and not dispatched yet."""
         self.network = SkinNetwork(self.send)
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -167,7 +167,7 @@ class BusLink(Dealer):
             self._rest()
             return
         try:
-            heard = self._deal_out()
+            heard = self._dispatch_received()
             if self.failure is not None and (heard or time.monotonic() > self._due_s):
                 self.failure = None
                 _log.warning("%s: the bus is back", self.config.name)
@@ -176,15 +176,15 @@ class BusLink(Dealer):
                 self._go_away(error)
                 return
             self._rests, self._rest_end_s = True, time.monotonic() + self._pause.next_s()
-            self.defects.report("dealing out frames", error)
+            self.defects.report("dispatching frames", error)
 
     def measure_load(self) -> None:
-        """As :meth:`measure`, at the time up to which was dealt out. Raises nothing."""
+        """As :meth:`measure`, at the time up to which was dispatched. Raises nothing."""
         try:
-            if not self._rests and self.t_dealt_ns * 1e-9 >= self._load_due_s:
-                self.measure(self.t_dealt_ns)
+            if not self._rests and self.t_dispatched_ns * 1e-9 >= self._load_due_s:
+                self.measure(self.t_dispatched_ns)
         except Exception as error:
-            self._load_due_s = self.t_dealt_ns * 1e-9 + self._load_pause.next_s()
+            self._load_due_s = self.t_dispatched_ns * 1e-9 + self._load_pause.next_s()
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
@@ -193,7 +193,7 @@ class BusLink(Dealer):
         if self._reopening is not None:
             self._reopening.join()
 
-    def _deal_out(self) -> bool:
+    def _dispatch_received(self) -> bool:
         """One batch of frames to their handlers; whether there was any."""
         seen_ns = self.intake.seen_ns  # first: whatever came before it is in the batch
         batch = self.intake.take()
@@ -203,16 +203,16 @@ class BusLink(Dealer):
                 job()
             except Exception as error:
                 owner.report("a job of the mainline", error)
-        # While frames wait, here or in the interface, time is that of the newest one dealt out: nothing is
+        # While frames wait, here or in the interface, time is that of the newest one dispatched: nothing is
         # late because we are.
         if batch:
-            self.deal(batch)
-            self.t_dealt_ns = batch[-1].t_ns
-        elif seen_ns > self.t_dealt_ns:
-            self.t_dealt_ns = seen_ns
+            self.dispatch(batch)
+            self.t_dispatched_ns = batch[-1].t_ns
+        elif seen_ns > self.t_dispatched_ns:
+            self.t_dispatched_ns = seen_ns
         else:
             return False
-        self.poll(self.t_dealt_ns)
+        self.poll(self.t_dispatched_ns)
         return bool(batch)
 
     def _rest(self) -> None:

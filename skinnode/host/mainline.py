@@ -1,4 +1,4 @@
-"""The mainline context: one thread that deals out what is received on all buses."""
+"""The mainline context: one thread that dispatches what is received on all buses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WAIT_S: Final = 0.02
 
 
 class Mainline:
-    """Receives on ``links`` and makes them deal out, from construction until :meth:`stop` or the end of a
+    """Receives on ``links`` and makes them dispatch, from construction until :meth:`stop` or the end of a
     ``with`` block. What goes wrong on one of them does not keep the others from it.
 
     One thread for all: frames of all buses come at the same time, and waking costs as much as twenty of them.

@@ -9,14 +9,14 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.config import HandConfig, PatchConfig
+from skinnode.host.arrivals import ArrivalPredictor
 from skinnode.host.code_watch import CodeWatch
 from skinnode.host.containment import Defects
-from skinnode.host.dealer import Dealer
+from skinnode.host.dispatcher import Dispatcher
 from skinnode.host.health import NodeMonitor
-from skinnode.host.pipeline import Lane
+from skinnode.host.other_masters import OtherMasters
+from skinnode.host.patch_stream import PatchStream
 from skinnode.host.publish import Publisher
-from skinnode.host.rhythm import Rhythm
-from skinnode.host.rivals import Rivals
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline, Workers
 from skinnode.protocol.assembler import Scan, ScanAssembler
@@ -32,7 +32,7 @@ On a full bus it gives way to the chunks of all other patches."""
 class PatchReception:
     """A patch on the receiving side."""
 
-    lane: Lane
+    stream: PatchStream
     monitor: NodeMonitor
 
 
@@ -40,71 +40,76 @@ class PatchReception:
 class BusReception:
     """Who else is listened to on a bus: other masters, and the SYNC of one."""
 
-    rivals: Rivals
+    other_masters: OtherMasters
     follower: SyncFollower
 
 
-def receive_bus(hand: HandConfig, dealer: Dealer, ticks: Ticks) -> BusReception:
+def receive_bus(hand: HandConfig, dispatcher: Dispatcher, ticks: Ticks) -> BusReception:
     """From now on other masters are heard."""
-    config = dealer.config
-    rivals, follower = Rivals(config), SyncFollower(ticks)
-    for cob_id, handler in rivals.handlers([patch.node_id for patch in hand.patches_on(config.name)]).items():
-        dealer.handle(cob_id, handler)
+    config = dispatcher.config
+    other_masters, follower = OtherMasters(config), SyncFollower(ticks)
+    for cob_id, handler in other_masters.handlers(
+        [patch.node_id for patch in hand.patches_on(config.name)]
+    ).items():
+        dispatcher.handle(cob_id, handler)
     if config.role == "guest":
-        dealer.handle(od.SYNC_COB_ID, follower.on_sync)
-        dealer.handle(od.NMT_COB_ID, _ignore)
-    return BusReception(rivals, follower)
+        dispatcher.handle(od.SYNC_COB_ID, follower.on_sync)
+        dispatcher.handle(od.NMT_COB_ID, _ignore)
+    return BusReception(other_masters, follower)
 
 
 def receive_patch(
     patch: PatchConfig,
     hand: HandConfig,
-    dealer: Dealer,
+    dispatcher: Dispatcher,
     ticks: Ticks,
     workers: Workers | Inline,
     publisher: Publisher,
     defects: Defects | None = None,
 ) -> PatchReception:
-    """From now on frames of the patch go to its monitor and its lane, which withholds scans until it is told
-    how to decode them: a node that an earlier host left operational may be sending already. Exceptions
-    there are reported to ``defects``; without ``defects`` they are raised, and the publisher fails."""
+    """Pass the frames of a patch to its monitor and its stream from now on.
+
+    The stream withholds scans until it has a solver, because a node that an earlier host left operational may
+    be sending already. Exceptions there are reported to ``defects``; without ``defects`` they are raised, and
+    the publisher fails.
+    """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
-    monitor = NodeMonitor(patch.name, patch.node_id, dealer.reject, watch)
+    monitor = NodeMonitor(patch.name, patch.node_id, dispatcher.reject, watch)
 
-    rhythm = Rhythm(period_ns)
-    dealer.expect(patch.name, ())  # until its first scan
+    arrivals = ArrivalPredictor(period_ns)
+    dispatcher.expect(patch.name, ())  # until its first scan
 
     def on_scan(scan: Scan) -> None:
         if not scan.empty:
             monitor.on_scan(scan.t_last_ns)
-        dealer.expect(patch.name, rhythm.next_ns(scan.t_last_ns))
+        dispatcher.expect(patch.name, arrivals.next_ns(scan.t_last_ns))
 
     assembler = ScanAssembler(
-        PatchProfile.from_config(patch, dealer.config),
+        PatchProfile.from_config(patch, dispatcher.config),
         counter_overflow=ticks.counter_overflow,
         period_ns=period_ns,
         grace_ns=max(LEAST_GRACE_NS, hand.sync.period_ms * 500_000),
         node_id=patch.node_id,
-        on_reject=dealer.reject,
+        on_reject=dispatcher.reject,
         under_way=True,
     )
-    lane = Lane(
+    stream = PatchStream(
         patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial, watch.on_scan,
-        under_way=dealer.config.role == "guest", defects=defects,
+        under_way=dispatcher.config.role == "guest", defects=defects,
     )  # fmt: skip
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)
         if len(data) == 1 and data[0] & STATE_MASK == NmtState.INITIALISING:
-            lane.withhold()  # what it sends from here on is not as it was configured
+            stream.withhold()  # what it sends from here on is not as it was configured
 
-    dealer.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, defects)
-    dealer.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, defects)
-    dealer.handle(od.chunk_cob_id(patch.node_id), lane.on_chunk, defects)
-    dealer.handle(od.summary_cob_id(patch.node_id), lane.on_summary, defects)
-    dealer.poll_with(lane.poll, defects)
-    return PatchReception(lane, monitor)
+    dispatcher.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, defects)
+    dispatcher.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, defects)
+    dispatcher.handle(od.chunk_cob_id(patch.node_id), stream.on_chunk, defects)
+    dispatcher.handle(od.summary_cob_id(patch.node_id), stream.on_summary, defects)
+    dispatcher.poll_with(stream.poll, defects)
+    return PatchReception(stream, monitor)
 
 
 def _ignore(data: bytes, t_ns: int) -> None:

@@ -12,10 +12,10 @@ from typing import Final
 from skinnode.canopen.nmt import NmtState
 from skinnode.config import Missing, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
-from skinnode.host import bringup
-from skinnode.host.network import Abandoned
-from skinnode.host.pipeline import Solver
-from skinnode.host.station import Station
+from skinnode.host import nmt_master
+from skinnode.host.patch_stream import Solver
+from skinnode.host.remote_node import RemoteNode
+from skinnode.host.sdo_client import Abandoned
 from skinnode.host.supervisor import START_DEADLINE_S
 from skinnode.text.words import known
 
@@ -47,9 +47,9 @@ def go_on_unless(cancelled: Callable[[], bool]) -> None:
         raise BringUpCancelled("bring-up was cancelled")
 
 
-def bring_up_all(
-    stations: Sequence[Station], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
-) -> dict[Station, Solver]:
+def configure_all(
+    nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
+) -> dict[RemoteNode, Solver]:
     """Those that are there, ready to start. The first failure stops the others at their next transfer.
 
     Raises what the bring-up of a node raises, NodeTimeout or BusError for silence unless it is to be waited
@@ -63,73 +63,73 @@ def bring_up_all(
     def abandoned() -> bool:
         return over.is_set() or cancelled()
 
-    def bring_up(station: Station) -> Solver:
-        if station.is_silent:
-            _listen(station, deadline_s, abandoned)
-            answered.append(station.patch)
+    def bring_up(node: RemoteNode) -> Solver:
+        if node.listen_only:
+            _listen(node, deadline_s, abandoned)
+            answered.append(node.patch)
         for left in reversed(range(_BRING_UPS)):
             try:
-                solver = station.bring_up(deadline_s, abandoned, answered.append)
-                if not left or station.monitor.boot_ups == station.boot_ups:
+                solver = node.configure(deadline_s, abandoned, answered.append)
+                if not left or node.monitor.boot_ups == node.boot_ups:
                     return solver
             except BusError:
-                booted = station.monitor.boot_ups != station.boot_ups
-                if not left or station.patch not in answered or not booted:
+                booted = node.monitor.boot_ups != node.boot_ups
+                if not left or node.patch not in answered or not booted:
                     raise
             except (SkinError, Abandoned):
                 raise
             except Exception as error:
-                station.defects.report("bring-up", error)
+                node.defects.report("bring-up", error)
                 if not left:
-                    patch = station.patch
-                    text = f"patch {patch.name!r} on {patch.bus}: {station.defects.newest}"
+                    patch = node.patch
+                    text = f"patch {patch.name!r} on {patch.bus}: {node.defects.newest}"
                     raise _Defective(patch.node_id, text) from error
         raise AssertionError("the last try returns or raises")
 
-    def may_wait(station: Station, failure: BaseException | None) -> bool:
-        silent = isinstance(failure, NodeTimeout) and station.patch not in answered
+    def may_wait(node: RemoteNode, failure: BaseException | None) -> bool:
+        silent = isinstance(failure, NodeTimeout) and node.patch not in answered
         return missing == "wait" and (silent or isinstance(failure, _Defective))
 
-    with ThreadPoolExecutor(min(len(stations), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
+    with ThreadPoolExecutor(min(len(nodes), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
         try:
-            jobs = {station: pool.submit(bring_up, station) for station in stations}
+            jobs = {node: pool.submit(bring_up, node) for node in nodes}
             pending = set(jobs.values())
             while pending:
                 done, pending = wait(pending, return_when=FIRST_EXCEPTION)
-                failures = {station: job.exception() for station, job in jobs.items() if job in done}
-                if any(failure and not may_wait(station, failure) for station, failure in failures.items()):
+                failures = {node: job.exception() for node, job in jobs.items() if job in done}
+                if any(failure and not may_wait(node, failure) for node, failure in failures.items()):
                     break
         finally:  # whoever still runs after the first failure, or after Ctrl-C, stops
             over.set()
             pool.shutdown(cancel_futures=True)
-    ready: dict[Station, Solver] = {}
-    for station, job in jobs.items():
+    ready: dict[RemoteNode, Solver] = {}
+    for node, job in jobs.items():
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
             continue
         if failure is None:
-            ready[station] = job.result()
-        elif isinstance(failure, _Defective) and may_wait(station, failure):
+            ready[node] = job.result()
+        elif isinstance(failure, _Defective) and may_wait(node, failure):
             continue  # the supervisor keeps trying
-        elif isinstance(failure, NodeTimeout) and station.patch not in answered:
-            if not may_wait(station, failure):
-                raise _silence(station, stations, answered, deadline_s) from None
+        elif isinstance(failure, NodeTimeout) and node.patch not in answered:
+            if not may_wait(node, failure):
+                raise _silence(node, nodes, answered, deadline_s) from None
         else:
             raise failure
     go_on_unless(cancelled)
     return ready
 
 
-def start_all(ready: dict[Station, Solver]) -> None:
+def start_all(ready: dict[RemoteNode, Solver]) -> None:
     """NMT start where the host is master, and each node says in a heartbeat that it is operational. Raises
     NodeTimeout. The deadline is counted in naps: nobody is late while this machine stands still."""
     t_start_ns = time.monotonic_ns()
-    for station, solver in ready.items():
-        station.start(solver, station.lane.withholdings)
+    for node, solver in ready.items():
+        node.start(solver, node.stream.withholdings)
     naps = round(START_DEADLINE_S / _POLL_S)
-    for station in ready:
-        patch, monitor = station.patch, station.monitor
-        while not station.is_guest and not monitor.said_since(NmtState.OPERATIONAL, t_start_ns):
+    for node in ready:
+        patch, monitor = node.patch, node.monitor
+        while not node.has_other_master and not monitor.said_since(NmtState.OPERATIONAL, t_start_ns):
             if naps == 0:
                 raise NodeTimeout(
                     patch.node_id,
@@ -139,18 +139,18 @@ def start_all(ready: dict[Station, Solver]) -> None:
                 )
             naps -= 1
             if naps % _START_AGAIN_NAPS == 0:
-                bringup.start(station.link.send, patch.node_id)
+                nmt_master.start(node.link.send, patch.node_id)
             time.sleep(_POLL_S)
 
 
-def _listen(station: Station, deadline_s: float, abandoned: Callable[[], bool]) -> None:
+def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
     """Wait for a sign of a node that may not be asked. Raises NodeTimeout."""
     end_s = time.monotonic() + deadline_s
-    while not station.heard:
+    while not node.heard:
         if abandoned():
             raise Abandoned
         if time.monotonic() > end_s:
-            patch = station.patch
+            patch = node.patch
             raise NodeTimeout(
                 patch.node_id, f"patch {patch.name!r} on {patch.bus}: heard nothing within {deadline_s:g} s"
             )
@@ -158,11 +158,11 @@ def _listen(station: Station, deadline_s: float, abandoned: Callable[[], bool]) 
 
 
 def _silence(
-    station: Station, stations: Sequence[Station], answered: list[PatchConfig], deadline_s: float
+    node: RemoteNode, nodes: Sequence[RemoteNode], answered: list[PatchConfig], deadline_s: float
 ) -> BusError:
-    """The error for a silent ``station``. If all are silent it is the cable, the supply or the bit rate."""
-    bus, patch = station.bus, station.patch
-    on_bus = [other.patch for other in stations if other.bus is bus]
+    """The error for a silent ``node``. If all are silent it is the cable, the supply or the bit rate."""
+    bus, patch = node.bus, node.patch
+    on_bus = [other.patch for other in nodes if other.bus is bus]
     silent = [other for other in on_bus if other not in answered]
     allowed = f"allowed: an answer within {deadline_s:g} s"
     names = ", ".join(f"{other.node_id} ({other.name})" for other in silent)

@@ -8,8 +8,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from skinnode.host.containment import Pause
-from skinnode.host.pipeline import Solver
-from skinnode.host.station import Station
+from skinnode.host.patch_stream import Solver
+from skinnode.host.remote_node import RemoteNode
 from skinnode.model.layout import Float
 
 
@@ -49,7 +49,7 @@ class Joined:
 class Supervised:
     """State of one node. Only the supervisor's thread uses it."""
 
-    station: Station
+    remote: RemoteNode
     phase: Phase
     since_ns: int
     read_ns: int

@@ -37,11 +37,11 @@ import numpy as np
 from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtState
 from skinnode.errors import BusError, ConfigError, NodeError, NodeTimeout
-from skinnode.host import bringup
+from skinnode.host import nmt_master
 from skinnode.host.containment import Defects, keep_on
 from skinnode.host.health import HEARTBEATS_MISSED
-from skinnode.host.network import Abandoned
-from skinnode.host.station import Station
+from skinnode.host.remote_node import RemoteNode
+from skinnode.host.sdo_client import Abandoned
 from skinnode.host.supervised import Joined, NodeStats, Phase, Supervised
 from skinnode.text.words import known
 
@@ -76,7 +76,7 @@ error may be lost, and the patch must be operational within a second of it. Cost
 
 
 class Supervisor:
-    """Supervises ``stations``, those of ``running`` from where they are, from construction to :meth:`close`.
+    """Supervises ``nodes``, those of ``running`` from where they are, from construction to :meth:`close`.
 
     Exceptions raised while serving no patch are reported to ``defects``. The supervisor also sends the
     heartbeats of masters that have one.
@@ -84,27 +84,27 @@ class Supervisor:
 
     def __init__(
         self,
-        stations: Sequence[Station],
-        running: Sequence[Station],
+        nodes: Sequence[RemoteNode],
+        running: Sequence[RemoteNode],
         heartbeat_s: float,
         defects: Defects,
     ) -> None:
         now_ns = time.monotonic_ns()
         self._nodes = [
             Supervised(
-                station,
-                Phase.RUNNING if station in running else Phase.AWAITED,
+                remote,
+                Phase.RUNNING if remote in running else Phase.AWAITED,
                 now_ns,
                 read_ns=now_ns + _LEAST_NS,
-                defects=station.defects.count,
-                baseline_ohm=None if station.facts is None else station.facts.baseline_ohm,
+                defects=remote.defects.count,
+                baseline_ohm=None if remote.facts is None else remote.facts.baseline_ohm,
             )
-            for station in stations
+            for remote in nodes
         ]
         self._links = {
-            station.link.config.name: station.link
-            for station in stations
-            if station.link.config.heartbeat_node_id is not None
+            remote.link.config.name: remote.link
+            for remote in nodes
+            if remote.link.config.heartbeat_node_id is not None
         }
         self._heartbeat_ns, self._beat_ns = int(heartbeat_s * 1e9), now_ns
         self._defects = defects
@@ -116,7 +116,7 @@ class Supervisor:
     def stats(self) -> dict[str, NodeStats]:
         """By patch."""
         return {
-            node.station.patch.name: NodeStats(
+            node.remote.patch.name: NodeStats(
                 node.phase, node.rejoins, node.failures, node.baselines, node.complaint
             )
             for node in self._nodes
@@ -151,7 +151,7 @@ class Supervisor:
                 self._look(node, time.monotonic_ns())
             except Exception as error:  # the next turn makes it faulty
                 node.upset = True
-                node.station.defects.report("supervision", error)
+                node.remote.defects.report("supervision", error)
         self._beat(time.monotonic_ns())
         return True
 
@@ -171,13 +171,13 @@ class Supervisor:
                 link.defects.report("sending a heartbeat", error)
 
     def _look(self, node: Supervised, now_ns: int) -> None:
-        count = node.station.defects.count
+        count = node.remote.defects.count
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
         if count != node.defects:  # a bring-up is due anyway; exceptions from frames must not delay it
             node.defects = count
-            node.complaint = node.station.monitor.defect = node.station.defects.newest
+            node.complaint = node.remote.monitor.defect = node.remote.defects.newest
         match node.phase:
             case Phase.AWAITED:
                 self._await(node, now_ns)
@@ -189,9 +189,9 @@ class Supervisor:
                 self._watch(node, now_ns)
 
     def _await(self, node: Supervised, now_ns: int) -> None:
-        station, monitor = node.station, node.station.monitor
-        booted = monitor.boot_ups != station.boot_ups
-        heard_ns = max(monitor.t_heartbeat_ns or 0, station.t_answer_ns, monitor.t_scan_ns or 0)
+        remote, monitor = node.remote, node.remote.monitor
+        booted = monitor.boot_ups != remote.boot_ups
+        heard_ns = max(monitor.t_heartbeat_ns or 0, remote.t_answer_ns, monitor.t_scan_ns or 0)
         if booted or heard_ns > node.since_ns:
             at_once = (booted or node.was_silent) and now_ns >= node.begun_ns + _LEAST_NS
             if at_once or now_ns >= node.not_before_ns:
@@ -199,36 +199,36 @@ class Supervisor:
             return
         if now_ns - max(heard_ns, node.since_ns) > _FORGET_NS:
             monitor.refusal = monitor.defect = None  # the node is gone, whatever it was
-        if station.is_silent or station.link.failure is not None:
+        if remote.listen_only or remote.link.failure is not None:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
             with contextlib.suppress(BusError):  # a bus that is away, or full: asked again
-                station.probe()
+                remote.probe()
         search_is_over = node.searching is None or node.searching.done()
-        if station.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
+        if remote.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
             node.search_ns = now_ns
-            node.searching = self._pool.submit(_search, station)
+            node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
         """Have the node brought up, once no job talks to it any more: asked for again until then."""
         if node.job is not None and not node.job.done():
             node.abandon.set()
             return
-        station, abandon = node.station, threading.Event()
+        remote, abandon = node.remote, threading.Event()
 
         def bring_up() -> Joined | None:
-            withholdings = station.withhold()
-            return Joined(station.bring_up(JOIN_DEADLINE_S, abandon.is_set), withholdings)
+            withholdings = remote.withhold()
+            return Joined(remote.configure(JOIN_DEADLINE_S, abandon.is_set), withholdings)
 
-        station.boot_ups = station.monitor.boot_ups
+        remote.boot_ups = remote.monitor.boot_ups
         node.job = self._pool.submit(bring_up)
         node.abandon, node.phase, node.since_ns, node.begun_ns = abandon, Phase.JOINING, now_ns, now_ns
 
     def _join(self, node: Supervised, now_ns: int) -> None:
-        station, job = node.station, node.job
+        remote, job = node.remote, node.job
         assert job is not None  # of this phase
-        if station.monitor.boot_ups != station.boot_ups:
+        if remote.monitor.boot_ups != remote.boot_ups:
             node.abandon.set()  # it booted again meanwhile: what was done so far is gone
         if not job.done():
             return
@@ -241,7 +241,7 @@ class Supervisor:
             joined = job.result()
             assert joined is not None  # of a bring-up
             assert joined.solver is not None
-            station.start(joined.solver, joined.withholdings)
+            remote.start(joined.solver, joined.withholdings)
             _note_baseline(node)
         except (BusError, ConfigError) as error:
             refused = isinstance(error, (NodeError, ConfigError)) and not isinstance(error, NodeTimeout)
@@ -249,43 +249,43 @@ class Supervisor:
             return
         except Exception as error:
             node.upset = True
-            station.defects.report("bring-up", error)
+            remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if station.is_guest:  # another master starts it when it likes
+        if remote.has_other_master:  # another master starts it when it likes
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:
-        station = node.station
-        if station.monitor.boot_ups != station.boot_ups:
+        remote = node.remote
+        if remote.monitor.boot_ups != remote.boot_ups:
             self._begin(node, now_ns)
-        elif station.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
+        elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
-        elif station.link.t_dealt_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            silent = station.monitor.nmt_state == NmtState.OPERATIONAL  # its state before the command
-            self._fail(node, _not_started(station, silent=silent), now_ns, refused=not silent)
+        elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
+            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL  # its state before the command
+            self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
         elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: it may have been lost
             node.probe_ns = now_ns + _PROBE_NS
             with contextlib.suppress(BusError):
-                bringup.start(station.link.send, station.patch.node_id)
+                nmt_master.start(remote.link.send, remote.patch.node_id)
 
     def _running(self, node: Supervised, now_ns: int) -> None:
-        station = node.station
+        remote = node.remote
         node.phase, node.since_ns, node.complaint = Phase.RUNNING, now_ns, None
         node.unconfigured = False
         node.read_ns = now_ns + _LEAST_NS
         node.rejoins += 1
-        station.monitor.rejoins = node.rejoins
-        station.monitor.refusal = station.monitor.defect = None
-        station.monitor.complaint = None
-        _log.warning("node %d (%s) was brought up and runs", station.patch.node_id, station.patch.name)
+        remote.monitor.rejoins = node.rejoins
+        remote.monitor.refusal = remote.monitor.defect = None
+        remote.monitor.complaint = None
+        _log.warning("node %d (%s) was brought up and runs", remote.patch.node_id, remote.patch.name)
 
     def _fail(self, node: Supervised, complaint: str, now_ns: int, *, refused: bool) -> None:
         if complaint != node.complaint:
             _log.warning("%s; tried again", complaint)
         node.failures += 1
         node.complaint = complaint
-        monitor = node.station.monitor
+        monitor = node.remote.monitor
         monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
         monitor.running = monitor.running and not refused  # it may be somebody else's now
@@ -293,12 +293,12 @@ class Supervisor:
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Make a patch faulty after a defect. Repeated at the next turn if it raises."""
-        station = node.station
-        count = station.defects.count
+        remote = node.remote
+        count = remote.defects.count
         node.abandon.set()
         node.failures += 1
-        node.complaint = station.monitor.defect = station.defects.newest
-        station.link.call(station.lane.withhold, station.defects)
+        node.complaint = remote.monitor.defect = remote.defects.newest
+        remote.link.call(remote.stream.withhold, remote.defects)
         self._await_again(node, now_ns, was_silent=False)
         node.defects, node.upset = count, False
 
@@ -307,12 +307,16 @@ class Supervisor:
         node.not_before_ns = now_ns + int(node.pause.next_s() * 1e9)
 
     def _watch(self, node: Supervised, now_ns: int) -> None:
-        station, monitor = node.station, node.station.monitor
+        remote, monitor = node.remote, node.remote.monitor
         said_ns = monitor.t_heartbeat_ns or 0
-        if monitor.boot_ups != station.boot_ups:
+        if monitor.boot_ups != remote.boot_ups:
             self._begin(node, now_ns)
             return
-        if not station.is_guest and monitor.nmt_state != NmtState.OPERATIONAL and said_ns > node.since_ns:
+        if (
+            not remote.has_other_master
+            and monitor.nmt_state != NmtState.OPERATIONAL
+            and said_ns > node.since_ns
+        ):
             self._begin(node, now_ns)
             if (
                 node.phase is Phase.RUNNING
@@ -321,28 +325,28 @@ class Supervisor:
             ):
                 node.probe_ns = now_ns + _PROBE_NS  # a job waits for a response that it does not send
                 with contextlib.suppress(BusError):
-                    bringup.stand_by(station.link.send, station.patch.node_id)
+                    nmt_master.stand_by(remote.link.send, remote.patch.node_id)
             if node.phase is Phase.JOINING:
                 _log.warning(
                     "node %d (%s) left NMT state %d for %s without the host's doing",
-                    station.patch.node_id,
-                    station.patch.name,
+                    remote.patch.node_id,
+                    remote.patch.name,
                     NmtState.OPERATIONAL,
                     monitor.nmt_state,
                 )
             return
-        patience_ns = HEARTBEATS_MISSED * station.heartbeat_s * 1e9
-        if station.link.t_dealt_ns > max(said_ns, node.since_ns) + patience_ns and not station.is_silent:
-            _log.warning("node %d (%s) is lost: no heartbeat", station.patch.node_id, station.patch.name)
+        patience_ns = HEARTBEATS_MISSED * remote.heartbeat_s * 1e9
+        if remote.link.t_dispatched_ns > max(said_ns, node.since_ns) + patience_ns and not remote.listen_only:
+            _log.warning("node %d (%s) is lost: no heartbeat", remote.patch.node_id, remote.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            station.link.call(station.lane.withhold, station.defects)  # until its state is known
+            remote.link.call(remote.stream.withhold, remote.defects)  # until its state is known
             return
         if node.unconfigured:
             node.unconfigured = False
-            _log.warning("node %d (%s) lost its configuration", station.patch.node_id, station.patch.name)
+            _log.warning("node %d (%s) lost its configuration", remote.patch.node_id, remote.patch.name)
             self._begin(node, now_ns)
             return
-        if node.job is None and now_ns >= node.mute_ns and station.is_mute(node.since_ns):
+        if node.job is None and now_ns >= node.mute_ns and remote.is_mute(node.since_ns):
             node.mute_ns = now_ns + _MUTE_NS
             node.job = self._pool.submit(_read_back, node)
             return
@@ -351,39 +355,39 @@ class Supervisor:
     def _watch_baseline(self, node: Supervised, now_ns: int) -> None:
         """Read it again where the node said that it changed, or may have said so in a summary that was
         lost. In the first case scans are withheld until then."""
-        station, lane, job = node.station, node.station.lane, node.job
+        remote, stream, job = node.remote, node.remote.stream, node.job
         if job is not None:
             if job.done():
                 node.job = None
                 self._take_baseline(node, job, now_ns)
             return
-        changed = lane.withholding
+        changed = stream.withholding
         node.announced |= changed
-        if not (changed or lane.doubtful) or now_ns < node.read_ns:
+        if not (changed or stream.doubtful) or now_ns < node.read_ns:
             self._watch_register(node, now_ns)
             return
-        if station.is_silent:
+        if remote.listen_only:
             if changed:
-                station.monitor.refusal = "its baseline changed; a guest that sends nothing cannot read it"
+                remote.monitor.refusal = "its baseline changed; a guest that sends nothing cannot read it"
             return
-        lane.doubtful = False
+        stream.doubtful = False
         abandon = node.abandon = threading.Event()
 
         def read() -> Joined | None:
-            withholdings = station.withhold() if changed else lane.withholdings
-            return Joined(station.renew_baseline(JOIN_DEADLINE_S, abandon.is_set), withholdings)
+            withholdings = remote.withhold() if changed else stream.withholdings
+            return Joined(remote.renew_baseline(JOIN_DEADLINE_S, abandon.is_set), withholdings)
 
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
         """Ask a node with an error for its error register: the emergency that ended it may have been lost."""
-        station = node.station
-        if not station.monitor.error_register or station.is_silent or now_ns < node.register_ns:
+        remote = node.remote
+        if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return
 
         def read() -> Joined | None:
             with contextlib.suppress(BusError, ConfigError):  # asked again
-                station.renew_register()
+                remote.renew_register()
             return None
 
         node.register_ns = now_ns + _REGISTER_NS
@@ -392,23 +396,23 @@ class Supervisor:
     def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
         if job.exception() is None and job.result() is None:  # it was the error register
             return
-        station, lane = node.station, node.station.lane
-        node.read_ns = now_ns + (_LEAST_NS if lane.withholding else _DOUBT_NS)
+        remote, stream = node.remote, node.remote.stream
+        node.read_ns = now_ns + (_LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
         except (BusError, ConfigError) as error:  # if the node is gone, its silence will show
-            lane.doubtful = True
+            stream.doubtful = True
             _log.warning("%s; its baseline is read again", error)
             return
         except Abandoned:
             return
         except Exception as error:
-            station.defects.report("reading the baseline or the error register", error)
+            remote.defects.report("reading the baseline or the error register", error)
             return
         assert read is not None  # see above
         solver = read.solver
         if solver is not None:
-            station.link.call(lambda: lane.resume(solver, read.withholdings, anew=False), station.defects)
+            remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
             node.announced = True  # or found after a lost summary
             _note_baseline(node)
 
@@ -416,34 +420,34 @@ class Supervisor:
 def _note_baseline(node: Supervised) -> None:
     """Note with which baseline the scans are solved now. A bring-up finds a new one too: after a reading that
     failed, or if it changed while the node was away."""
-    facts, before = node.station.facts, node.baseline_ohm
+    facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # of a node that was brought up
     node.baseline_ohm = facts.baseline_ohm
     if node.announced or (before is not None and not np.array_equal(before, facts.baseline_ohm)):
         node.announced = False
         node.baselines += 1
-        node.station.monitor.baselines = node.baselines
+        node.remote.monitor.baselines = node.baselines
 
 
 def _read_back(node: Supervised) -> None:
     """Find out whether a node that sends no scans lost its configuration."""
     with contextlib.suppress(BusError, ConfigError):  # asked again
-        node.unconfigured = not node.station.is_configured()
+        node.unconfigured = not node.remote.is_configured()
 
 
-def _search(station: Station) -> bool:
+def _search(remote: RemoteNode) -> bool:
     """Search for the patch by LSS. Returns whether it was found."""
     try:
-        return station.search()
+        return remote.search()
     except Exception as error:
-        station.defects.report("search by LSS", error)
+        remote.defects.report("search by LSS", error)
         return False
 
 
-def _not_started(station: Station, *, silent: bool) -> str:
+def _not_started(remote: RemoteNode, *, silent: bool) -> str:
     """Return why a node does not count as started."""
-    node = f"node {station.patch.node_id}"
+    node = f"node {remote.patch.node_id}"
     if silent:
         return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command, allowed: one"
-    state = known(station.monitor.nmt_state)
+    state = known(remote.monitor.nmt_state)
     return f"{node}: got NMT state {state} after the start command, allowed: {NmtState.OPERATIONAL:d}"

@@ -8,15 +8,15 @@ from typing import Protocol
 
 from skinnode.host.containment import Defects
 from skinnode.host.link import BusLink
-from skinnode.host.pipeline import Lane, LaneTap, Solver
+from skinnode.host.patch_stream import PatchStream, Solver, StreamTap
 from skinnode.transport import Frame
 
 
-class HostTap(LaneTap, Protocol):
+class HostTap(StreamTap, Protocol):
     """Who writes down all frames and what else decides what a host makes of them. Never waits."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """A batch that is about to be dealt out. On the mainline of the bus, as what a lane says is."""
+        """A batch that is about to be dispatched. On the mainline of the bus, as what a stream says is."""
 
     def sent(self, bus: str, frame: Frame) -> None:
         """A frame that the interface has taken. On whatever thread sent it."""
@@ -69,20 +69,23 @@ def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
     return end
 
 
-def tap_bus(tap: HostTap, link: BusLink, lanes: Sequence[Lane]) -> Callable[[], None]:
-    """Have the mainline let ``tap`` hear of every frame and of the lanes, first of how they are; and no more
-    when what is returned is called, from any thread."""
+def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Callable[[], None]:
+    """Have the mainline pass every frame and every change of the streams to ``tap``, their state first.
+
+    Returns:
+        A function that ends this, for any thread.
+    """
     ends: list[Callable[[], None]] = []
 
     def begin() -> None:
         ends.append(tap_link(tap, link))
-        for lane in lanes:
-            lane.tap = tap
-            lane.tell_tap()
+        for stream in streams:
+            stream.tap = tap
+            stream.tell_tap()
 
     def end() -> None:
-        for lane in lanes:
-            lane.tap = None
+        for stream in streams:
+            stream.tap = None
         ends.pop()()
 
     link.call(begin)

@@ -8,7 +8,7 @@ from typing import Final
 
 from skinnode.errors import NodeTimeout
 from skinnode.host.health import PatchHealth
-from skinnode.host.station import Station
+from skinnode.host.remote_node import RemoteNode
 
 TARE_DEADLINE_S: Final = 5.0
 """Default deadline of a tare, in s, in addition to the SYNC periods below: 16 readings take milliseconds,
@@ -21,25 +21,25 @@ _POLL_S: Final = 0.005
 
 
 def tare(
-    station: Station, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
+    node: RemoteNode, baselines: Callable[[], int], health: Callable[[], PatchHealth], deadline_s: float
 ) -> None:
     """Tare a patch and return once its scans are solved with the new baseline.
 
     ``baselines`` returns how many baselines have been read. Raises NodeTimeout after ``deadline_s``, and
-    whatever :meth:`Station.tare` raises.
+    whatever :meth:`RemoteNode.tare` raises.
     """
     before, emergencies = baselines(), health().emergencies
-    station.tare()
+    node.tare()
     end_s = time.monotonic() + deadline_s
-    while baselines() == before or station.lane.withholding:
+    while baselines() == before or node.stream.withholding:
         if time.monotonic() > end_s:
-            raise NodeTimeout(station.patch.node_id, _why(station, health(), emergencies, deadline_s))
+            raise NodeTimeout(node.patch.node_id, _why(node, health(), emergencies, deadline_s))
         time.sleep(_POLL_S)
 
 
-def _why(station: Station, now: PatchHealth, emergencies: int, deadline_s: float) -> str:
+def _why(node: RemoteNode, now: PatchHealth, emergencies: int, deadline_s: float) -> str:
     said = f"the patch is {now.condition}"
     if now.emergencies > emergencies and now.emergency_text:
         said += f" and reported {now.emergency_text}"
-    where = f"patch {station.patch.name!r} on {station.patch.bus}"
+    where = f"patch {node.patch.name!r} on {node.patch.bus}"
     return f"{where}: tare commanded, but no new baseline came within {deadline_s:g} s; {said}"

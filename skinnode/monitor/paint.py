@@ -84,7 +84,7 @@ def _header(view: View, ui: Ui, look: Look, width: int) -> Line:
 
 def _losses(view: View, bus: BusView) -> str:
     """Describe the losses of the patches of a bus, the worst in words; empty if there are none."""
-    counts = [patch.lane.assembler for patch in view.patches if patch.bus == bus.name]
+    counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
         ("summaries_lost", "summary lost", "summaries lost"),

@@ -182,8 +182,8 @@ def _caption(text: str, look: Look) -> Line:
 
 def facts(patch: PatchView, look: Look, width: int) -> list[Line]:
     """All figures of a patch, a name and a value a line."""
-    health, lane = patch.health, patch.lane
-    counts = lane.assembler
+    health, stream = patch.health, patch.stream
+    counts = stream.assembler
     lines = [
         spread(
             [
@@ -216,8 +216,8 @@ def facts(patch: PatchView, look: Look, width: int) -> list[Line]:
         "scans torn": counts.scans_torn,
         "scans corrupt": counts.scans_corrupt,
         "scans missed": counts.scans_missed,
-        "scans skipped": lane.skipped,
-        "scans withheld": lane.withheld + lane.partial,
+        "scans skipped": stream.skipped,
+        "scans withheld": stream.withheld + stream.partial,
         "chunks lost": counts.chunks_lost,
     }
     losses = ", ".join(f"{count} {what}" for what, count in lost.items() if count)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, Final
 
-from skinnode.host.accounting import losses_of_lane
+from skinnode.host.accounting import losses_of_stream
 from skinnode.host.health import Condition, PatchHealth
 from skinnode.monitor.source import Source
 from skinnode.monitor.state import History, PatchView, View
@@ -47,7 +47,7 @@ class FaultBook:
                 self._add(patch.name, patch.condition, patch.condition)
             for key, text in _lasting(patch.health):
                 self._add(patch.name, key, text)
-            for counter, text in losses_of_lane(patch.lane).items():
+            for counter, text in losses_of_stream(patch.stream).items():
                 self._add(patch.name, counter, text)
         for bus in view.buses:
             if bus.level == "bad":
@@ -113,7 +113,7 @@ def as_json(view: View) -> dict[str, Any]:
 
 
 def _patch_json(patch: PatchView) -> dict[str, Any]:
-    counts = patch.lane.assembler
+    counts = patch.stream.assembler
     return {
         "node_id": patch.node_id,
         "bus": patch.bus,
@@ -133,7 +133,7 @@ def _patch_json(patch: PatchView) -> dict[str, Any]:
         "torn": counts.scans_torn,
         "corrupt": counts.scans_corrupt,
         "missed": counts.scans_missed,
-        "skipped": patch.lane.skipped,
+        "skipped": patch.stream.skipped,
         "chunks_lost": counts.chunks_lost,
         "depth_m": patch.depth_m,
         "depth_std_m": patch.depth_std_m,

@@ -15,10 +15,10 @@ from typing import Final, Protocol, Self
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.host import Host, PatchHealth
-from skinnode.host.dealer import BusStats
+from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import Events, EventSubscription, HealthEvent, HealthWatch
 from skinnode.host.health import BusHealth
-from skinnode.host.pipeline import LaneStats
+from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, Replay
 
@@ -36,7 +36,7 @@ class Snapshot:
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
-    lanes: Mapping[str, LaneStats]
+    streams: Mapping[str, StreamStats]
     fields: Mapping[str, FieldFrame | None]
 
 
@@ -109,7 +109,7 @@ class HostSource:
             health={name: host.health(name) for name in stats.patches},
             bus_health={name: host.bus_health(name) for name in stats.buses},
             buses=stats.buses,
-            lanes=stats.patches,
+            streams=stats.patches,
             fields={name: host.latest(name) for name in stats.patches},
         )
 
@@ -188,7 +188,7 @@ class ReplaySource:
             health=self._health(),
             bus_health=self._bus_health(),
             buses=self._run.bus_stats(),
-            lanes=self._run.patch_stats(),
+            streams=self._run.patch_stats(),
             fields={patch.name: self._run.publisher.latest(patch.name) for patch in self.hand.patches},
         )
 

@@ -14,10 +14,10 @@ import numpy as np
 from skinnode.canopen.emergency import register_text
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.config.patches import LayoutConfig
-from skinnode.host.dealer import BusStats
+from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
-from skinnode.host.pipeline import LaneStats
+from skinnode.host.patch_stream import StreamStats
 from skinnode.model.layout import Float
 from skinnode.monitor.maps import Surface, mean_shear_m, surface_of
 from skinnode.monitor.source import Snapshot
@@ -42,7 +42,7 @@ class PatchView:
     words: tuple[str, ...]
     """What is wrong beside the condition, the worst first."""
     health: PatchHealth
-    lane: LaneStats
+    stream: StreamStats
     rate_hz: float
     """Fields a second."""
     latency_s: float | None
@@ -155,8 +155,8 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
 
 def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float, live: bool) -> PatchView:
     now, before, name = history[-1], history[0], patch.name
-    health, lane, field = now.health[name], now.lanes[name], now.fields[name]
-    condition, level, words = judge_patch(health, lane, before.lanes[name])
+    health, stream, field = now.health[name], now.streams[name], now.fields[name]
+    condition, level, words = judge_patch(health, stream, before.streams[name])
     surface = None if field is None else surface_of(field, upper_m(patch.layout))
     depth_m = depth_std_m = None
     if field is not None and surface is not None:
@@ -173,8 +173,8 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
         level=level,
         words=words,
         health=health,
-        lane=lane,
-        rate_hz=max(0, lane.solved - before.lanes[name].solved) / elapsed_s,
+        stream=stream,
+        rate_hz=max(0, stream.solved - before.streams[name].solved) / elapsed_s,
         latency_s=statistics.median(latencies) if latencies else None,
         latency_max_s=max(latencies, default=None),
         scan=None if field is None or field.stamp is None else field.stamp.scan,
@@ -207,11 +207,11 @@ def upper_m(layout: LayoutConfig) -> Float:
 
 
 def judge_patch(
-    health: PatchHealth, lane: LaneStats, before: LaneStats
+    health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
     """The condition, how much it matters, and what else is wrong."""
     condition, words = health.condition, []
-    if condition is Condition.STALE and not lane.solved and not lane.withheld:
+    if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()
     if health.refusal:
         words.append(health.refusal)
@@ -224,8 +224,8 @@ def judge_patch(
     words += [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     if health.error_register:
         words.append(health.emergency_text or f"error: {register_text(health.error_register)}")
-    losses = lane.assembler.chunks_lost - before.assembler.chunks_lost
-    missed = lane.assembler.scans_missed - before.assembler.scans_missed
+    losses = stream.assembler.chunks_lost - before.assembler.chunks_lost
+    missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
         lossy = []  # what is gone loses all

@@ -10,7 +10,7 @@ from types import FrameType
 
 
 @contextmanager
-def until_told() -> Iterator[threading.Event]:
+def stop_on_signal() -> Iterator[threading.Event]:
     """An event that SIGINT (Ctrl-C), SIGTERM and, unless it is ignored as under nohup, SIGHUP (the terminal
     is gone) set. The handlers from before are back at the end of the block. For the main thread; Python
     allows no other to handle signals (ValueError)."""

@@ -19,7 +19,7 @@ from typing import Any, Final, Self
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects, keep_on
-from skinnode.host.pipeline import Solver
+from skinnode.host.patch_stream import Solver
 from skinnode.record.journal import SUFFIX, Header, facts_table
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFrame, create

@@ -1,5 +1,5 @@
-"""Makes fields of a recording again, by the code that made them live: dealer, assembler, decoder, lane,
-solver, publisher. Nothing here has a thread: each scan is solved when its last frame is dealt out.
+"""Makes fields of a recording again, by the code that made them live: dispatcher, assembler, decoder, stream,
+solver, publisher. Nothing here has a thread: each scan is solved when its last frame is dispatched.
 
 **Same as live.** For the scans that were solved live the numbers are the same bits, where the recording began
 before the host did, is whole, the build and processor are the same and no deadline cut a solve short. Times
@@ -20,9 +20,9 @@ from skinnode.canopen.indices import SYNC_COB_ID
 from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
-from skinnode.host.dealer import BusStats, Dealer
+from skinnode.host.dispatcher import BusStats, Dispatcher
 from skinnode.host.health import PatchHealth
-from skinnode.host.pipeline import LaneStats, Solver
+from skinnode.host.patch_stream import Solver, StreamStats
 from skinnode.host.publish import Publisher
 from skinnode.host.reception import PatchReception, receive_bus, receive_patch
 from skinnode.host.sync import SyncFollower, Ticks
@@ -173,12 +173,12 @@ class Replay:
         """Counters by bus."""
         return {name: bus.stats() for name, bus in self._buses.items()}
 
-    def patch_stats(self) -> dict[str, LaneStats]:
+    def patch_stats(self) -> dict[str, StreamStats]:
         """Counters by patch."""
-        return {patch.name: self._lane_stats(patch.name) for patch in self.hand.patches}
+        return {patch.name: self._stream_stats(patch.name) for patch in self.hand.patches}
 
-    def _lane_stats(self, patch: str) -> LaneStats:
-        return self._buses[self.hand.patch(patch).bus].patches[patch].lane.stats()
+    def _stream_stats(self, patch: str) -> StreamStats:
+        return self._buses[self.hand.patch(patch).bus].patches[patch].stream.stats()
 
     def _wait(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds
@@ -217,7 +217,7 @@ class _Pace:
             self._wait(ahead_s)
 
 
-class _PollerlessDealer(Dealer):
+class _PollerlessDispatcher(Dispatcher):
     """Lanes are polled where the journal says so, not after each batch: there are no batches any more."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
@@ -231,16 +231,16 @@ class _Bus:
         self._config, self._replay = config, replay
         hand = replay.hand
         self._ticks = Ticks(hand.sync.counter_overflow)
-        self._dealer = _PollerlessDealer(config, {}, 0)
-        receive_bus(hand, self._dealer, self._ticks)
+        self._dispatcher = _PollerlessDispatcher(config, {}, 0)
+        receive_bus(hand, self._dispatcher, self._ticks)
         self._own_syncs = SyncFollower(self._ticks)
         self.patches: dict[str, PatchReception] = {
-            patch.name: receive_patch(patch, hand, self._dealer, self._ticks, Inline(), replay.publisher)
+            patch.name: receive_patch(patch, hand, self._dispatcher, self._ticks, Inline(), replay.publisher)
             for patch in hand.patches_on(config.name)
         }
         for name, heard in self.patches.items():
             mine = [e for e in events if e["event"] == "overtaken" and e["patch"] == name]
-            heard.lane.leave_out([e["received_ns"] for e in mine], _ROUNDING_NS)
+            heard.stream.leave_out([e["received_ns"] for e in mine], _ROUNDING_NS)
         self._events = deque(events)
         self._solvers: dict[str, Solver | None] = {}
         self._received = self._sent = 0
@@ -249,18 +249,18 @@ class _Bus:
         """The next frame of the log. ``whole``: no frame before it was damaged."""
         if sent:
             self._sent += 1
-            self._dealer.count_sent(frame.can_id, frame.data)
+            self._dispatcher.count_sent(frame.can_id, frame.data)
             if frame.can_id == SYNC_COB_ID and not frame.extended:
                 self._own_syncs.on_sync(frame.data, frame.t_ns)
             return
         while self._events and self._is_due(self._events[0], frame.t_ns, whole=whole):
             self._happen(self._events.popleft())
         self._received += 1
-        self._dealer.deal((frame,))
+        self._dispatcher.dispatch((frame,))
         if not whole:
             for heard in self.patches.values():
-                heard.lane.poll(frame.t_ns)
-        self._dealer.measure(frame.t_ns)
+                heard.stream.poll(frame.t_ns)
+        self._dispatcher.measure(frame.t_ns)
 
     def finish(self) -> None:
         """What happened after the last frame."""
@@ -268,7 +268,7 @@ class _Bus:
             self._happen(self._events.popleft())
 
     def stats(self) -> BusStats:
-        return self._dealer.count(sent=self._sent)
+        return self._dispatcher.count(sent=self._sent)
 
     def _is_due(self, event: dict[str, Any], t_ns: int, *, whole: bool) -> bool:
         if whole:
@@ -276,18 +276,18 @@ class _Bus:
         return bool(event["t_ns"] <= t_ns)
 
     def _happen(self, event: dict[str, Any]) -> None:
-        lane = self.patches[event["patch"]].lane
+        stream = self.patches[event["patch"]].stream
         match event["event"]:
             case "withheld":
-                lane.withhold()
+                stream.withhold()
             case "polled":
-                lane.poll(event["t_ns"] + _ROUNDING_NS)
+                stream.poll(event["t_ns"] + _ROUNDING_NS)
             case "resumed":
                 solver = self._solver(event)
                 if solver is None:
-                    lane.withhold()
+                    stream.withhold()
                 else:
-                    lane.resume(solver, lane.withholdings, anew=bool(event.get("anew")))
+                    stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> Solver | None:
         """None where nobody knows how the scans are to be decoded."""

@@ -12,7 +12,7 @@ from skinnode.canopen import nmt
 from skinnode.canopen.lss import LssAddress
 from skinnode.canopen.sdo import upload_request
 from skinnode.errors import ConfigError
-from skinnode.host.lss import LssFailed
+from skinnode.host.lss_master import LssFailed
 from skinnode.technician.line import Line
 from skinnode.technician.survey import find_unconfigured
 

@@ -13,7 +13,7 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode
 from skinnode.conformance.eds import SIGNED, UNSIGNED, Eds, EdsEntry, number
 from skinnode.errors import ConfigError, SdoAbort
-from skinnode.host.network import MOST_BYTES, RemoteOd
+from skinnode.host.sdo_client import MAX_UPLOAD_BYTES, RemoteOd
 from skinnode.technician.standard import (
     SERIES,
     SINGLE,
@@ -147,7 +147,7 @@ def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
     """A value of a node; an abort is a reading too. Raises NodeError where the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
-        data = remote.read_bytes(entry.index, entry.subindex, MOST_BYTES)
+        data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
     except SdoAbort as abort:
         why = "no data" if abort.code == AbortCode.NO_DATA else f"refused: {abort_text(abort)}"
         return Reading(*named, None, None, why, abort.code)

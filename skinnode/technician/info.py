@@ -12,7 +12,7 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.emergency import history_text, register_text
 from skinnode.conformance.eds import Eds, parse_eds
 from skinnode.errors import NodeError, SdoAbort
-from skinnode.host.network import RemoteOd
+from skinnode.host.sdo_client import RemoteOd
 from skinnode.model.layout import PRESET_IDS, Float
 from skinnode.protocol.codec import SelfTestFault, SelfTestStatus
 from skinnode.protocol.profile import PatchProfile, eds_text

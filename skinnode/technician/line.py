@@ -13,9 +13,9 @@ from skinnode.canopen.nmt import state_name
 from skinnode.config import BusConfig
 from skinnode.errors import BusError, NodeError, SkinError
 from skinnode.host.link import BusLink
-from skinnode.host.lss import LssMaster
+from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
-from skinnode.host.network import RemoteOd
+from skinnode.host.sdo_client import RemoteOd
 from skinnode.technician.heard import Beat, Heard
 
 LONGEST_HEARTBEAT_S: Final = 2.5

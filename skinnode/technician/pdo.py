@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from skinnode.canopen import indices as od
 from skinnode.errors import SdoAbort
-from skinnode.host.network import RemoteOd
+from skinnode.host.sdo_client import RemoteOd
 from skinnode.text.words import counted
 
 Direction = Literal["TPDO", "RPDO"]

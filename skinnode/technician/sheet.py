@@ -8,7 +8,7 @@ from typing import NamedTuple
 from skinnode.canopen import indices as od
 from skinnode.conformance.eds import Eds, parse_eds, parse_eds_file
 from skinnode.errors import ConfigError, NodeError, ProfileError, Shown
-from skinnode.host.network import RemoteOd
+from skinnode.host.sdo_client import RemoteOd
 from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
 
 

@@ -20,7 +20,7 @@ from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.nmt import NmtState
 from skinnode.config import BusConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, SdoAbort
-from skinnode.host.network import RemoteOd
+from skinnode.host.sdo_client import RemoteOd
 from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 from skinnode.technician.line import Line

@@ -17,7 +17,7 @@ from skinnode.bench import soak_cache as _soak_cache
 from skinnode.bench.soak_starvation import starved_processor
 from skinnode.cli.bench import app
 from skinnode.compiled import jit
-from skinnode.host.pipeline import Lane
+from skinnode.host.patch_stream import PatchStream
 from skinnode.host.publish import Publisher
 from skinnode.model.frames import FieldFrame
 from vcan_sim.fleet import FaultyPort
@@ -96,18 +96,18 @@ def _children() -> set[int]:
 @pytest.mark.long
 def test_what_grows_or_is_miscounted_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[Any] = []
-    publish, on_summary = Publisher.publish, Lane.on_summary
+    publish, on_summary = Publisher.publish, PatchStream.on_summary
 
     def leaking(publisher: Publisher, field: FieldFrame, patch: str) -> None:
         kept.append([[number] for number in range(1000)])
         publish(publisher, field, patch)
 
-    def losing(lane: Lane, data: bytes, t_ns: int) -> None:
+    def losing(stream: PatchStream, data: bytes, t_ns: int) -> None:
         if data[0] % 50:
-            on_summary(lane, data, t_ns)
+            on_summary(stream, data, t_ns)
 
     monkeypatch.setattr(Publisher, "publish", leaking)
-    monkeypatch.setattr(Lane, "on_summary", losing)
+    monkeypatch.setattr(PatchStream, "on_summary", losing)
     code, output, figures = soak(tmp_path, "0.1")
     assert code == 1
     assert {"growth: blocks of Python", "sums that do not agree"} <= set(missed(figures)), output

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from skinnode.host.pipeline import Solver
+from skinnode.host.patch_stream import Solver
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
 from skinnode.protocol.assembler import Scan

@@ -9,8 +9,8 @@ import pytest
 
 from skinnode.config import BusConfig
 from skinnode.host.accounting import discrepancies
-from skinnode.host.dealer import Dealer
-from skinnode.host.pipeline import LaneStats
+from skinnode.host.dispatcher import Dispatcher
+from skinnode.host.patch_stream import StreamStats
 from skinnode.transport import Frame
 
 BUS = {"read": 31, "received": 20, "ignored": 5, "error_frames": 3, "dropped": 2, "waiting": 1}
@@ -32,8 +32,8 @@ LANE = {"frames": 13, "offered": 5, "withheld": 2, "partial": 1, "solved": 4, "f
 SHARES = ["withheld", "partial", "solved", "failed", "skipped"]
 
 
-def found(bus: dict[str, int], lane: dict[str, int], assembled: dict[str, int]) -> list[str]:
-    lane_stats = SimpleNamespace(**LANE | lane, assembler=SimpleNamespace(**ASSEMBLED | assembled))
+def found(bus: dict[str, int], stream: dict[str, int], assembled: dict[str, int]) -> list[str]:
+    lane_stats = SimpleNamespace(**LANE | stream, assembler=SimpleNamespace(**ASSEMBLED | assembled))
     bus_stats = SimpleNamespace(**{"foreign": 4, "malformed": 3} | BUS | bus)
     return discrepancies(SimpleNamespace(buses={"can0": bus_stats}, patches={"palm": lane_stats}))  # type: ignore[arg-type]
 
@@ -59,7 +59,9 @@ def test_each_counter_of_an_assembler_is_in_its_sum(counter: str) -> None:
     assert lines == [f"palm: {name}: got {got}, must be the {must}"]
 
 
-@pytest.mark.parametrize("counter", [name for name in SHARES if name in {f.name for f in fields(LaneStats)}])
+@pytest.mark.parametrize(
+    "counter", [name for name in SHARES if name in {f.name for f in fields(StreamStats)}]
+)
 def test_each_counter_of_a_patch_is_in_its_sum(counter: str) -> None:
     (line,) = found({}, {counter: LANE[counter] + 1}, {})
     assert line.startswith("palm: scans offered")
@@ -74,14 +76,14 @@ def test_sums_over_all_buses_and_patches() -> None:
 
 def test_load_of_a_bus_is_that_of_its_last_second() -> None:
     """Frames of 53 bits (timing tests: identifier 0, no data) at 1 Mbit/s; measured ten times a second."""
-    dealer = Dealer(BusConfig(name="can0", channel="load"), {}, 0)
-    assert (dealer.count().bits, dealer.count().load) == (0, 0.0)
-    dealer.deal([Frame(0, b"", 1)] * 1000)
-    dealer.measure(99_999_999)
-    assert dealer.count().bits == 0  # not due yet
+    dispatcher = Dispatcher(BusConfig(name="can0", channel="load"), {}, 0)
+    assert (dispatcher.count().bits, dispatcher.count().load) == (0, 0.0)
+    dispatcher.dispatch([Frame(0, b"", 1)] * 1000)
+    dispatcher.measure(99_999_999)
+    assert dispatcher.count().bits == 0  # not due yet
     for tenth in range(1, 11):
-        dealer.measure(tenth * 100_000_000)
-        assert dealer.count().load == pytest.approx(0.053 / (0.1 * tenth))
-    assert dealer.count().bits == 53_000
-    dealer.measure(1_100_000_000)
-    assert dealer.count().load == 0.0
+        dispatcher.measure(tenth * 100_000_000)
+        assert dispatcher.count().load == pytest.approx(0.053 / (0.1 * tenth))
+    assert dispatcher.count().bits == 53_000
+    dispatcher.measure(1_100_000_000)
+    assert dispatcher.count().load == 0.0

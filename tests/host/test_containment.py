@@ -21,8 +21,8 @@ from skinnode.host.code_watch import CodeWatch
 from skinnode.host.containment import Defects, Pause, keep_on
 from skinnode.host.events import HealthWatch
 from skinnode.host.health import NodeMonitor
-from skinnode.host.pipeline import Solver
-from skinnode.host.station import Station
+from skinnode.host.patch_stream import Solver
+from skinnode.host.remote_node import RemoteNode
 from skinnode.host.supervisor import Supervisor
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.record import Recorder
@@ -141,7 +141,7 @@ OF_PATCH: list[tuple[type, str, Callable[[Any], bool], str]] = [
     (ScanAssembler, "on_summary", lambda this: this._node_id == 5, "frame 0x285"),
     (NodeMonitor, "on_heartbeat", lambda this: this.node_id == 5, "frame 0x705"),
     (NodeMonitor, "said_since", lambda this: this.node_id == 5, "supervision"),
-    (Station, "bring_up", lambda this: this.patch.name == "p0", "bring-up"),
+    (RemoteNode, "configure", lambda this: this.patch.name == "p0", "bring-up"),
 ]
 
 
@@ -236,7 +236,7 @@ def test_a_patch_that_cannot_be_solved_is_brought_up_anew_ever_more_seldom(
 OF_HOST: list[tuple[type, str, str, str]] = [
     (BusLoad, "add_all", "can0", "counting frames"),
     (Receiver, "wait", "host", "the mainline"),
-    (Intake, "take", "can0", "dealing out frames"),
+    (Intake, "take", "can0", "dispatching frames"),
     (CodeWatch, "on_scan", "p0", "polling"),
     (HealthWatch, "_compare_bus", "host", "watching the health"),
     (Supervisor, "_beat", "host", "supervision"),

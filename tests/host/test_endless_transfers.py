@@ -12,7 +12,7 @@ import pytest
 from skinnode.config import HandConfig
 from skinnode.errors import NodeError
 from skinnode.host import Condition, Host
-from skinnode.host.network import Abandoned, RemoteOd, SkinNetwork
+from skinnode.host.sdo_client import Abandoned, RemoteOd, SkinNetwork
 from skinnode.transport import CanPort
 
 from .conftest import Rack, eventually

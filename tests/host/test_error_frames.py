@@ -9,7 +9,7 @@ from skinnode.cli.host import faults_of
 from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Host
 from skinnode.host.accounting import discrepancies, losses_of_bus
-from skinnode.host.dealer import Dealer
+from skinnode.host.dispatcher import Dispatcher
 from skinnode.transport import Frame
 from vcan_sim.fleet import Fleet
 
@@ -32,9 +32,9 @@ WARNING, PASSIVE, ACTIVE = "00 08 00 00 00 00 60 00", "00 20 00 00 00 00 90 00",
 def test_states_of_a_controller_as_linux_tells_them(
     told: list[tuple[int, str]], controller: str | None, bus_offs: int
 ) -> None:
-    dealer = Dealer(BusConfig(name="can0", interface="socketcan", channel="can0"), {}, 0)
-    dealer.deal([Frame(can_id, bytes.fromhex(data), 0, error=True) for can_id, data in told])
-    stats = dealer.count()
+    dispatcher = Dispatcher(BusConfig(name="can0", interface="socketcan", channel="can0"), {}, 0)
+    dispatcher.dispatch([Frame(can_id, bytes.fromhex(data), 0, error=True) for can_id, data in told])
+    stats = dispatcher.count()
     assert (stats.controller, stats.bus_offs, stats.error_frames) == (controller, bus_offs, len(told))
     assert losses_of_bus(stats)["error_frames"].startswith(f"{len(told)} error frame")
 

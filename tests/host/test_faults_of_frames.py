@@ -15,9 +15,9 @@ import pytest
 
 from skinnode.config import HandConfig
 from skinnode.host import Condition, Host
-from skinnode.host.accounting import discrepancies, losses_of_lane
-from skinnode.host.facade import HostStats
-from skinnode.host.pipeline import LaneStats
+from skinnode.host.accounting import discrepancies, losses_of_stream
+from skinnode.host.host import HostStats
+from skinnode.host.patch_stream import StreamStats
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
 
@@ -36,14 +36,14 @@ class Hand:
     def __init__(self, fleet: Fleet, host: Host, tags: Tags) -> None:
         self.fleet, self.host, self.tags = fleet, host, tags
 
-    def lane(self, patch: str = "p0") -> LaneStats:
+    def stream(self, patch: str = "p0") -> StreamStats:
         return self.host.stats().patches[patch]
 
     def scans(self, more: int, patch: str = "p0") -> None:
         """Wait until this many more scans were taken by the node and let through by the host."""
-        taken, offered = self.tags.taken(patch), self.lane(patch).offered
+        taken, offered = self.tags.taken(patch), self.stream(patch).offered
         assert eventually(
-            lambda: self.tags.taken(patch) >= taken + more and self.lane(patch).offered > offered
+            lambda: self.tags.taken(patch) >= taken + more and self.stream(patch).offered > offered
         )
 
     def suffer(self, faults: Faults, scans: int = SCANS) -> Injected:
@@ -73,8 +73,8 @@ def assert_sums(stats: HostStats, fleet: Fleet, tags: Tags) -> None:
     """At the end: what was sent is what was received, what was received is what was published, and nothing
     that was published is mixed."""
     assert discrepancies(stats) == []
-    for name, lane in stats.patches.items():
-        assert lane.frames == fleet.injected(name).pdos
+    for name, stream in stats.patches.items():
+        assert stream.frames == fleet.injected(name).pdos
     assert stats.patches["p1"].assembler.scans_torn == 0  # the neighbour suffers nothing
     assert stats.patches["p1"].assembler.scans_missed == overruns(fleet, "p1")
     assert tags.mixed == []
@@ -88,7 +88,7 @@ def overruns(fleet: Fleet, patch: str) -> int:
 
 def test_lost_chunks(running: Hand) -> None:
     injected = running.suffer(Faults(lost=0.05))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.lost > 10
     assert counted.chunks_lost == injected.lost
     assert counted.scans_torn == injected.scans_spoilt
@@ -98,7 +98,7 @@ def test_lost_chunks(running: Hand) -> None:
 
 def test_duplicated_chunks(running: Hand) -> None:
     injected = running.suffer(Faults(duplicated=0.05))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.duplicated > 10
     assert counted.duplicates == injected.duplicated
     assert counted.scans_torn == counted.chunks_lost == counted.conflicts == 0
@@ -106,14 +106,14 @@ def test_duplicated_chunks(running: Hand) -> None:
 
 def test_reordered_chunks(running: Hand) -> None:
     injected = running.suffer(Faults(reordered=0.1))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.reordered > 20
     assert counted.scans_torn == counted.chunks_lost == counted.late == counted.duplicates == 0
 
 
 def test_late_chunks(running: Hand) -> None:
     injected = running.suffer(Faults(late=0.05))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.late > 10
     assert counted.late == counted.chunks_lost == injected.late
     assert counted.scans_torn == injected.scans_spoilt
@@ -121,7 +121,7 @@ def test_late_chunks(running: Hand) -> None:
 
 def test_short_and_remote_frames(running: Hand) -> None:
     injected = running.suffer(Faults(short=0.03, remote=0.03))
-    counted, bus = running.lane().assembler, running.host.stats().buses["can0"]
+    counted, bus = running.stream().assembler, running.host.stats().buses["can0"]
     assert injected.short > 5
     assert injected.remote > 5
     assert counted.bad_length == bus.malformed == injected.short
@@ -142,7 +142,7 @@ def test_heartbeats_that_are_too_long(running: Hand) -> None:
 
 def test_counters_of_scans_long_past_or_impossible(running: Hand) -> None:
     injected = running.suffer(Faults(miscounted=0.03, miscounted_by=-10))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.miscounted > 5
     assert counted.late + counted.bad_counter == counted.chunks_lost == injected.miscounted
     assert counted.scans_torn == injected.scans_spoilt
@@ -156,9 +156,9 @@ def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Ha
     for _ in range(20):  # until this machine was fast enough for the node
         skipped = overruns(running.fleet, "p0")
         running.scans(5)
-        before = running.lane().assembler
+        before = running.stream().assembler
         running.scans(5)
-        after = running.lane().assembler
+        after = running.stream().assembler
         if overruns(running.fleet, "p0") == skipped:
             break
     assert after.scans_complete >= before.scans_complete + 4
@@ -173,7 +173,7 @@ def test_any_wrong_counter_is_followed_by_the_stream_within_a_second(running: Ha
 
 def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
     injected = running.suffer(Faults(torn=0.4))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.torn > 2
     assert counted.scans_mixed == injected.torn
     assert counted.scans_missed == injected.torn + overruns(running.fleet, "p0")
@@ -183,7 +183,7 @@ def test_two_scans_under_one_counter_are_thrown_away(running: Hand) -> None:
 
 def test_lost_summaries(running: Hand) -> None:
     injected = running.suffer(Faults(summary_lost=0.4))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.summary_lost > 2
     assert counted.summaries_lost == injected.summary_lost
     assert counted.scans_unchecked == injected.summary_lost
@@ -192,7 +192,7 @@ def test_lost_summaries(running: Hand) -> None:
 
 def test_lost_syncs(running: Hand) -> None:
     injected = running.suffer(Faults(sync_lost=0.4))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.sync_lost > 2
     assert counted.scans_missed == injected.sync_lost + overruns(running.fleet, "p0")
     assert counted.scans_torn == counted.chunks_lost == 0
@@ -202,7 +202,7 @@ def test_everything_at_once(running: Hand) -> None:
     chunks = ("lost", "duplicated", "reordered", "late", "short", "remote", "miscounted")
     faults = dict.fromkeys(chunks, 0.02) | dict.fromkeys(("torn", "summary_lost", "sync_lost"), 0.06)
     injected = running.suffer(Faults(miscounted_by=-10, **faults), 2 * SCANS)
-    counted, bus = running.lane().assembler, running.host.stats().buses["can0"]
+    counted, bus = running.stream().assembler, running.host.stats().buses["can0"]
     assert min(dataclasses.asdict(injected)[fault] for fault in faults) > 0
     assert counted.bad_length == bus.malformed == injected.short
     assert bus.ignored == injected.remote
@@ -223,16 +223,16 @@ def test_everything_at_once(running: Hand) -> None:
 
 def test_codes_changed_after_they_were_packed(running: Hand) -> None:
     injected = running.suffer(Faults(corrupted=0.02))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.corrupted > 5
     assert counted.scans_corrupt == injected.scans_spoilt
     assert counted.scans_torn == counted.chunks_lost == counted.conflicts == counted.scans_unchecked == 0
-    assert losses_of_lane(running.lane())["scans_corrupt"].endswith("discarded by their check")
+    assert losses_of_stream(running.stream())["scans_corrupt"].endswith("discarded by their check")
 
 
 def test_chunks_with_the_counter_of_the_next_scan_that_loses_its_own(running: Hand) -> None:
     injected = running.suffer(Faults(displaced=0.4))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.displaced > 2
     assert counted.scans_corrupt == injected.displaced
     assert counted.scans_mixed == counted.conflicts == 0
@@ -240,7 +240,7 @@ def test_chunks_with_the_counter_of_the_next_scan_that_loses_its_own(running: Ha
 
 def test_summaries_that_claim_that_the_rest_is_unchanged(running: Hand) -> None:
     injected = running.suffer(Faults(understated=0.4))
-    counted = running.lane().assembler
+    counted = running.stream().assembler
     assert injected.understated > 2
     # After one that is thrown away nothing is known of chunks that are not sent: the next cannot be checked.
     assert counted.scans_corrupt + counted.scans_unchecked == injected.understated
@@ -250,7 +250,7 @@ def test_summaries_that_claim_that_the_rest_is_unchanged(running: Hand) -> None:
 
 def test_summaries_without_the_check_that_the_node_sends(running: Hand) -> None:
     injected = running.suffer(Faults(unchecked=0.4))
-    counted, bus = running.lane().assembler, running.host.stats().buses["can0"]
+    counted, bus = running.stream().assembler, running.host.stats().buses["can0"]
     assert injected.unchecked > 2
     assert counted.bad_form == counted.scans_unchecked == counted.summaries_lost == injected.unchecked
     assert bus.malformed == injected.unchecked

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 import pytest
 
 from skinnode.config import HandConfig
-from skinnode.host import Condition, Host, bringup
+from skinnode.host import Condition, Host, nmt_master
 from skinnode.host.accounting import discrepancies
 from skinnode.host.events import EventSubscription, HealthEvent
 from skinnode.transport import CanPort
@@ -76,8 +76,8 @@ def running(make_hand: Callable[..., HandConfig], monkeypatch: pytest.MonkeyPatc
             assert host.health("p1").rejoins == 0
         stats = host.stats()
         assert discrepancies(stats) == []
-        for name, lane in stats.patches.items():
-            assert lane.frames == fleet.injected(name).pdos
+        for name, stream in stats.patches.items():
+            assert stream.frames == fleet.injected(name).pdos
         assert tags.mixed == []
 
 
@@ -273,11 +273,11 @@ def test_host_that_dies_is_followed_by_another(
     with Fleet(hand) as fleet:
         with monkeypatch.context() as dying, Host.from_config(hand) as host:
             assert Hand(fleet, host).well_again()
-            dying.setattr(bringup, "stand_by", lambda send, node_id: None)
+            dying.setattr(nmt_master, "stand_by", lambda send, node_id: None)
         assert {int(report.nmt_state) for report in fleet.report()} == {5}
         with Host.from_config(hand) as host:
             assert Hand(fleet, host).well_again()
-            assert all(lane.assembler.scans_torn == 0 for lane in host.stats().patches.values())
+            assert all(stream.assembler.scans_torn == 0 for stream in host.stats().patches.values())
         assert discrepancies(host.stats()) == []
 
 

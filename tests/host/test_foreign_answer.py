@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skinnode.errors import NodeError
-from skinnode.host.network import RemoteOd, SkinNetwork
+from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 
 
 def test_answer_for_another_object_names_who_may_have_caused_it() -> None:

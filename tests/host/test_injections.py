@@ -40,7 +40,7 @@ REACHED_S: Final = 3.0
 
 GUARDS: Final = {
     "containment.": "the guard itself",
-    "pipeline.Lane._leave": "gives the lane's token back by one deque.append: the last line of its guard",
+    "patch_stream.PatchStream._leave": "gives the token back by one deque.append: the last line of its guard",
     "mainline.Mainline.__init__.<locals>.<lambda>": "reports what the receiver met: part of its guard",
     "tap.ContainedTap": "the guard of a tap; what the tap itself calls is injected",
 }

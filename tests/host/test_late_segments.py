@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import pytest
 
 from skinnode.errors import NodeTimeout
-from skinnode.host.network import RemoteOd, SkinNetwork
+from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 
 DATA = bytes(range(1, 61))  # nine segments, three bytes of the last unused
 

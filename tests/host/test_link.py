@@ -15,7 +15,7 @@ from skinnode.config import BusConfig, HandConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SdoAbort, SkinError
 from skinnode.host import containment
 from skinnode.host.containment import Defects
-from skinnode.host.dealer import Dealer
+from skinnode.host.dispatcher import Dispatcher
 from skinnode.host.link import BusLink
 from skinnode.host.mainline import Mainline
 from skinnode.transport import CanPort, Frame
@@ -98,27 +98,29 @@ def test_a_batch_and_the_pollers_go_on_after_a_defect() -> None:
     """Each owner hears of its own defect; every other frame and poller of the turn is served."""
     palm, thumb, contained, served = Defects("palm"), Defects("thumb"), [], []
 
-    class Containing(Dealer):
+    class Containing(Dispatcher):
         def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
             contained.append((owner, doing, str(error)))
 
     def broken(*_: object) -> None:
         raise RuntimeError("broken")
 
-    dealer = Containing(BusConfig(name="can0", channel="batch"), {}, 0)
-    dealer.handle(0x185, broken, palm)
-    dealer.handle(0x186, lambda data, t_ns: served.append(data), thumb)
-    dealer.poll_with(broken, palm)
-    dealer.poll_with(served.append, thumb)
-    dealer.deal([Frame(can_id, bytes([i]), i + 1) for i, can_id in enumerate((0x185, 0x186, 0x185, 0x186))])
-    dealer.poll(5_000_000)
+    dispatcher = Containing(BusConfig(name="can0", channel="batch"), {}, 0)
+    dispatcher.handle(0x185, broken, palm)
+    dispatcher.handle(0x186, lambda data, t_ns: served.append(data), thumb)
+    dispatcher.poll_with(broken, palm)
+    dispatcher.poll_with(served.append, thumb)
+    dispatcher.dispatch(
+        [Frame(can_id, bytes([i]), i + 1) for i, can_id in enumerate((0x185, 0x186, 0x185, 0x186))]
+    )
+    dispatcher.poll(5_000_000)
     assert served == [b"\x01", b"\x03", 5_000_000]
     assert contained == [
         (palm, "frame 0x185", "broken"),
         (palm, "frame 0x185", "broken"),
         (palm, "polling", "broken"),
     ]
-    assert dealer.count().received == 4
+    assert dispatcher.count().received == 4
 
 
 def test_a_listener_that_raises_costs_no_frame(hand: HandConfig, listener: CanPort) -> None:
@@ -140,12 +142,12 @@ def test_a_listener_that_raises_costs_no_frame(hand: HandConfig, listener: CanPo
 
 def test_pollers_are_told_the_time_every_two_milliseconds_at_most() -> None:
     told: list[int] = []
-    dealer = Dealer(BusConfig(name="can0", channel="polls"), {}, 0)
-    dealer.poll_with(told.append)
+    dispatcher = Dispatcher(BusConfig(name="can0", channel="polls"), {}, 0)
+    dispatcher.poll_with(told.append)
     for t_us in (5000, 5000, 5001, 6999, 7000, 8999, 12_000):
-        dealer.poll(1000 * t_us)
+        dispatcher.poll(1000 * t_us)
     assert told == [5_000_000, 7_000_000, 12_000_000]
-    dealer.poll(11_999_000)  # time went back: nobody waits until it has caught up
+    dispatcher.poll(11_999_000)  # time went back: nobody waits until it has caught up
     assert told[3:] == [11_999_000]
 
 
@@ -164,7 +166,7 @@ def test_a_load_that_cannot_be_measured_is_tried_again_ever_more_seldom(
         monkeypatch.setattr(link, "measure", broken)
         for turn in range(4000):
             now_s[0] = 100.0 + turn / 1000
-            link.t_dealt_ns = round(now_s[0] * 1e9)
+            link.t_dispatched_ns = round(now_s[0] * 1e9)
             link.measure_load()
     assert link.defects.newest == "measuring the load: ZeroDivisionError: of ours"
     pauses = [later - earlier for earlier, later in itertools.pairwise(due_s)]
@@ -267,9 +269,9 @@ def test_the_time_up_to_which_frames_were_dealt_out_never_goes_back(hand: HandCo
     told: list[int] = []
     with BusLink(hand.buses[0], {}, fail) as link:
         link.poll_with(told.append)
-        link.t_dealt_ns = link.intake.seen_ns + 1_000_000_000
+        link.t_dispatched_ns = link.intake.seen_ns + 1_000_000_000
         link.turn()
-        assert (link.t_dealt_ns, told) == (link.intake.seen_ns + 1_000_000_000, [])
+        assert (link.t_dispatched_ns, told) == (link.intake.seen_ns + 1_000_000_000, [])
 
 
 def test_whoever_asks_is_answered_as_soon_as_if_no_scan_were_expected(hand: HandConfig) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress, LssCommand
-from skinnode.host.lss import ANSWER_S, LssFailed, LssMaster
+from skinnode.host.lss_master import ANSWER_S, LssFailed, LssMaster
 from skinnode.node.lss import LssSlave
 
 LATE_S = 1.5 * ANSWER_S

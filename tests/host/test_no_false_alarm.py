@@ -30,7 +30,9 @@ def test_no_alarm_of_a_healthy_stream(
     )
     with Fleet(hand), Host.from_config(hand) as host:
         events = host.events()
-        assert eventually(lambda: min(lane.solved for lane in host.stats().patches.values()) > SCANS, 20.0)
+        assert eventually(
+            lambda: min(stream.solved for stream in host.stats().patches.values()) > SCANS, 20.0
+        )
         told = []
         while (event := events.get(0.0)) is not None:
             told.append(event)

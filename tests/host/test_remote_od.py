@@ -9,7 +9,7 @@ from canopen.sdo.client import SdoClient
 
 from skinnode.errors import BusError, NodeError, NodeTimeout, SdoAbort
 from skinnode.host import sdo_streams
-from skinnode.host.network import ATTEMPTS, RemoteOd, SkinNetwork
+from skinnode.host.sdo_client import ATTEMPTS, RemoteOd, SkinNetwork
 
 NO_OBJECT = 0x0602_0000
 
@@ -150,8 +150,8 @@ def test_a_node_that_refuses_is_not_asked_again(server: Server, code: int) -> No
 
 def test_only_what_differs_is_written(server: Server) -> None:
     """Each write to a node of another master's may be one too many."""
-    server.remote.ensure(0x1017, 0, "u16", 250)
+    server.remote.write_if_different(0x1017, 0, "u16", 250)
     assert server.written == []
-    server.remote.ensure(0x1017, 0, "u16", 100)
+    server.remote.write_if_different(0x1017, 0, "u16", 100)
     assert server.written == [(0x1017, 0)]
     assert server.remote.read(0x1017, 0, "u16") == 100

@@ -1,4 +1,4 @@
-"""The host as master and as guest of a robot's own master; rivals; patches found by their serial number."""
+"""The host as master, and beside another master; frames of other masters; patches found by serial number."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_guest_that_sends_nothing_learns_by_the_flag_who_sends_checks(
     rack.plug("p1", lets_through=lets_through, profile=old)
 
     def published(host: Host) -> dict[str, tuple[int, int]]:
-        assemblers = {name: lane.assembler for name, lane in host.stats().patches.items()}
+        assemblers = {name: stream.assembler for name, stream in host.stats().patches.items()}
         return {name: (each.scans_complete, each.scans_unchecked) for name, each in assemblers.items()}
 
     with robot(listener, hand), Host.from_config(hand) as host:
@@ -140,7 +140,7 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
                 assert eventually(functools.partial(all_operational, host))
                 assert faults_of(host) == []
             assert discrepancies(host.stats()) == []
-            joined += sum(lane.assembler.scans_joined for lane in host.stats().patches.values())
+            joined += sum(stream.assembler.scans_joined for stream in host.stats().patches.values())
     assert joined > 0
 
 
@@ -247,7 +247,7 @@ def test_coordinates_come_from_the_node(hand: HandConfig, rack_of: Callable[[Han
         rack.plug(name, layout=real)
     with Host.from_config(changed(hand, patch={"layout": {**SMALL, "coordinates": "node"}})) as host:
         take(host.fields(timeout_s=10, patch="p0"), 2)
-        layout = host._stations["p0"].facts.layout
+        layout = host._nodes["p0"].facts.layout
     assert layout.layout_hash == real.layout_hash
     np.testing.assert_allclose(layout.upper_m, real.upper_m, atol=1e-9)
 
@@ -260,9 +260,9 @@ def test_a_second_master_is_named(
         for counter in (1, 2, 3):
             listener.send(0x080, bytes([counter]))
         listener.send(0x605, bytes.fromhex("40 00 10 00 00 00 00 00"))
-        assert eventually(lambda: host.stats().rivals["can0"].sdo_requests == 1)
-        rivals = host.stats().rivals["can0"]
-        assert (rivals.syncs, rivals.nmt_commands, rivals.heartbeats) == (3, 0, 0)
+        assert eventually(lambda: host.stats().other_masters["can0"].sdo_requests == 1)
+        other_masters = host.stats().other_masters["can0"]
+        assert (other_masters.syncs, other_masters.nmt_commands, other_masters.heartbeats) == (3, 0, 0)
     assert [record.getMessage() for record in caplog.records] == [
         "can0: somebody else sends SYNC: a second host or master?",
         "can0: somebody else sends SDO requests to our nodes: a second host or master?",
@@ -276,8 +276,8 @@ def test_nodes_fall_silent_when_a_master_with_a_heartbeat_is_killed(
     with Host.from_config(hand) as host:
         take(host.fields(timeout_s=10), 8)
         assert eventually(lambda: any(f == (0x764, b"\x05") for f in ((x[0], x[1]) for x in heard(listener))))
-        for station in host._stations.values():  # as if killed: nobody puts the nodes on stand-by
-            station.monitor.running = False
+        for node in host._nodes.values():  # as if killed: nobody puts the nodes on stand-by
+            node.monitor.running = False
         assert {node.nmt_state for node in rack.nodes.values()} == {NmtState.OPERATIONAL}
     assert eventually(lambda: {n.nmt_state for n in rack.nodes.values()} == {NmtState.PRE_OPERATIONAL})
     with Host.from_config(hand) as host:

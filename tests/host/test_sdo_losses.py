@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 from skinnode.errors import NodeError
 from skinnode.host import sdo_streams
-from skinnode.host.network import RemoteOd, SkinNetwork
+from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.sdo.server import SdoServer
@@ -107,7 +107,7 @@ def segmented_write(line: Line) -> None:
 
 
 def write(line: Line) -> None:
-    line.remote.configure(NUMBER, 0, "u16", 250)
+    line.remote.write_checked(NUMBER, 0, "u16", 250)
 
 
 TRANSFERS = [block_read, segmented_read, read, block_write, segmented_write, write]

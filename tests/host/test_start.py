@@ -10,8 +10,8 @@ import pytest
 from skinnode.config import BringUpConfig, HandConfig, Missing
 from skinnode.errors import NodeError, NodeTimeout
 from skinnode.host import Host, start
-from skinnode.host.pipeline import Solver
-from skinnode.host.station import Station
+from skinnode.host.patch_stream import Solver
+from skinnode.host.remote_node import RemoteNode
 
 from .conftest import Rack, eventually
 
@@ -21,8 +21,8 @@ class Node:
 
     def __init__(self, naps: int) -> None:
         self.naps = naps
-        self.is_guest, self.patch = False, SimpleNamespace(name="thumb", bus="can0", node_id=5)
-        self.lane, self.monitor = SimpleNamespace(withholdings=0), self
+        self.has_other_master, self.patch = False, SimpleNamespace(name="thumb", bus="can0", node_id=5)
+        self.stream, self.monitor = SimpleNamespace(withholdings=0), self
         self.nmt_state = 127
         self.sent: list[tuple[int, bytes]] = []
         self.link = SimpleNamespace(send=lambda can_id, data: self.sent.append((can_id, data)))
@@ -57,15 +57,15 @@ def test_a_defect_at_every_bring_up_of_a_node_ends_the_start_unless_nodes_may_be
     hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch, missing: Missing
 ) -> None:
     """Nobody is handed a hand that lacks a patch without having said that it may."""
-    bring_up, tried = Station.bring_up, list[str]()
+    configure, tried = RemoteNode.configure, list[str]()
 
-    def broken(station: Station, *args: Any, **options: Any) -> Solver:
-        if station.patch.name == "p0" and len(tried) < 3:
-            tried.append(station.patch.name)
+    def broken(node: RemoteNode, *args: Any, **options: Any) -> Solver:
+        if node.patch.name == "p0" and len(tried) < 3:
+            tried.append(node.patch.name)
             raise ZeroDivisionError("of ours")
-        return bring_up(station, *args, **options)
+        return configure(node, *args, **options)
 
-    monkeypatch.setattr(Station, "bring_up", broken)
+    monkeypatch.setattr(RemoteNode, "configure", broken)
     hand = hand.model_copy(update={"bring_up": BringUpConfig(missing=missing)})
     if missing == "refuse":
         complaint = "node 5: patch 'p0' on can0: bring-up: ZeroDivisionError: of ours"

@@ -56,12 +56,12 @@ def test_every_scan_from_the_first_on_every_patch(hand: HandConfig, fleet: Fleet
         for patch in ("p0", "p1"):
             assert numbers[patch] == list(range(numbers[patch][0], numbers[patch][-1] + 1))
         stats = host.stats()
-    for lane in stats.patches.values():
-        assembler = lane.assembler
-        assert lane.skipped == 0
+    for stream in stats.patches.values():
+        assembler = stream.assembler
+        assert stream.skipped == 0
         assert assembler.scans_torn == assembler.scans_missed == assembler.chunks_lost == 0
         assert assembler.late == assembler.duplicates == assembler.resyncs == 0
-        assert assembler.scans_complete == lane.offered
+        assert assembler.scans_complete == stream.offered
     assert (stats.buses["can0"].dropped, stats.buses["can0"].foreign) == (0, 0)
 
 
@@ -273,10 +273,10 @@ def test_fields_over_can_fd_are_those_of_a_classic_bus(code_bits: int) -> None:
         host = stack.enter_context(Host.from_config(hand))
         fields = take(host.fields(timeout_s=10), 12)
         stats = host.stats()
-    assert {lane.assembler.scans_torn for lane in stats.patches.values()} == {0}
+    assert {stream.assembler.scans_torn for stream in stats.patches.values()} == {0}
     for name, chunks in (("on classic", -(-128 // (3 if code_bits == 16 else 2))), ("on fd", 8)):
-        lane = stats.patches[name].assembler
-        assert 0 <= lane.chunks_accepted - chunks * lane.scans_complete <= chunks  # a scan may be open
+        stream = stats.patches[name].assembler
+        assert 0 <= stream.chunks_accepted - chunks * stream.scans_complete <= chunks  # a scan may be open
     assert stats.buses["fd"].load > 0
     by_bus = {name: [f for f in fields if stamp(f).patch == f"on {name}"] for name in ("classic", "fd")}
     for classic, fd in zip(*(by_bus[name] for name in ("classic", "fd")), strict=False):
@@ -304,8 +304,8 @@ def test_simulated_hand_over_can_fd(make_hand: Callable[..., HandConfig]) -> Non
         fields = take(host.fields(timeout_s=10), 30)
         stats = host.stats()
     assert {stamp(field).patch for field in fields} == {"p0", "p1"}
-    for lane in stats.patches.values():
-        assert (lane.assembler.scans_torn, lane.assembler.bad_length) == (0, 0)
+    for stream in stats.patches.values():
+        assert (stream.assembler.scans_torn, stream.assembler.bad_length) == (0, 0)
     assert stats.buses["can0"].ignored == 0
 
 

@@ -153,7 +153,7 @@ def test_a_callback_that_raises_or_blocks_loses_its_own_data_only(
         assert eventually(lambda: bad.failed >= 10 and slow.dropped >= 10)
         take(fields, 20)
         assert (fields.dropped, bad.dropped, slow.failed) == (0, 0, 0)
-        assert sum(lane.skipped for lane in host.stats().patches.values()) == 0
+        assert sum(stream.skipped for stream in host.stats().patches.values()) == 0
         go.set()
     assert [record.getMessage() for record in caplog.records] == [f"callback {broken.__qualname__} raised"]
     assert caplog.records[0].exc_info is not None

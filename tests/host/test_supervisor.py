@@ -90,7 +90,7 @@ def test_a_node_that_somebody_resets_or_stops_runs_again(
         take(host.fields(timeout_s=10, patch="p1"), 4)
         assert host.health("p1").boot_ups == boot_ups + booted
         assert host.stats().nodes["p0"].rejoins == 0
-        assert host.stats().rivals["can0"].nmt_commands == 1
+        assert host.stats().other_masters["can0"].nmt_commands == 1
 
 
 def test_a_node_whose_boot_up_nobody_heard_is_found_by_asking(hand: HandConfig, rack: Rack) -> None:
@@ -192,7 +192,7 @@ def test_a_tare_is_followed_and_no_scan_is_decoded_with_the_wrong_baseline(
         assert stats.patches["p1"].withheld >= 1
         assert stats.patches["p0"].withheld == 0
         assert stats.nodes["p1"].rejoins == 0
-        assert stats.rivals["can0"].sdo_requests == 1
+        assert stats.other_masters["can0"].sdo_requests == 1
 
 
 @pytest.mark.real_time

@@ -13,7 +13,7 @@ import pytest
 from skinnode.config import HandConfig
 from skinnode.errors import NodeError, NodeTimeout
 from skinnode.host import Host
-from skinnode.host.bringup import Bringer
+from skinnode.host.configurator import Configurator
 from skinnode.record import Recorder
 from skinnode.transport import CanPort
 
@@ -116,7 +116,7 @@ def test_a_tare_returns_when_the_new_baseline_is_in_use(hand: HandConfig, rack: 
 def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
     hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read, calls = Bringer._settle_baseline, []
+    read, calls = Configurator._settle_baseline, []
 
     def fails_once(*arguments: Any) -> Any:
         calls.append(arguments)
@@ -125,7 +125,7 @@ def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
         return read(*arguments)
 
     with Host.from_config(hand) as host:
-        monkeypatch.setattr(Bringer, "_settle_baseline", fails_once)
+        monkeypatch.setattr(Configurator, "_settle_baseline", fails_once)
         host.tare("p0")  # the patch is faulty meanwhile, and brought up again
         assert len(calls) == 2
         assert host.health("p0").baselines == 1

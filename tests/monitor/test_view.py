@@ -229,7 +229,7 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
             time.sleep(0.05)
             view = history.add(source.snapshot())
             patch = view.patch("p0")
-            if patch.level == "bad" and patch.lane.assembler.chunks_lost:
+            if patch.level == "bad" and patch.stream.assembler.chunks_lost:
                 break
         lines = screen(view, ui, [], 1e-4, look, 120, 40)
     assert "nothing happened" in well
@@ -265,6 +265,6 @@ def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> N
         view = history.add(source.snapshot())
         assert source.over
         assert not source.live
-    assert view.patch("p0").lane.solved >= live
+    assert view.patch("p0").stream.solved >= live
     assert view.patch("p0").surface is not None
     assert faults.lines == []

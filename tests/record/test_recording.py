@@ -136,7 +136,7 @@ def test_the_wall_clock_jumps_while_it_is_recorded(tmp_path: Path, jump_s: int) 
         time.clock_settime(time.CLOCK_REALTIME, time.time() + jump_s)
         try:
             run.take(15)
-            torn = [lane.assembler.scans_torn for lane in run.host.stats().patches.values()]
+            torn = [stream.assembler.scans_torn for stream in run.host.stats().patches.values()]
         finally:
             time.clock_settime(time.CLOCK_REALTIME, time.time() - jump_s)
         run.take(5)

@@ -13,7 +13,7 @@ import pytest
 from skinnode.canopen import indices as od
 from skinnode.config import BusConfig
 from skinnode.errors import SdoAbort
-from skinnode.host.network import RemoteOd
+from skinnode.host.sdo_client import RemoteOd
 from skinnode.node import PatchNode
 from skinnode.protocol.profile import PatchProfile
 from skinnode.technician import survey

@@ -94,6 +94,6 @@ def test_a_host_that_runs_reads_the_new_baseline_and_goes_on(
     assert (stats.nodes["thumb"].baselines, stats.nodes["index"].baselines) == (1, 0)
     assert {node.complaint for node in stats.nodes.values()} == {None}
     assert {node.rejoins for node in stats.nodes.values()} == {0}
-    for name, lane in stats.patches.items():
+    for name, stream in stats.patches.items():
         assert host.health(name).condition == "operational"
-        assert (lane.assembler.chunks_lost, lane.assembler.scans_torn) == (0, 0)
+        assert (stream.assembler.chunks_lost, stream.assembler.scans_torn) == (0, 0)

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,23 +17,24 @@ from skinnode.bus_load.stuffing import load_kernels
 from skinnode.canopen import indices as od
 from skinnode.config import BusConfig, HandConfig, PatchConfig, load_hand
 from skinnode.errors import BusError, CodecError
-from skinnode.host import bringup
+from skinnode.host import nmt_master
 from skinnode.host.callback import Callbacks, FieldCallback
+from skinnode.host.configurator import BOOT_DEADLINE_S
 from skinnode.host.containment import Defects, DefectStats
-from skinnode.host.dealer import BusStats
+from skinnode.host.dispatcher import BusStats
 from skinnode.host.events import CAPACITY_EVENTS, Events, EventSubscription, HealthWatch
 from skinnode.host.hand_files import check_files
 from skinnode.host.hand_frame import HandGatherer, HandSubscription
 from skinnode.host.health import SYNCS_MISSED, BusHealth, PatchHealth
 from skinnode.host.link import BusLink
-from skinnode.host.lss import LssMaster
+from skinnode.host.lss_master import LssMaster
 from skinnode.host.mainline import Mainline
-from skinnode.host.pipeline import Lane, LaneStats, check_solvable
+from skinnode.host.other_masters import OtherMasters, OtherMasterStats
+from skinnode.host.patch_stream import PatchStream, StreamStats, check_solvable
 from skinnode.host.publish import Publisher, Subscription
 from skinnode.host.reception import receive_bus, receive_patch
-from skinnode.host.rivals import Rivals, RivalStats
-from skinnode.host.start import bring_up_all, go_on_unless, start_all
-from skinnode.host.station import Station
+from skinnode.host.remote_node import RemoteNode
+from skinnode.host.start import configure_all, go_on_unless, start_all
 from skinnode.host.supervised import NodeStats
 from skinnode.host.supervisor import Supervisor
 from skinnode.host.sync import SyncFollower, SyncProducer, SyncStats, Ticks
@@ -55,16 +57,26 @@ class HostStats:
     """Counters of a running host, at one instant."""
 
     buses: Mapping[str, BusStats]
-    patches: Mapping[str, LaneStats]
+    patches: Mapping[str, StreamStats]
     nodes: Mapping[str, NodeStats]
     """By patch."""
-    rivals: Mapping[str, RivalStats]
+    other_masters: Mapping[str, OtherMasterStats]
     """By bus: what other masters send there."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
     """The first frame of wrong length on each bus that had one."""
     defects: Mapping[str, DefectStats]
     """Exceptions that the host contained, by patch and by bus; under ``host`` those of neither."""
+
+    @property
+    def rivals(self) -> Mapping[str, OtherMasterStats]:
+        """Old name of :attr:`other_masters`, for one version."""
+        warnings.warn(
+            "HostStats.rivals is HostStats.other_masters now; the old name goes in version 0.2",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return self.other_masters
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +85,7 @@ class _Bus:
 
     link: BusLink
     ticks: Ticks
-    rivals: Rivals
+    other_masters: OtherMasters
     follower: SyncFollower
     lss: LssMaster
 
@@ -98,7 +110,7 @@ class Host:
         self,
         hand: HandConfig,
         buses: Mapping[str, _Bus],
-        stations: Sequence[Station],
+        nodes: Sequence[RemoteNode],
         sync: SyncProducer | None,
         supervisor: Supervisor,
         publisher: Publisher,
@@ -109,7 +121,7 @@ class Host:
         self.hand, self._defects = hand, defects
         self._callbacks, self._events = callbacks, events
         self._buses = buses
-        self._stations = {station.patch.name: station for station in stations}
+        self._nodes = {node.patch.name: node for node in nodes}
         self._sync, self._supervisor, self._publisher = sync, supervisor, publisher
         self._t_up_ns = time.monotonic_ns()
 
@@ -121,7 +133,7 @@ class Host:
         *,
         interface: str | None = None,
         channel: str | None = None,
-        boot_deadline_s: float = bringup.BOOT_DEADLINE_S,
+        boot_deadline_s: float = BOOT_DEADLINE_S,
         cancelled: Callable[[], bool] = _never,
         tap: HostTap | None = None,
     ) -> Iterator[Host]:
@@ -146,7 +158,7 @@ class Host:
         *,
         interface: str | None = None,
         channel: str | None = None,
-        boot_deadline_s: float = bringup.BOOT_DEADLINE_S,
+        boot_deadline_s: float = BOOT_DEADLINE_S,
         cancelled: Callable[[], bool] = _never,
         tap: HostTap | None = None,
         open_port: Callable[[BusConfig], CanPort] = CanPort,
@@ -189,27 +201,29 @@ class Host:
                 if hand.patches_on(bus.name)
             }
             workers = stack.enter_context(_workers(hand, defects))
-            stations = [_station(patch, hand, buses[patch.bus], workers, publisher) for patch in hand.patches]
+            nodes = [
+                _remote_node(patch, hand, buses[patch.bus], workers, publisher) for patch in hand.patches
+            ]
             if tap is not None:
                 tap = ContainedTap(tap, defects)
                 for bus in buses.values():
                     tap_link(tap, bus.link)
-                for station in stations:
-                    station.lane.tap = tap
+                for node in nodes:
+                    node.stream.tap = tap
             # Undone in this order from below: SYNC stops, the scans under way end, nobody is brought up any
             # more, nodes fall silent, the mainline ends, boxes are emptied, workers end, interfaces close,
             # subscribers hear the end.
-            for station in stations:
-                stack.callback(station.lane.close)
+            for node in nodes:
+                stack.callback(node.stream.close)
             # Everybody knows by now what to do with what comes.
             stack.enter_context(Mainline([bus.link for bus in buses.values()], defects))
             for patch in hand.patches:
                 go_on_unless(cancelled)
                 check_solvable(patch, hand.solver)
             try:
-                ready = bring_up_all(stations, hand.bring_up.missing, boot_deadline_s, cancelled)
-                for station in stations:
-                    stack.callback(_stand_by, station)
+                ready = configure_all(nodes, hand.bring_up.missing, boot_deadline_s, cancelled)
+                for node in nodes:
+                    stack.callback(_stand_by, node)
                 start_all(ready)
             except BusError:
                 for bus in buses.values():
@@ -217,19 +231,21 @@ class Host:
                         raise bus.link.failure from bus.link.failure.__cause__
                 raise
             supervisor = stack.enter_context(
-                Supervisor(stations, list(ready), hand.bring_up.heartbeat_s, defects)
+                Supervisor(nodes, list(ready), hand.bring_up.heartbeat_s, defects)
             )
             own = [bus for bus in buses.values() if bus.link.config.role == "master"]
             sync: SyncProducer | None = None
             if own:
-                lanes = [(each.lane, buses[each.patch.bus].ticks) for each in stations if not each.is_guest]
-                stack.callback(_let_scans_end, lanes, hand.sync.period_s)
+                streams = [
+                    (each.stream, buses[each.patch.bus].ticks) for each in nodes if not each.has_other_master
+                ]
+                stack.callback(_let_scans_end, streams, hand.sync.period_s)
                 senders = [(bus.link.send, bus.ticks) for bus in own]
                 of_buses = [bus.link.defects for bus in own]
                 sync = SyncProducer(senders, hand.sync.period_s, hand.sync.stagger_s, of_buses)
                 stack.enter_context(sync)
             events = Events(defects)
-            host = cls(hand, buses, stations, sync, supervisor, publisher, callbacks, events, defects)
+            host = cls(hand, buses, nodes, sync, supervisor, publisher, callbacks, events, defects)
             stack.callback(events.end)
             watch = HealthWatch(host._all_health, host._all_bus_health, events, defects, host._all_defects)
             stack.enter_context(watch)
@@ -279,18 +295,18 @@ class Host:
 
     def health(self, patch: str) -> PatchHealth:
         """How a patch is. Raises KeyError for no such patch."""
-        station = self._stations[patch]
-        return station.monitor.health(
+        node = self._nodes[patch]
+        return node.monitor.health(
             time.monotonic_ns(),
-            station.heartbeat_s,
+            node.heartbeat_s,
             self.hand.sync.period_s,
-            station.lane.stats().assembler.conflicts,
-            station.lane.t_passed_ns,
+            node.stream.stats().assembler.conflicts,
+            node.stream.t_passed_ns,
         )
 
     def bus_health(self, bus: str) -> BusHealth:
         """How a bus is. Raises KeyError for no such bus, and for one without patches."""
-        link, rivals = self._buses[bus].link, self._buses[bus].rivals.stats()
+        link, other_masters = self._buses[bus].link, self._buses[bus].other_masters.stats()
         stats, failure = link.stats(), link.failure
         return BusHealth(
             bus=bus,
@@ -304,22 +320,22 @@ class Host:
             malformed=stats.malformed,
             foreign=stats.foreign,
             foreign_ids=tuple(sorted(stats.foreign_ids)),
-            other_syncs=rivals.syncs,
-            other_masters=rivals.nmt_commands + rivals.sdo_requests + rivals.heartbeats,
+            other_syncs=other_masters.syncs,
+            other_masters=other_masters.nmt_commands + other_masters.sdo_requests + other_masters.heartbeats,
             controller=stats.controller,
             no_sync=self._lacks_sync(self._buses[bus]),
         )
 
     def _lacks_sync(self, bus: _Bus) -> bool:
-        """Of a bus of guests. By the time that was dealt out: nothing is late because we are. Where patches
+        """Of a bus of guests. By the time that was dispatched: nothing is late because we are. Where patches
         scan by their own clocks, nobody needs one."""
         if bus.link.config.role == "master" or bus.link.failure is not None:
             return False
         since_ns = max(self._t_up_ns, bus.follower.t_newest_ns)
-        if bus.link.t_dealt_ns - since_ns < SYNCS_MISSED * self.hand.sync.period_ms * 1_000_000:
+        if bus.link.t_dispatched_ns - since_ns < SYNCS_MISSED * self.hand.sync.period_ms * 1_000_000:
             return False
-        lanes = [station.lane for station in self._stations.values() if station.link is bus.link]
-        return bool(self.hand.sync.counter_overflow) or not any(lane.stats().offered for lane in lanes)
+        streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
+        return bool(self.hand.sync.counter_overflow) or not any(stream.stats().offered for stream in streams)
 
     def events(self, *, capacity: int = CAPACITY_EVENTS) -> EventSubscription:
         """What happens to the health of patches, wires and buses from now until the host closes."""
@@ -333,14 +349,14 @@ class Host:
             raise ValueError(f"SYNC producers: got {producers}, must be one that all patches follow")
 
     def _all_health(self) -> dict[str, PatchHealth]:
-        return {patch: self.health(patch) for patch in self._stations}
+        return {patch: self.health(patch) for patch in self._nodes}
 
     def _all_bus_health(self) -> dict[str, BusHealth]:
         return {bus: self.bus_health(bus) for bus in self._buses}
 
     def _all_defects(self) -> dict[str, DefectStats]:
         of_buses = [bus.link.defects for bus in self._buses.values()]
-        of_patches = [station.defects for station in self._stations.values()]
+        of_patches = [node.defects for node in self._nodes.values()]
         return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
@@ -348,8 +364,8 @@ class Host:
         One at a time."""
         ends, tap = [], ContainedTap(tap, self._defects)
         for bus in self._buses.values():
-            lanes = [station.lane for station in self._stations.values() if station.link is bus.link]
-            ends.append(tap_bus(tap, bus.link, lanes))
+            streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
+            ends.append(tap_bus(tap, bus.link, streams))
 
         def untap() -> None:
             for end in ends:
@@ -368,11 +384,11 @@ class Host:
         keeps its baseline, or if the node is not operational; NodeTimeout if no new baseline came in time;
         BusError if the command cannot be sent.
         """
-        station = self._stations[patch]
+        node = self._nodes[patch]
         if deadline_s is None:
             deadline_s = TARE_DEADLINE_S + TARE_DEADLINE_SYNCS * self.hand.sync.period_s
         tare(
-            station,
+            node,
             lambda: self._supervisor.stats()[patch].baselines,
             lambda: self.health(patch),
             deadline_s,
@@ -386,9 +402,9 @@ class Host:
         rejected = (bus.link.first_malformed for bus in buses.values())
         return HostStats(
             buses={name: bus.link.stats() for name, bus in buses.items()},
-            patches={name: station.lane.stats() for name, station in self._stations.items()},
+            patches={name: node.stream.stats() for name, node in self._nodes.items()},
             nodes=self._supervisor.stats(),
-            rivals={name: bus.rivals.stats() for name, bus in buses.items()},
+            other_masters={name: bus.other_masters.stats() for name, bus in buses.items()},
             sync=replace(
                 sync,
                 received=sum(follower.received for follower in followers),
@@ -404,38 +420,38 @@ def _workers(hand: HandConfig, defects: Defects) -> Workers:
     return Workers(min(count, len(hand.patches)), "solve", defects)
 
 
-def _station(
+def _remote_node(
     patch: PatchConfig, hand: HandConfig, bus: _Bus, workers: Workers, publisher: Publisher
-) -> Station:
+) -> RemoteNode:
     defects = Defects(patch.name)
     reception = receive_patch(patch, hand, bus.link, bus.ticks, workers, publisher, defects)
-    return Station(patch, hand, bus.link, reception, bus.lss, defects)
+    return RemoteNode(patch, hand, bus.link, reception, bus.lss, defects)
 
 
 def _serve_bus(hand: HandConfig, link: BusLink, ticks: Ticks) -> _Bus:
     heard, lss = receive_bus(hand, link, ticks), LssMaster(link.send)
     link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)
-    return _Bus(link, ticks, heard.rivals, heard.follower, lss)
+    return _Bus(link, ticks, heard.other_masters, heard.follower, lss)
 
 
 def _logged_already(error: Exception) -> None:
     """Ignore a defect of a bus: the health watch reports it."""
 
 
-def _let_scans_end(lanes: Sequence[tuple[Lane, Ticks]], period_s: float) -> None:
+def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
     """Wait for the scans of the last SYNC, so that no scan is cut off by the end of the program."""
     end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
-    while not all(lane.settled(ticks.newest) for lane, ticks in lanes):
+    while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if time.monotonic() > end_s:
             return
         time.sleep(_POLL_S)
 
 
-def _stand_by(station: Station) -> None:
-    if station.is_guest or not station.monitor.running:
+def _stand_by(node: RemoteNode) -> None:
+    if node.has_other_master or not node.monitor.running:
         return
-    station.monitor.running = False
+    node.monitor.running = False
     try:
-        bringup.stand_by(station.link.send, station.patch.node_id)
+        nmt_master.stand_by(node.link.send, node.patch.node_id)
     except Exception as error:  # the bus is gone; the shutdown must continue
-        _log.warning("node %d was not put on stand-by: %s", station.patch.node_id, error)
+        _log.warning("node %d was not put on stand-by: %s", node.patch.node_id, error)

@@ -19,7 +19,7 @@ MOST: Final = 3
 """With more instants than that a scan may come at any time, by all that can be told."""
 
 
-class Rhythm:
+class ArrivalPredictor:
     """The ends of the scans of a patch, ``period_ns`` from one to the next. Owned by one thread."""
 
     def __init__(self, period_ns: int) -> None:

@@ -19,7 +19,7 @@ from .conftest import Rack, eventually, heard
 
 @pytest.mark.real_time
 def test_a_node_that_sends_scans_is_asked_nothing(hand: HandConfig, rack: Rack, listener: CanPort) -> None:
-    """Its configuration is read back only if its scans stop: see 0.4 s in :mod:`skinnode.host.station`."""
+    """Its configuration is read back only if its scans stop: see 0.4 s in the remote node."""
     with Host.from_config(hand) as host:
         assert eventually(lambda: all(patch.solved > 2 for patch in host.stats().patches.values()))
         heard(listener)
@@ -100,6 +100,6 @@ def test_a_node_that_left_operational_is_not_tared(hand: HandConfig, rack: Rack)
     """It would not hear the command."""
     with Host.from_config(hand) as host:
         assert host.fields(timeout_s=10, patch="p0").get(10) is not None
-        host._stations["p0"].monitor.on_heartbeat(b"\x7f", time.monotonic_ns())
+        host._nodes["p0"].monitor.on_heartbeat(b"\x7f", time.monotonic_ns())
         with pytest.raises(NodeError, match=r"patch 'p0' on can0: not tared: it is not operational$"):
             host.tare("p0", deadline_s=0.0)

@@ -303,7 +303,7 @@ def test_bring_up_knows_whether_a_node_sends_checks(hand: HandConfig, checked: b
     """p1 is of revision 1.0 in one case."""
     with Fleet(hand, unchecked=() if checked else ("p1",)), Host.from_config(hand) as host:
         assert eventually(lambda: all(p.solved > 3 for p in host.stats().patches.values()))
-        facts = {name: host._stations[name].facts for name in ("p0", "p1")}
+        facts = {name: host._nodes[name].facts for name in ("p0", "p1")}
     assert {name: each is not None and each.checked for name, each in facts.items()} == {
         "p0": True,
         "p1": checked,

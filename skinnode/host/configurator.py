@@ -16,12 +16,12 @@ import numpy as np
 
 from skinnode.bus_load.plan import inhibit_time_100us
 from skinnode.canopen import indices as od
-from skinnode.canopen import nmt
 from skinnode.canopen.abort import AbortCode
 from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
+from skinnode.host import nmt_master
 from skinnode.host.hand_files import load_baseline
-from skinnode.host.network import Abandoned, RemoteOd
+from skinnode.host.sdo_client import Abandoned, RemoteOd
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.codec import CodeScale
 from skinnode.protocol.coordinates import unpack_coordinates
@@ -60,7 +60,7 @@ class NodeFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Bringer:
+class Configurator:
     """Brings up one node after the other, or several side by side, until ``abandoned`` says so.
 
     ``on_answer`` hears of each node that answered at all.
@@ -75,7 +75,7 @@ class Bringer:
     search: Callable[[PatchConfig], object]
     """Looks for a node that does not answer, by its serial number."""
 
-    def bring_up(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
+    def configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
         """Wait for the node, check who it is, configure it; on the bus of a master it ends up
         pre-operational.
 
@@ -86,9 +86,9 @@ class Bringer:
         if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
             return self._from_files(patch, profile)
         with remote.until(self.abandoned):
-            return self._bring_up(patch, profile, remote)
+            return self._configure_by_sdo(patch, profile, remote)
 
-    def _bring_up(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
+    def _configure_by_sdo(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
         master = self.bus.role == "master"
         self._wait_for(patch, remote)
         self.on_answer(patch)
@@ -96,10 +96,10 @@ class Bringer:
         profile = replace(profile, checked=revision > od.UNCHECKED_REVISION_NUMBER)
         layout = self._check_layout(patch, profile, remote)
         if master:
-            stand_by(self.send, patch.node_id)
+            nmt_master.stand_by(self.send, patch.node_id)
             self._configure_communication(remote)
         heartbeat_s = self._configure_heartbeat(remote, master=master)
-        self._configure(patch, profile, remote, master=master)
+        self._configure_patch(patch, profile, remote, master=master)
         scale = CodeScale(
             patch.code_bits,
             remote.read(od.DESCRIPTOR, od.CODE_LO, "f32"),
@@ -185,11 +185,11 @@ class Bringer:
         """What a master decides: SYNC, and whose heartbeat is watched."""
         self._go_on()
         sync = self.hand.sync
-        remote.configure(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
+        remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
         # The overflow value may only change while the cycle period is 0 (CiA 301, 7.5.2.22).
-        remote.configure(od.CYCLE_PERIOD, 0, "u32", 0)
-        remote.configure(od.SYNC_COUNTER_OVERFLOW, 0, "u8", sync.counter_overflow)
-        remote.configure(od.CYCLE_PERIOD, 0, "u32", sync.period_ms * 1000)
+        remote.write_checked(od.CYCLE_PERIOD, 0, "u32", 0)
+        remote.write_checked(od.SYNC_COUNTER_OVERFLOW, 0, "u8", sync.counter_overflow)
+        remote.write_checked(od.CYCLE_PERIOD, 0, "u32", sync.period_ms * 1000)
         _open_window(remote)
         watched = 0
         if self.bus.heartbeat_node_id is not None:
@@ -204,10 +204,10 @@ class Bringer:
             told_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
             if told_ms:
                 return told_ms * 1e-3
-        remote.configure(od.HEARTBEAT_PRODUCER, 0, "u16", heartbeat_ms)
+        remote.write_checked(od.HEARTBEAT_PRODUCER, 0, "u16", heartbeat_ms)
         return heartbeat_ms * 1e-3
 
-    def _configure(
+    def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
         """What belongs to the patch alone: when it scans and how it sends."""
@@ -217,7 +217,7 @@ class Bringer:
             if overflow != sync.counter_overflow:
                 allowed = f"{sync.counter_overflow} as in sync.counter_overflow of the hand file"
                 raise _mismatch(patch, "SYNC counter overflow, set by another master", str(overflow), allowed)
-        write = remote.configure if master else remote.ensure
+        write = remote.write_checked if master else remote.write_if_different
         write(od.ACQUISITION, od.ACQUISITION_PERIOD, "u16", 0)
         write(od.SEND_POLICY, od.SEND_MODE, "u8", 0)
         self._check_mapping(patch, profile, remote)
@@ -235,9 +235,9 @@ class Bringer:
             )
             if not master and all(remote.read(index, sub, size) == value for sub, size, value in wanted):
                 continue
-            remote.configure(index, od.PDO_COB_ID, "u32", cob_id | od.PDO_INVALID)
+            remote.write_checked(index, od.PDO_COB_ID, "u32", cob_id | od.PDO_INVALID)
             for sub, size, value in wanted:
-                remote.configure(index, sub, size, value)
+                remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
         """Check that the PDOs have the mapping of the node's revision, the only one that the decoder
@@ -321,21 +321,11 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
     return all(remote.read(index, subindex, kind) == value for index, subindex, kind, value in wanted)
 
 
-def start(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """NMT: go operational."""
-    send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.START, node_id))
-
-
-def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """NMT: go pre-operational; the node falls silent but for its heartbeat and SDO."""
-    send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.ENTER_PRE_OPERATIONAL, node_id))
-
-
 def _open_window(remote: RemoteOd) -> None:
     """Disable the synchronous window (0x1007), because a summary follows only after its whole scan. A node
     without the object has no window."""
     try:
-        remote.configure(od.SYNC_WINDOW, 0, "u32", 0)
+        remote.write_checked(od.SYNC_WINDOW, 0, "u32", 0)
     except SdoAbort as abort:
         if abort.code != AbortCode.NO_OBJECT:
             raise
@@ -345,15 +335,15 @@ def _watch_master(remote: RemoteOd, watched: int) -> None:
     """Write entry 1 of 0x1016, which watches the host. Other entries stay unchanged, except one that also
     watches the host: a node-ID may occur only once."""
     try:
-        remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
+        remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
     except SdoAbort as abort:
         if abort.code != AbortCode.INCOMPATIBLE:
             raise
         for subindex in range(2, int(remote.read(od.HEARTBEAT_CONSUMER, 0, "u8")) + 1):
             entry = int(remote.read(od.HEARTBEAT_CONSUMER, subindex, "u32"))
             if entry >> 16 == watched >> 16:
-                remote.configure(od.HEARTBEAT_CONSUMER, subindex, "u32", 0)
-        remote.configure(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
+                remote.write_checked(od.HEARTBEAT_CONSUMER, subindex, "u32", 0)
+        remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
 
 
 def _mismatch(patch: PatchConfig, what: str, got: str, allowed: str) -> NodeError:

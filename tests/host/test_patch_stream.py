@@ -1,4 +1,4 @@
-"""A lane under overload and under a defect: newest scan first, everything counted, nothing swallowed."""
+"""A stream under overload and under a defect: newest scan first, everything counted, nothing swallowed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import pytest
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
-from skinnode.host.bringup import NodeFacts
+from skinnode.host.configurator import NodeFacts
 from skinnode.host.containment import Defects
-from skinnode.host.pipeline import Lane, Solver
+from skinnode.host.patch_stream import PatchStream, Solver, StreamStats
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Inline, Job, OnError, Workers
@@ -79,70 +79,74 @@ def ticks() -> Ticks:
 
 
 @pytest.fixture
-def lane(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[Lane]:
+def stream(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[PatchStream]:
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(2, "solve") as workers:
-        lane = Lane("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None)
-        lane.resume(stub, 0, anew=True)
-        yield lane
+        stream = PatchStream("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None)
+        stream.resume(stub, 0, anew=True)
+        yield stream
         stub.go.set()
-        lane.close()
+        stream.close()
 
 
-def feed(lane: Lane, counter: int, t_ns: int) -> None:
+def all_accounted_for(stats: StreamStats) -> bool:
+    return stats.offered == stats.solved + stats.skipped
+
+
+def feed(stream: PatchStream, counter: int, t_ns: int) -> None:
     """A whole scan at rest."""
     chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), counter, PROFILE)
     for chunk in chunks:
-        lane.on_chunk(chunk, t_ns)
-    lane.on_summary(pack_summary(counter, SummaryFlag(0), len(chunks), 1000 * counter), t_ns)
+        stream.on_chunk(chunk, t_ns)
+    stream.on_summary(pack_summary(counter, SummaryFlag(0), len(chunks), 1000 * counter), t_ns)
 
 
 def test_overload_skips_to_the_newest_scan(
-    lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
+    stream: PatchStream, stub: Stub, publisher: Publisher, ticks: Ticks
 ) -> None:
     fields = publisher.subscribe(10, 10.0, None)
-    feed(lane, 1, 0)
+    feed(stream, 1, 0)
     assert stub.entered.wait(10)
     for counter in range(2, 8):
-        feed(lane, counter, counter * MS)
-    stats = lane.stats()
+        feed(stream, counter, counter * MS)
+    stats = stream.stats()
     assert stats.offered == 7
     stub.go.set()
     numbers = [field.stamp.scan for field in (fields.get(10), fields.get(10)) if field and field.stamp]
     assert numbers == [1, 7]
-    assert eventually(lambda: lane.stats().solved == 2)
-    stats = lane.stats()
+    assert eventually(lambda: stream.stats().solved == 2)
+    stats = stream.stats()
     assert (stats.offered, stats.solved, stats.skipped) == (7, 2, 5)
     assert fields.get(0.05) is None
 
 
 def test_what_a_replay_leaves_out_is_told_by_its_time_not_its_number(
-    lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
+    stream: PatchStream, stub: Stub, publisher: Publisher, ticks: Ticks
 ) -> None:
     """After a long pause a counter may come again, and both scans are that of one SYNC."""
     stub.go.set()
     fields = publisher.subscribe(10, 10.0, None)
     ticks.note(5, 0)
-    lane.leave_out([1000 * MS + 1500], 2000)
-    feed(lane, 5, 0)
+    stream.leave_out([1000 * MS + 1500], 2000)
+    feed(stream, 5, 0)
     first = fields.get(10)
-    feed(lane, 5, 1000 * MS)
+    feed(stream, 5, 1000 * MS)
     assert fields.get(0.05) is None
-    feed(lane, 5, 2000 * MS)
+    feed(stream, 5, 2000 * MS)
     third = fields.get(10)
     numbers = [field.stamp.scan for field in (first, third) if field and field.stamp]
     assert numbers == [5, 5]
-    assert (lane.stats().offered, lane.stats().skipped) == (3, 1)
+    assert (stream.stats().offered, stream.stats().skipped) == (3, 1)
 
 
 def test_scan_number_and_time_are_those_of_the_sync(
-    lane: Lane, stub: Stub, publisher: Publisher, ticks: Ticks
+    stream: PatchStream, stub: Stub, publisher: Publisher, ticks: Ticks
 ) -> None:
     stub.go.set()
     fields = publisher.subscribe(10, 10.0, None)
     for number in range(239, 243):
         counter = ticks.note(number, 1000 * number)
-        feed(lane, counter, number * MS)
+        feed(stream, counter, number * MS)
         field = fields.get(10)
         assert field is not None
         assert field.stamp is not None
@@ -159,72 +163,78 @@ def test_scan_with_a_chunk_missing_is_withheld_by_policy(
     fields = publisher.subscribe(10, 10.0, None)
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(1, "solve") as workers:
-        lane = Lane("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, "withhold")
-        lane.resume(stub, 0, anew=True)
+        stream = PatchStream(
+            "thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, "withhold"
+        )
+        stream.resume(stub, 0, anew=True)
         chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
         for chunk in chunks[1:]:
-            lane.on_chunk(chunk, 0)
-        lane.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
-        feed(lane, 2, 80 * MS)  # ends the torn one
-        lane.poll(80 * MS)
+            stream.on_chunk(chunk, 0)
+        stream.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
+        feed(stream, 2, 80 * MS)  # ends the torn one
+        stream.poll(80 * MS)
         field = fields.get(10)
         assert field is not None
         assert field.stamp is not None
         assert field.stamp.counter == 2
-        stats = lane.stats()
+        stats = stream.stats()
         assert (stats.partial, stats.offered, stats.withheld) == (1, 1, 0)
         assert stats.assembler.scans_torn == 1
-        lane.close()
+        stream.close()
 
 
-def test_scan_with_a_chunk_missing_goes_on_with_a_mask(lane: Lane, stub: Stub, publisher: Publisher) -> None:
+def test_scan_with_a_chunk_missing_goes_on_with_a_mask(
+    stream: PatchStream, stub: Stub, publisher: Publisher
+) -> None:
     stub.go.set()
     chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
     for chunk in chunks[:3] + chunks[4:]:
-        lane.on_chunk(chunk, 0)
-    lane.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
-    assert lane.stats().offered == 0
-    lane.poll(100 * MS)
-    assert eventually(lambda: lane.stats().solved == 1)
-    stats = lane.stats()
+        stream.on_chunk(chunk, 0)
+    stream.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 0), 0)
+    assert stream.stats().offered == 0
+    stream.poll(100 * MS)
+    assert eventually(lambda: stream.stats().solved == 1)
+    stats = stream.stats()
     assert (stats.assembler.scans_torn, stats.assembler.chunks_lost, stats.invalid_codes) == (1, 1, 3)
 
 
 @pytest.mark.parametrize("anew", [False, True])
-def test_a_node_known_to_send_checks_is_taken_at_its_word(lane: Lane, stub: Stub, anew: bool) -> None:
+def test_a_node_known_to_send_checks_is_taken_at_its_word(
+    stream: PatchStream, stub: Stub, anew: bool
+) -> None:
     """From the first scan on: a summary without a check counts for nothing."""
     stub.go.set()
     stub.facts.checked = True
-    lane.resume(stub, lane.withholdings, anew=anew)
-    feed(lane, 1, 0)
-    lane.poll(100 * MS)
-    assembler = lane.stats().assembler
+    stream.resume(stub, stream.withholdings, anew=anew)
+    feed(stream, 1, 0)
+    stream.poll(100 * MS)
+    assembler = stream.stats().assembler
     assert (assembler.bad_form, assembler.scans_unchecked, assembler.scans_complete) == (1, 1, 0)
 
 
-def test_a_scan_thrown_away_may_have_told_of_a_new_baseline(lane: Lane, stub: Stub) -> None:
+def test_a_scan_thrown_away_may_have_told_of_a_new_baseline(stream: PatchStream, stub: Stub) -> None:
     """Nobody will ever see its flags: so the baseline is read again."""
     stub.go.set()
-    feed(lane, 1, 0)
-    assert not lane.doubtful
+    feed(stream, 1, 0)
+    assert not stream.doubtful
     codes = encode(REST_OHM, REST_OHM, CodeScale())
     chunks = pack_scan(codes, 2, PROFILE)
     for chunk in chunks:
-        lane.on_chunk(chunk, MS)
+        stream.on_chunk(chunk, MS)
     wrong = check_of_codes(codes, PROFILE) ^ 1
-    lane.on_summary(pack_checked_summary(2, SummaryFlag.BASELINE_CHANGED, len(chunks), 0, wrong), MS)
-    assert lane.stats().assembler.scans_corrupt == 1
-    assert lane.doubtful
+    stream.on_summary(pack_checked_summary(2, SummaryFlag.BASELINE_CHANGED, len(chunks), 0, wrong), MS)
+    assert stream.stats().assembler.scans_corrupt == 1
+    assert stream.doubtful
 
 
 @pytest.mark.parametrize("failing", [ZeroDivisionError("by zero"), MemoryError("no more")])
 def test_a_defect_reaches_the_subscriber(
-    lane: Lane, stub: Stub, publisher: Publisher, failing: Exception
+    stream: PatchStream, stub: Stub, publisher: Publisher, failing: Exception
 ) -> None:
     fields = publisher.subscribe(10, 10.0, None)
     stub.error = failing
     stub.go.set()
-    feed(lane, 1, 0)
+    feed(stream, 1, 0)
     with pytest.raises(SkinError) as caught:
         fields.get(10)
     assert str(caught.value) == f"patch 'thumb', scan 1: {type(failing).__name__}: {failing}"
@@ -243,24 +253,26 @@ class Full(Inline):
         super().submit(job, on_error)
 
 
-def lane_of(
+def stream_of(
     workers: Inline, publisher: Publisher, ticks: Ticks, solver: Any, defects: Defects | None = None
-) -> Lane:
+) -> PatchStream:
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
-    lane = Lane("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, defects=defects)
-    lane.resume(solver, 0, anew=True)
-    return lane
+    stream = PatchStream(
+        "thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, defects=defects
+    )
+    stream.resume(solver, 0, anew=True)
+    return stream
 
 
 def test_a_scan_that_no_worker_takes_costs_itself(stub: Stub, publisher: Publisher, ticks: Ticks) -> None:
     workers, fields = Full(), publisher.subscribe(10, 10.0, None)
     stub.go.set()
-    lane = lane_of(workers, publisher, ticks, stub)
+    stream = stream_of(workers, publisher, ticks, stub)
     workers.full = True
     with pytest.raises(MemoryError, match="no more"):  # whoever handles the frame reports it
-        feed(lane, 1, 0)
+        feed(stream, 1, 0)
     workers.full = False
-    feed(lane, 2, MS)
+    feed(stream, 2, MS)
     field = fields.get(0)
     assert field is not None
     assert field.stamp is not None
@@ -274,18 +286,18 @@ def test_a_worker_that_finds_no_successor_leaves_the_lane_open(publisher: Publis
     class Slow(Stub):
         def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
             if stamp.counter == 1:
-                feed(lane, 2, MS)
+                feed(stream, 2, MS)
                 workers.full = True
             return super().solve(scan, stamp)
 
     slow = Slow()
     slow.go.set()
-    lane = lane_of(workers, publisher, ticks, slow, defects)
-    feed(lane, 1, 0)
+    stream = stream_of(workers, publisher, ticks, slow, defects)
+    feed(stream, 1, 0)
     assert (defects.count, defects.newest) == (1, "solving: MemoryError: no more")
     workers.full = False
-    feed(lane, 3, 2 * MS)
-    stats = lane.stats()
+    feed(stream, 3, 2 * MS)
+    stats = stream.stats()
     assert (stats.offered, stats.solved, stats.skipped) == (3, 2, 1)
     assert defects.count == 1
 
@@ -300,7 +312,7 @@ def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
     solver = Solver(facts, hand.solver, lambda: 7 * MS)
     pressed_m = LAYOUT.upper_m - [0.0, 0.0, 0.05e-3]
     pressed_ohm = resistance_ohm(LAYOUT, pressed_m)
-    lane = Lane(
+    stream = PatchStream(
         "thumb",
         ScanAssembler(PROFILE, counter_overflow=240),
         Inline(),
@@ -308,30 +320,34 @@ def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
         ticks.find,
         lambda t_ns: None,
     )
-    lane.resume(solver, 0, anew=True)
+    stream.resume(solver, 0, anew=True)
     fields = publisher.subscribe(10, 10.0, None)
     chunks = pack_scan(encode(pressed_ohm, REST_OHM, CodeScale()), 1, PROFILE)
     for chunk in chunks:
-        lane.on_chunk(chunk, MS)
-    lane.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 1000), MS)
+        stream.on_chunk(chunk, MS)
+    stream.on_summary(pack_summary(1, SummaryFlag(0), len(chunks), 1000), MS)
     field = fields.get(0)
     assert field is not None
-    assert (field.method, field.trusted, lane.stats().invalid_codes) == (method, True, 0)
+    assert (field.method, field.trusted, stream.stats().invalid_codes) == (method, True, 0)
     assert field.stamp is not None
     assert (field.stamp.t_receive_ns, field.stamp.t_solved_ns) == (MS, 7 * MS)
     expected = Tracker(LAYOUT, method=method, baseline_ohm=REST_OHM).update(pressed_ohm)
     np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=1e-6)
 
 
-def test_scans_from_many_turns_are_all_accounted_for(lane: Lane, stub: Stub, publisher: Publisher) -> None:
+def test_scans_from_many_turns_are_all_accounted_for(
+    stream: PatchStream, stub: Stub, publisher: Publisher
+) -> None:
     """However mainline and workers interleave: solved, skipped or waiting, and the token is never lost."""
     stub.go.set()
     for number in range(500):
-        feed(lane, number % 240 + 1, number * MS)
+        feed(stream, number % 240 + 1, number * MS)
         if number % 50 == 0:
-            assert eventually(lambda: lane.stats().offered == lane.stats().solved + lane.stats().skipped)
-    assert eventually(lambda: lane.stats().offered == lane.stats().solved + lane.stats().skipped)
-    assert lane.stats().offered == 500
+            assert eventually(
+                lambda: stream.stats().offered == stream.stats().solved + stream.stats().skipped
+            )
+    assert eventually(lambda: all_accounted_for(stream.stats()))
+    assert stream.stats().offered == 500
     newest = publisher.latest("thumb")
     assert newest is not None
     assert newest.stamp is not None
@@ -339,20 +355,20 @@ def test_scans_from_many_turns_are_all_accounted_for(lane: Lane, stub: Stub, pub
 
 
 def test_scans_are_withheld_until_somebody_says_how_to_decode_them(
-    lane: Lane, stub: Stub, publisher: Publisher
+    stream: PatchStream, stub: Stub, publisher: Publisher
 ) -> None:
     fields = publisher.subscribe(10, 10.0, None)
     stub.go.set()
-    feed(lane, 1, 0)
-    assert eventually(lambda: lane.stats().solved == 1)
-    lane.withhold()
-    feed(lane, 2, MS)
-    known = lane.withholdings
-    lane.withhold()
-    lane.resume(stub, known, anew=False)  # what it knows was out of date by then
-    feed(lane, 3, 2 * MS)
-    lane.resume(stub, lane.withholdings, anew=False)
-    feed(lane, 4, 3 * MS)
+    feed(stream, 1, 0)
+    assert eventually(lambda: stream.stats().solved == 1)
+    stream.withhold()
+    feed(stream, 2, MS)
+    known = stream.withholdings
+    stream.withhold()
+    stream.resume(stub, known, anew=False)  # what it knows was out of date by then
+    feed(stream, 3, 2 * MS)
+    stream.resume(stub, stream.withholdings, anew=False)
+    feed(stream, 4, 3 * MS)
     assert [field.stamp.counter for field in (fields.get(10), fields.get(10))] == [1, 4]
-    assert eventually(lambda: lane.stats().solved == 2)
-    assert (lane.stats().withheld, lane.stats().offered) == (2, 2)
+    assert eventually(lambda: stream.stats().solved == 2)
+    assert (stream.stats().withheld, stream.stats().offered) == (2, 2)

@@ -41,13 +41,13 @@ _OUT_OF_STEP: Final = (
 )
 """SDO abort codes of a node that missed a frame of the transfer, which is then retried."""
 
-MOST_BYTES: Final = 4 * 254 * 254
+MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
 """Maximum length of a value in bytes: the baseline of the largest patch."""
 
-MOST_TEXT_BYTES: Final = 4096
+MAX_TEXT_BYTES: Final = 4096
 """Maximum length of a value in bytes where a number or a text is expected."""
 
-_MOST_NUMBER_BYTES: Final = 8
+_MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
@@ -64,7 +64,7 @@ class Abandoned(Exception):
     """The caller no longer wants the result; the transfer was aborted."""
 
 
-class _Endless(Exception):
+class _UploadTooLong(Exception):
     """The node sends more than a value can have, or takes too long over it."""
 
 
@@ -116,10 +116,10 @@ class RemoteOd:
     def answers(self) -> bool:
         """Whether the node answers at all, be it with an abort. One try."""
         try:
-            self._upload(DEVICE_TYPE, 0, _MOST_NUMBER_BYTES)
+            self._upload(DEVICE_TYPE, 0, _MAX_NUMBER_BYTES)
         except SdoAbortedError:
             return True
-        except _Endless:
+        except _UploadTooLong:
             self._client.give_up(DEVICE_TYPE, 0)
             return True
         except Abandoned:
@@ -134,11 +134,11 @@ class RemoteOd:
             return False
         return True
 
-    def read_bytes(self, index: int, subindex: int, most: int = MOST_TEXT_BYTES) -> bytes:
+    def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
         """The value as it came, of at most ``most`` bytes."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
-    def read_block(self, index: int, most: int = MOST_BYTES) -> bytes:
+    def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
         """A value of many bytes, at most ``most``, by block transfer with CRC."""
 
         def ask() -> bytes:
@@ -147,7 +147,7 @@ class RemoteOd:
 
         return bytes(self._transfer(index, 0, "block read", ask))
 
-    def read_large(self, index: int, most: int = MOST_BYTES) -> bytes:
+    def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
         """By block transfer, or segment by segment from a node that refuses that."""
         try:
             return self.read_block(index, most)
@@ -167,7 +167,7 @@ class RemoteOd:
     def read(self, index: int, subindex: int, kind: str) -> Any:
         """The value, decoded."""
         layout = struct.Struct(_PLAIN[kind])
-        data = self.read_bytes(index, subindex, _MOST_NUMBER_BYTES)
+        data = self.read_bytes(index, subindex, _MAX_NUMBER_BYTES)
         if len(data) != layout.size:
             shown = data.hex(" ") or "nothing"
             raise NodeError(
@@ -189,12 +189,12 @@ class RemoteOd:
 
         self._transfer(index, subindex, "write", ask)
 
-    def ensure(self, index: int, subindex: int, kind: str, value: float) -> None:
+    def write_if_different(self, index: int, subindex: int, kind: str, value: float) -> None:
         """Write, and read back, only what differs."""
         if self.read(index, subindex, kind) != value:
-            self.configure(index, subindex, kind, value)
+            self.write_checked(index, subindex, kind, value)
 
-    def configure(self, index: int, subindex: int, kind: str, value: float) -> None:
+    def write_checked(self, index: int, subindex: int, kind: str, value: float) -> None:
         """Write and read back. Raises NodeError where the node kept something else."""
         self.write(index, subindex, kind, value)
         kept = self.read(index, subindex, kind)
@@ -212,7 +212,7 @@ class RemoteOd:
                 return ask()
             except SkinError:  # the interface does not take the request
                 raise
-            except _Endless as endless:
+            except _UploadTooLong as endless:
                 self._client.give_up(index, subindex)
                 raise NodeError(self.node_id, f"{where}: got {endless}") from None
             except Abandoned:
@@ -235,9 +235,9 @@ class RemoteOd:
 
     def _whole(self, stream: Any, most: int) -> bytes:
         """Read a stream to its end. Raises SdoCommunicationError if the data is not as long as announced,
-        _Endless if it is longer than ``most`` or takes too long, and Abandoned."""
+        _UploadTooLong if it is longer than ``most`` or takes too long, and Abandoned."""
         if stream.size is not None and stream.size > most:
-            raise _Endless(f"a value of {counted(stream.size, 'byte')}, allowed: {most} at most")
+            raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, allowed: {most} at most")
         limit_s = _TRANSFER_S + _SEGMENT_S * most / SEGMENT_BYTES
         end_s = time.monotonic() + limit_s
         data = bytearray()
@@ -245,12 +245,14 @@ class RemoteOd:
             data += segment
             if len(data) > (most if stream.size is None else stream.size):
                 if stream.size is None:
-                    raise _Endless(f"more than {counted(most, 'byte')}, allowed: {most} at most")
+                    raise _UploadTooLong(f"more than {counted(most, 'byte')}, allowed: {most} at most")
                 break
             if self.abandoned():
                 raise Abandoned
             if time.monotonic() > end_s:
-                raise _Endless(f"{counted(len(data), 'byte')} and no end, allowed: within {limit_s:.1f} s")
+                raise _UploadTooLong(
+                    f"{counted(len(data), 'byte')} and no end, allowed: within {limit_s:.1f} s"
+                )
         if stream.size is not None and len(data) != stream.size:
             raise SdoCommunicationError(f"{len(data)} of {stream.size} bytes")
         return bytes(data)

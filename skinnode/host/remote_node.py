@@ -1,4 +1,4 @@
-"""A patch as its host sees it: the node on its bus, what is known of it, and the lane of its scans."""
+"""A patch as its host sees it: the node on its bus, what is known of it, and the stream of its scans."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.nmt import NmtState
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout
-from skinnode.host import bringup
-from skinnode.host.bringup import Bringer, NodeFacts
+from skinnode.host import nmt_master
+from skinnode.host.configurator import Configurator, NodeFacts, is_configured
 from skinnode.host.containment import Defects
 from skinnode.host.link import BusLink
-from skinnode.host.lss import LssMaster
-from skinnode.host.pipeline import Solver
+from skinnode.host.lss_master import LssMaster
+from skinnode.host.patch_stream import Solver
 from skinnode.host.reception import PatchReception
 from skinnode.protocol.codec import pack_command
 from skinnode.protocol.profile import PatchProfile
@@ -34,7 +34,7 @@ _MUTE_SCANS: Final = 5
 be back within a second."""
 
 
-class Station:
+class RemoteNode:
     """One patch. Its methods without a mark may be called by one thread at a time, which is not the mainline:
     whoever brings the node up."""
 
@@ -48,10 +48,10 @@ class Station:
         defects: Defects,
     ) -> None:
         self.patch, self.link, self.defects = patch, link, defects
-        self.lane, self.monitor = reception.lane, reception.monitor
+        self.stream, self.monitor = reception.stream, reception.monitor
         self.bus = hand.bus(patch.bus)
-        self.is_guest = self.bus.role == "guest"
-        self.is_silent = self.is_guest and self.bus.guest_sends == "nothing"
+        self.has_other_master = self.bus.role == "guest"
+        self.listen_only = self.has_other_master and self.bus.guest_sends == "nothing"
         """Whether nothing at all may be sent to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
@@ -75,34 +75,34 @@ class Station:
     @property
     def heard(self) -> bool:
         """Whether anything of the node was heard since the host opened its bus."""
-        return self.monitor.t_heartbeat_ns is not None or self.lane.stats().withheld > 0
+        return self.monitor.t_heartbeat_ns is not None or self.stream.stats().withheld > 0
 
     @property
     def heartbeat_s(self) -> float:
         """How often the node says that it is there."""
         return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
 
-    def bring_up(
+    def configure(
         self,
         deadline_s: float,
         abandoned: Callable[[], bool],
         on_answer: Callable[[PatchConfig], None] | None = None,
     ) -> Solver:
         """Bring the node up and learn what it is; scans are withheld meanwhile. Raises as
-        :meth:`Bringer.bring_up`."""
+        :meth:`Configurator.configure`."""
         self.boot_ups = self.monitor.boot_ups
-        if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.is_guest:
-            bringup.stand_by(self.link.send, self.patch.node_id)  # one of ours that somebody stopped is deaf
+        if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
+            nmt_master.stand_by(self.link.send, self.patch.node_id)  # a stopped node does not answer SDO
 
         def answered(patch: PatchConfig) -> None:
             self.boot_ups = self.monitor.boot_ups  # those of before were waited for
             if on_answer is not None:
                 on_answer(patch)
 
-        bringer = self._bringer(deadline_s, abandoned, answered)
+        configurator = self._configurator(deadline_s, abandoned, answered)
         answers = self._answers
         try:
-            self.facts = bringer.bring_up(self.patch, self._profile, self._remote)
+            self.facts = configurator.configure(self.patch, self._profile, self._remote)
         except NodeError as error:
             if self._answers == answers or abandoned() or (count := self._answers_to_one_question()) < 2:
                 raise
@@ -118,20 +118,20 @@ class Station:
     def start(self, solver: Solver, withholdings: int) -> None:
         """Let scans through to ``solver`` and, as master, tell the node to send them. Raises BusError."""
         # What a guest finds running goes on, heard since its bus was opened, unless the node has booted.
-        anew = not self.is_guest or self.monitor.boot_ups > 0
-        self.link.call(lambda: self.lane.resume(solver, withholdings, anew=anew), self.defects)
-        if not self.is_guest:
-            bringup.start(self.link.send, self.patch.node_id)
+        anew = not self.has_other_master or self.monitor.boot_ups > 0
+        self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
+        if not self.has_other_master:
+            nmt_master.start(self.link.send, self.patch.node_id)
         self.monitor.running = True
 
     def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> Solver | None:
         """A solver with the baseline that the node has now; None where that is the one known and scans go
-        through. Raises as :meth:`Bringer.settle_baseline`."""
+        through. Raises as :meth:`Configurator.settle_baseline`."""
         facts = self.facts
         assert facts is not None  # asked of nodes that run
-        bringer = self._bringer(deadline_s, abandoned, lambda patch: None)
-        baseline_ohm = bringer.settle_baseline(self.patch, self._profile, self._remote)
-        if (baseline_ohm == facts.baseline_ohm).all() and not self.lane.withholding:
+        configurator = self._configurator(deadline_s, abandoned, lambda patch: None)
+        baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
+        if (baseline_ohm == facts.baseline_ohm).all() and not self.stream.withholding:
             return None
         facts = facts.with_baseline(baseline_ohm)
         solver = Solver(facts, self._hand.solver)
@@ -150,17 +150,17 @@ class Station:
         lost its configuration. False on the bus of another master, who alone may restore it."""
         scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
         patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
-        return not self.is_guest and self.link.t_dealt_ns > scan_ns + patience_ns
+        return not self.has_other_master and self.link.t_dispatched_ns > scan_ns + patience_ns
 
     def is_configured(self) -> bool:
-        """As :func:`bringup.is_configured`."""
-        return bringup.is_configured(self.patch, self._hand, self._remote)
+        """As :func:`~skinnode.host.configurator.is_configured`."""
+        return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
         """Tell the node to take what it feels now for its baseline. Any thread. Raises as
         :meth:`Host.tare`."""
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
-        if self.is_guest:
+        if self.has_other_master:
             raise NodeError(node_id, f"{said}: the host is a guest there")
         if self.patch.baseline is not None:  # it would be written back at once
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
@@ -174,7 +174,7 @@ class Station:
         """Have the mainline withhold scans; returns the number that :meth:`start` wants. Raises NodeTimeout
         where the mainline is held up, as while the bus is away."""
         answer: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self.link.call(lambda: answer.put(self.lane.withhold()), self.defects)
+        self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
         try:
             return answer.get(timeout=_MAINLINE_S)
         except queue.Empty:
@@ -204,21 +204,21 @@ class Station:
     @property
     def searchable(self) -> bool:
         """Whether the hand file has its serial number, and the host is not a guest."""
-        return not self.is_guest and self.patch.serial is not None
+        return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
         """Look for the patch by its serial number, if there is one; whether it was found. It will boot at its
         node-ID."""
-        if self.is_guest or self.patch.serial is None:
+        if self.has_other_master or self.patch.serial is None:
             return False
         try:
             return self._lss.give_node_id(self.patch.serial, self.patch.node_id)
         except BusError:
             return False
 
-    def _bringer(
+    def _configurator(
         self, deadline_s: float, abandoned: Callable[[], bool], answered: Callable[[PatchConfig], None]
-    ) -> Bringer:
-        return Bringer(
+    ) -> Configurator:
+        return Configurator(
             self.link.send, self._hand, self.bus, deadline_s, abandoned, answered, lambda _: self.search()
         )

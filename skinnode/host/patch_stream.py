@@ -1,8 +1,8 @@
 """From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
 
-A patch has a lane. The mainline assembles into it and leaves scans in a box of one; a worker takes the newest
-and solves it. A scan that is overtaken while the worker is busy is skipped and counted. The lane's token
-makes sure that at most one worker is in it.
+The mainline assembles scans and leaves the newest in a box of one; a worker takes it and solves it. A scan
+that is overtaken while the worker is busy is skipped and counted. The stream's token makes sure that at most
+one worker is in it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from skinnode.config import Partial, PatchConfig, SolverConfig
 from skinnode.errors import ConfigError, SkinError
-from skinnode.host.bringup import NodeFacts
+from skinnode.host.configurator import NodeFacts
 from skinnode.host.containment import Defects, one_line
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import Tick
@@ -112,12 +112,12 @@ def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class LaneStats:
+class StreamStats:
     """What became of a patch's scans: those assembled = ``offered`` + ``withheld`` + ``partial``, and
     ``offered`` = ``solved`` + ``failed`` + ``skipped`` + at most two in work."""
 
     frames: int
-    """Chunks and summaries handed to the lane, whatever became of them."""
+    """Chunks and summaries handed to the stream, whatever became of them."""
     offered: int
     withheld: int
     """Came while the patch was being brought up or its baseline being read: nobody could decode them."""
@@ -135,24 +135,24 @@ class LaneStats:
     """Scans whose decoding or solving raised an exception: a defect."""
 
 
-class LaneTap(Protocol):
-    """Who writes down what, beside the frames, decides which scans a lane makes of them. Mainline."""
+class StreamTap(Protocol):
+    """Who writes down what, beside the frames, decides which scans a stream makes of them. Mainline."""
 
     def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
-        """:meth:`Lane.resume` let scans through."""
+        """:meth:`PatchStream.resume` let scans through."""
 
     def withheld(self, patch: str) -> None:
-        """:meth:`Lane.withhold` was called."""
+        """:meth:`PatchStream.withhold` was called."""
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """:meth:`Lane.poll` ended a scan."""
+        """:meth:`PatchStream.poll` ended a scan."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
         """A scan, of this number and whose last frame came then, was overtaken by a newer one before a worker
         was free."""
 
 
-class Lane:
+class PatchStream:
     """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
     them. ``on_scan`` is told of each at once, ``watch`` a while later. ``under_way``: others start the node,
     which may be sending already whenever its scans are let through. A scan whose decoding or solving
@@ -181,7 +181,7 @@ class Lane:
         self._unwatched: deque[tuple[int, Scan]] = deque()
         self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
-        self.tap: LaneTap | None = None
+        self.tap: StreamTap | None = None
         self._left_out: list[int] = []
         self._left_out_within_ns = 0
         self.withholdings = 0
@@ -192,7 +192,7 @@ class Lane:
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
         self._solving = 0
-        """Number of the scan that the worker in the lane is solving."""
+        """Number of the scan that the worker in the stream is solving."""
         self.t_passed_ns = 0
         """Monotonic time at which the newest scan that was not withheld was received; 0 before the first."""
 
@@ -328,7 +328,7 @@ class Lane:
         try:
             self._token.pop()
         except IndexError:
-            return  # a worker is in the lane and looks into the box when it is done
+            return  # a worker is in the stream and looks into the box when it is done
         try:
             self._workers.submit(self._work, self._work_failed)
         except Exception:
@@ -346,7 +346,7 @@ class Lane:
         self._taken += 1  # before it leaves the box, so that no reader of the counters sees it nowhere
         try:
             scan, stamp, solver = self._box.popleft()
-        except IndexError:  # the lane was closed
+        except IndexError:  # the stream was closed
             self._taken -= 1
             return
         self._solving = stamp.scan
@@ -366,7 +366,7 @@ class Lane:
         self._leave()
 
     def _leave(self) -> None:
-        """Release the lane to the next worker, at once if a scan is waiting. Never raises: the holder must
+        """Release the stream to the next worker, at once if a scan is waiting. Never raises: the holder must
         return the token exactly once."""
         self._token.append(None)
         try:
@@ -384,10 +384,10 @@ class Lane:
         failure.__cause__ = error
         self._publisher.fail(failure)
 
-    def stats(self) -> LaneStats:
+    def stats(self) -> StreamStats:
         """Counters. Read in this order, no scan counts as skipped that may still be solved."""
         offered, waiting = self._offered, len(self._box)
-        return LaneStats(
+        return StreamStats(
             frames=self._frames,
             offered=offered,
             withheld=self._withheld,

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinnode.config import HandConfig
-from skinnode.host.dealer import Dealer
+from skinnode.host.arrivals import APART_NS, MOST, REMEMBERED, ArrivalPredictor
+from skinnode.host.dispatcher import Dispatcher
 from skinnode.host.publish import Publisher
 from skinnode.host.reception import receive_patch
-from skinnode.host.rhythm import APART_NS, MOST, REMEMBERED, Rhythm
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Inline
 
@@ -22,10 +22,10 @@ PERIOD_NS = 50_000_000
 
 def after(ends_ns: Iterable[int]) -> tuple[int, ...]:
     """What is expected after scans that ended then."""
-    rhythm = Rhythm(PERIOD_NS)
+    arrivals = ArrivalPredictor(PERIOD_NS)
     due: tuple[int, ...] = ()
     for t_ns in ends_ns:
-        due = rhythm.next_ns(t_ns)
+        due = arrivals.next_ns(t_ns)
     return due
 
 
@@ -57,10 +57,10 @@ def test_where_a_scan_comes_at_any_time_nobody_can_say() -> None:
 
 @given(st.lists(st.integers(0, 200_000_000), min_size=1, max_size=30), st.integers(1_000_000, PERIOD_NS))
 def test_what_is_expected_lies_ahead_and_apart(steps_ns: list[int], period_ns: int) -> None:
-    rhythm, t_ns = Rhythm(period_ns), 0
+    arrivals, t_ns = ArrivalPredictor(period_ns), 0
     for step_ns in steps_ns:
         t_ns += step_ns
-        due = rhythm.next_ns(t_ns)
+        due = arrivals.next_ns(t_ns)
         assert len(due) <= MOST
         assert all(t_ns + period_ns // 2 - 1 <= due_ns <= t_ns + period_ns * 3 // 2 + 1 for due_ns in due)
         assert all(later - earlier >= APART_NS for earlier, later in itertools.pairwise(due))
@@ -72,7 +72,7 @@ def test_after_a_hiccup_the_next_is_looked_for_in_time(hiccup_ns: int) -> None:
     assert due == (11 * PERIOD_NS, 11 * PERIOD_NS + hiccup_ns)
 
 
-class Told(Dealer):
+class Told(Dispatcher):
     """Remembers what was expected."""
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
@@ -81,8 +81,8 @@ class Told(Dealer):
 
 def test_the_first_scan_of_a_patch_may_come_at_any_time(hand: HandConfig) -> None:
     """However well those of the others are known."""
-    dealer = Told(hand.buses[0], {}, 0)
+    dispatcher = Told(hand.buses[0], {}, 0)
     names = [patch.name for patch in hand.patches]
     for patch in hand.patches:
-        receive_patch(patch, hand, dealer, Ticks(240), Inline(), Publisher(tuple(names)))
-    assert dealer.expected == dict.fromkeys(names, ())
+        receive_patch(patch, hand, dispatcher, Ticks(240), Inline(), Publisher(tuple(names)))
+    assert dispatcher.expected == dict.fromkeys(names, ())

@@ -13,13 +13,13 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Silence after which a rival that is heard again is told of again."""
+"""Silence after which another master that is heard again is logged again, ns."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
 
 
 @dataclass(frozen=True, slots=True)
-class RivalStats:
+class OtherMasterStats:
     """Frames that only a master sends, from others than this host. A guest expects the first two."""
 
     syncs: int
@@ -32,7 +32,7 @@ class RivalStats:
     """When the newest of them was received, monotonic."""
 
 
-class Rivals:
+class OtherMasters:
     """Counts them on one bus, and says once that they are there. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
@@ -53,10 +53,10 @@ class Rivals:
             handlers[od.heartbeat_cob_id(self._bus.heartbeat_node_id)] = heard(HEARTBEAT)
         return handlers
 
-    def stats(self) -> RivalStats:
+    def stats(self) -> OtherMasterStats:
         counts = self._counts
         last_ns = max(self._last_ns.values(), default=None)
-        return RivalStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)
+        return OtherMasterStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)
 
     def _on(self, what: str, t_ns: int) -> None:
         self._counts[what] += 1

@@ -1,6 +1,6 @@
-"""What the mainline of a bus does with frames: counts them and deals them out by COB-ID. No thread, no clock.
+"""Counts the frames of a bus and dispatches them to handlers by COB-ID. No thread, no clock.
 
-A :class:`~skinnode.host.link.BusLink` is fed by a bus; a replay feeds a dealer from a recording.
+A :class:`~skinnode.host.link.BusLink` is fed by a bus; a replay feeds a dispatcher from a recording.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class BusStats:
     """Share of the bus that these took over the last second; 1 is full."""
 
 
-class Dealer:
+class Dispatcher:
     """One bus of the hand, as far as its frames go. Owned by one thread, the mainline; only what says so may
     be called from others."""
 
@@ -128,7 +128,7 @@ class Dealer:
         """Let a frame that was sent count towards the load. From any thread."""
         self._outgoing.append((can_id, data))
 
-    def deal(self, batch: Sequence[Frame]) -> None:
+    def dispatch(self, batch: Sequence[Frame]) -> None:
         """Pass frames to their handlers, in order. A handler that raises loses only that frame."""
         for listener in self._listeners:
             try:
@@ -212,7 +212,7 @@ class Dealer:
         waiting: int = 0,
         kernel_dropped: int = 0,
     ) -> BusStats:
-        """All counters; the arguments are those of whoever feeds the dealer. From any thread."""
+        """All counters; the arguments are those of whoever feeds the dispatcher. From any thread."""
         return BusStats(
             received=self._received,
             sent=sent,

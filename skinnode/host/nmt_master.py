@@ -1,0 +1,18 @@
+"""NMT commands that the host sends as NMT master (CiA 301 v4.2, 7.2.8.3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from skinnode.canopen.indices import NMT_COB_ID
+from skinnode.canopen.nmt import NmtCommand, encode
+
+
+def start(send: Callable[[int, bytes], None], node_id: int) -> None:
+    """Tell a node to become operational."""
+    send(NMT_COB_ID, encode(NmtCommand.START, node_id))
+
+
+def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
+    """Tell a node to become pre-operational: it then sends nothing but heartbeats, EMCY and SDO responses."""
+    send(NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))

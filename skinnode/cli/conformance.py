@@ -87,7 +87,7 @@ def _write(report: Report, title: str, junit: Path | None, html: Path | None, js
     import datetime
     import json
 
-    from skinnode.conformance.html import as_html
+    from skinnode.conformance.html_report import as_html
     from skinnode.conformance.report import as_json, as_junit
     from skinnode.files.output_file import write_text
 

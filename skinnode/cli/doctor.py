@@ -10,8 +10,8 @@ import typer
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Interface, Json
 
 if TYPE_CHECKING:
-    from skinnode.doctor.causes import Group
-    from skinnode.doctor.facts import BusFacts
+    from skinnode.diagnose.facts import BusFacts
+    from skinnode.diagnose.root_causes import Group
 
 
 def doctor(
@@ -43,8 +43,8 @@ def doctor(
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
-    from skinnode.doctor.causes import grouped
-    from skinnode.doctor.gather import gather
+    from skinnode.diagnose.collect_facts import collect_facts
+    from skinnode.diagnose.root_causes import grouped
     from skinnode.files.output_file import require_writable, write_text
 
     if html is not None:
@@ -55,10 +55,10 @@ def doctor(
     places = find_buses(interface, channel, bitrate, fd, hand, bus)
     plan, buses = places[0].hand, [place.bus for place in places if place.patches or len(places) == 1]
     with progress(as_json) as tell:
-        facts = [gather(item, plan, active=active, progress=tell) for item in buses]
+        facts = [collect_facts(item, plan, active=active, progress=tell) for item in buses]
     groups = grouped(facts)
     if html is not None:
-        from skinnode.doctor.page import as_html
+        from skinnode.diagnose.html_report import as_html
 
         write_text("--html", html, as_html(facts, groups, plan.name if plan else facts[0].name))
     if as_json:
@@ -72,7 +72,7 @@ def doctor(
 def _as_json(facts: list[BusFacts], groups: list[Group]) -> dict[str, object]:
     from dataclasses import asdict
 
-    from skinnode.doctor.checks import not_judged, others
+    from skinnode.diagnose.checks.run import not_judged, others
 
     return {
         "findings": [
@@ -108,8 +108,8 @@ def _print(facts: list[BusFacts], groups: list[Group]) -> None:
     from rich.text import Text
 
     from skinnode.cli._console import console, indented
-    from skinnode.doctor.causes import merged
-    from skinnode.doctor.checks import not_judged, others
+    from skinnode.diagnose.checks.run import not_judged, others
+    from skinnode.diagnose.root_causes import merged
     from skinnode.text.words import counted
 
     out = console()

@@ -10,7 +10,7 @@ import typer
 from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
 
 if TYPE_CHECKING:
-    from skinnode.technician.info import NodeInfo, PatchInfo
+    from skinnode.diagnose.node_info import NodeInfo, PatchInfo
 
 
 def info(
@@ -33,19 +33,19 @@ def info(
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
-    from skinnode.technician.info import read_info
-    from skinnode.technician.line import Line
-    from skinnode.technician.sheet import load_sheet
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.data_sheet import load_data_sheet
+    from skinnode.diagnose.node_info import read_info
 
     place, node_id = find_node(node, interface, channel, bitrate, fd, hand, bus)
     sheet = None
     if eds is not None:
-        sheet, *_, note = load_sheet(eds)
+        sheet, *_, note = load_data_sheet(eds)
         if note:
             typer.echo(f"note: {note}", err=True)
-    with progress(as_json) as tell, Line(place.bus) as line:
+    with progress(as_json) as tell, BusConnection(place.bus) as connection:
         tell(f"reading node {node_id}")
-        found = read_info(line, node_id, sheet)
+        found = read_info(connection, node_id, sheet)
     if as_json:
         from dataclasses import asdict
 

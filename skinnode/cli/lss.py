@@ -11,7 +11,7 @@ from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, 
 if TYPE_CHECKING:
     from skinnode.canopen.lss import LssAddress
     from skinnode.cli._bus import Place
-    from skinnode.technician.commission import Commissioned
+    from skinnode.diagnose.lss_commissioning import Commissioned
 
 app = typer.Typer(help="Layer setting services: give nodes their node-ID and bit rate.", no_args_is_help=True)
 
@@ -29,8 +29,8 @@ def list_nodes(
     """Find all nodes without a node-ID, by fastscan, on one bus or on all of --hand. Changes nothing."""
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import console, print_json, progress, table
-    from skinnode.technician.line import Line
-    from skinnode.technician.survey import find_unconfigured
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.discovery import find_unconfigured
     from skinnode.text.words import counted
 
     found: list[tuple[str, LssAddress]] = []
@@ -39,8 +39,8 @@ def list_nodes(
     with progress(as_json) as tell:
         for place in places:
             tell(f"{place.bus.name}: fastscan")
-            with Line(place.bus) as line:
-                there, and_more = find_unconfigured(line)
+            with BusConnection(place.bus) as connection:
+                there, and_more = find_unconfigured(connection)
             found += [(place.bus.name, address) for address in there]
             more |= and_more
     if as_json:
@@ -103,9 +103,9 @@ def set_node(
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.lss_commissioning import commission, only_unconfigured
     from skinnode.errors import ConfigError, Shown
-    from skinnode.technician.commission import commission, only_unconfigured
-    from skinnode.technician.line import Line
 
     if node_id is None and bit_rate is None:
         raise ConfigError("--node-id, --bit-rate", None, "at least one of them")
@@ -113,11 +113,11 @@ def set_node(
         allowed = ", ".join(str(rate) for rate in BIT_RATES_BPS.values())
         raise ConfigError("--bit-rate", bit_rate, allowed)
     place = _meant(find_buses(interface, channel, bitrate, fd, hand, bus), serial, node_id)
-    with Line(place.bus) as line:
+    with BusConnection(place.bus) as connection:
         if serial is None:
             with progress(as_json) as tell:
                 tell("fastscan")
-                address = only_unconfigured(line)
+                address = only_unconfigured(connection)
         else:
             named = LssAddress(
                 od.VENDOR_ID if vendor is None else vendor,
@@ -126,12 +126,14 @@ def set_node(
                 serial,
             )
             ours = vendor is None and product is None and revision is None
-            address = line.lss.select_patch(serial) or named if ours else named
+            address = connection.lss.select_patch(serial) or named if ours else named
 
         def agreed(before: int | None) -> bool:
             return yes or _confirmed(address.serial_number, before, node_id, bit_rate, store)
 
-        done = commission(line, address, node_id=node_id, bitrate_bps=bit_rate, store=store, agreed=agreed)
+        done = commission(
+            connection, address, node_id=node_id, bitrate_bps=bit_rate, store=store, agreed=agreed
+        )
     if done is None:
         raise ConfigError("--yes", Shown("no"), "yes to the question; nothing was changed")
     if as_json:

@@ -11,7 +11,7 @@ from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, 
 
 if TYPE_CHECKING:
     from skinnode.cli._bus import Place
-    from skinnode.technician.nmt import Change
+    from skinnode.diagnose.nmt_commands import Change
 
 _COMMANDS = "start stop pre-operational reset-node reset-communication"
 
@@ -47,10 +47,10 @@ def nmt(
     """
     from skinnode.cli._bus import find_buses, find_node
     from skinnode.cli._console import console, print_json, progress, table
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.discovery import discover
+    from skinnode.diagnose.nmt_commands import Command, command_nodes
     from skinnode.errors import BusError, ConfigError
-    from skinnode.technician.line import Line
-    from skinnode.technician.nmt import Command, command_nodes
-    from skinnode.technician.survey import survey
 
     if command not in _COMMANDS.split():
         raise ConfigError("COMMAND", command, _COMMANDS.replace(" ", ", "))
@@ -62,12 +62,14 @@ def nmt(
     changes: list[tuple[Place, Change]] = []
     with progress(as_json) as tell:
         for place, node_ids in wanted:
-            with Line(place.bus) as line:
+            with BusConnection(place.bus) as connection:
                 if node == "all":
-                    node_ids = [found.node_id for found in survey(line, tell).nodes]
+                    node_ids = [found.node_id for found in discover(connection, tell).nodes]
                 tell(f"{place.bus.name}: {command}")
                 done = (
-                    command_nodes(line, node_ids, Command(command), at_once=node == "all") if node_ids else []
+                    command_nodes(connection, node_ids, Command(command), at_once=node == "all")
+                    if node_ids
+                    else []
                 )
             changes += [(place, change) for change in done]
     if not changes:

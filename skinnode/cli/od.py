@@ -11,10 +11,10 @@ from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, 
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
-    from skinnode.conformance.eds import EdsEntry
+    from skinnode.conformance.eds_reader import EdsEntry
+    from skinnode.diagnose.data_sheet import DataSheet
+    from skinnode.diagnose.object_dictionary import Difference, Reading
     from skinnode.host.sdo_client import RemoteOd
-    from skinnode.technician.dictionary import Difference, Reading
-    from skinnode.technician.sheet import Sheet
 
 
 def od(
@@ -53,18 +53,18 @@ def od(
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
-    from skinnode.errors import ConfigError
-    from skinnode.files.output_file import require_writable
-    from skinnode.technician.dcf import expected
-    from skinnode.technician.dictionary import (
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.data_sheet import data_sheet_of, load_data_sheet
+    from skinnode.diagnose.dcf import expected
+    from skinnode.diagnose.object_dictionary import (
         compare,
         dump,
         dump_standard,
         entries_at,
         parse_address,
     )
-    from skinnode.technician.line import Line
-    from skinnode.technician.sheet import load_sheet, sheet_of
+    from skinnode.errors import ConfigError
+    from skinnode.files.output_file import require_writable
 
     place, node_id = find_node(node, interface, channel, bitrate, fd, hand, bus)
     where = None if address is None else parse_address(address)
@@ -78,16 +78,16 @@ def od(
         require_writable("--dcf", dcf)
     wanted = None
     if diff is not None:
-        compared = load_sheet(diff)
+        compared = load_data_sheet(diff)
         _note(compared)
         wanted = expected(compared)
-    with progress(as_json) as tell, Line(place.bus) as line:
+    with progress(as_json) as tell, BusConnection(place.bus) as line:
         remote = line.od(node_id)
         line.require_answer(node_id)
         if wanted is not None:
             found = compare(remote, wanted, node_id, tell)
         else:
-            sheet = sheet_of(remote, eds) if dcf is not None else _sheet_if_any(remote, eds)
+            sheet = data_sheet_of(remote, eds) if dcf is not None else _sheet_if_any(remote, eds)
             _note(sheet)
             if where is None:
                 bare = not sheet.eds.entries
@@ -113,32 +113,32 @@ def od(
             typer.echo(f"note: node {node_id} is not a skinnode patch; --eds FILE names all its objects")
 
 
-def _note(sheet: Sheet) -> None:
+def _note(sheet: DataSheet) -> None:
     if sheet.note:
         typer.echo(f"note: {sheet.note}", err=True)
 
 
-def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> Sheet:
+def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the sheet of the node. It has no entries for a third-party device without an EDS, or a node that
     refuses to say which it is: CiA 301 then names the objects."""
-    from skinnode.conformance.eds import Eds
+    from skinnode.conformance.eds_reader import Eds
+    from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of
     from skinnode.errors import NodeError, ProfileError
-    from skinnode.technician.sheet import Sheet, sheet_of
 
     try:
-        return sheet_of(remote, eds)
+        return data_sheet_of(remote, eds)
     except ProfileError:
         if eds is not None:
             raise
         why = ""
     except NodeError as error:
         why = f"{error}: objects are named by CiA 301 alone"
-    return Sheet(Eds("", {}, frozenset(), {}, ()), "", note=why)
+    return DataSheet(Eds("", {}, frozenset(), {}, ()), "", note=why)
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
     """One object alone must be there; of several the refusal of one is told beside the others."""
-    from skinnode.technician.dictionary import read_entry
+    from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":
         remote.read_bytes(entries[0].index, entries[0].subindex)
@@ -146,8 +146,8 @@ def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
 
 
 def _write(remote: RemoteOd, entries: list[EdsEntry], text: str, as_hex: bool, node_id: int) -> None:
+    from skinnode.diagnose.object_dictionary import encode
     from skinnode.errors import ConfigError
-    from skinnode.technician.dictionary import encode
 
     if len(entries) != 1:
         raise ConfigError(
@@ -165,10 +165,10 @@ def _write(remote: RemoteOd, entries: list[EdsEntry], text: str, as_hex: bool, n
 
 
 def _write_dcf(
-    file: Path, readings: list[Reading], sheet: Sheet, node_id: int, bitrate: int, name: str
+    file: Path, readings: list[Reading], sheet: DataSheet, node_id: int, bitrate: int, name: str
 ) -> None:
+    from skinnode.diagnose.dcf import as_dcf
     from skinnode.files.output_file import write_text
-    from skinnode.technician.dcf import as_dcf
     from skinnode.text.words import counted
 
     made = as_dcf(sheet, readings, node_id, bitrate, name or f"node {node_id}")
@@ -186,7 +186,7 @@ def _write_dcf(
 
 def _print(readings: list[Reading], as_hex: bool, *, single: bool) -> None:
     from skinnode.cli._console import console, table
-    from skinnode.technician.dictionary import hex_text
+    from skinnode.diagnose.object_dictionary import hex_text
 
     out = console()
     listed = table("object", "name", "type", "access", "value")

@@ -10,7 +10,7 @@ from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
 
 if TYPE_CHECKING:
     from skinnode.cli._bus import Place
-    from skinnode.technician.survey import FoundNode, Survey
+    from skinnode.diagnose.discovery import Discovery, FoundNode
 
 
 def scan(
@@ -31,14 +31,14 @@ def scan(
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
-    from skinnode.technician.line import Line
-    from skinnode.technician.survey import survey
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.discovery import discover
 
-    scans: list[tuple[Place, Survey]] = []
+    scans: list[tuple[Place, Discovery]] = []
     with progress(as_json) as tell:
         for place in find_buses(interface, channel, bitrate, fd, hand, bus):
-            with Line(place.bus) as line:
-                scans.append((place, survey(line, tell)))
+            with BusConnection(place.bus) as connection:
+                scans.append((place, discover(connection, tell)))
     named = len(scans) > 1
     faults = [
         f"{place.bus.name}: {fault}" if named else fault
@@ -53,9 +53,9 @@ def scan(
         raise typer.Exit(1)
 
 
-def _faults(found: Survey, place: Place) -> list[str]:
+def _faults(found: Discovery, place: Place) -> list[str]:
     """What is not as it should be, one line each."""
-    from skinnode.technician.line import no_answer
+    from skinnode.diagnose.bus_connection import no_answer
     from skinnode.text.words import known
 
     faults = [
@@ -85,7 +85,7 @@ def _faults(found: Survey, place: Place) -> list[str]:
     return faults
 
 
-def _as_json(scans: list[tuple[Place, Survey]], faults: list[str]) -> dict[str, object]:
+def _as_json(scans: list[tuple[Place, Discovery]], faults: list[str]) -> dict[str, object]:
     """Return the scans as JSON, in the same shape for one bus and for several: each node names its bus."""
     from dataclasses import asdict
 
@@ -113,7 +113,7 @@ def _as_json(scans: list[tuple[Place, Survey]], faults: list[str]) -> dict[str, 
     }
 
 
-def _print(scans: list[tuple[Place, Survey]], faults: list[str]) -> None:
+def _print(scans: list[tuple[Place, Discovery]], faults: list[str]) -> None:
     from skinnode.cli._console import console
 
     out = console()
@@ -125,7 +125,7 @@ def _print(scans: list[tuple[Place, Survey]], faults: list[str]) -> None:
         out.print(f"fault: {fault}")
 
 
-def _print_bus(found: Survey, place: Place) -> None:
+def _print_bus(found: Discovery, place: Place) -> None:
     from skinnode.cli._console import console, table
     from skinnode.text.words import counted
 

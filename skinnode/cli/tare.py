@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from skinnode.cli._bus import Place
-    from skinnode.technician.tare import Tared
+    from skinnode.diagnose.tare import Tared
 
 
 def tare(
@@ -75,8 +75,8 @@ def tare(
 def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
     """Tare the nodes of one bus. Opens it only if at least one of them may be tared. Raises BusError if the
     bus fails."""
-    from skinnode.technician.line import Line
-    from skinnode.technician.tare import Tared, refusal, tare
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.tare import Tared, refusal, tare
 
     named = {patch.node_id: patch for patch in place.patches}
     refused = {
@@ -89,12 +89,12 @@ def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> 
         for node_id, why in refused.items()
     }
     if len(refused) < len(node_ids):
-        with Line(place.bus) as line:
+        with BusConnection(place.bus) as connection:
             for node_id in node_ids:
                 if node_id not in refused:
                     period_s = 0.0 if place.hand is None else place.hand.sync.period_s
                     done[node_id] = tare(
-                        line,
+                        connection,
                         node_id,
                         place.patch_name(node_id),
                         sync_period_s=period_s,

@@ -7,7 +7,7 @@ constants, so that a wrong number in :mod:`skinnode.canopen` fails a case.
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict
 from skinnode.conformance.dut import Dut
-from skinnode.conformance.eds import Eds, parse_eds, parse_eds_file
+from skinnode.conformance.eds_reader import Eds, parse_eds, parse_eds_file
 from skinnode.conformance.run import Report, connect, run_case, run_cases
 from skinnode.conformance.suite import CASES, select
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from skinnode.conformance.bus import TraceLine
+from skinnode.conformance.tester import TraceLine
 
 if TYPE_CHECKING:
     from skinnode.conformance.dut import Dut

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.dut import RESTORE, STORE, Dut
+from skinnode.conformance.tester import Failed
 
 Values = Mapping[tuple[int, int], bytes]
 

@@ -6,10 +6,10 @@ import contextlib
 import time
 from typing import Final
 
-from skinnode.conformance.bus import QUIET_S, Failed, Tester, describe
 from skinnode.conformance.case import NotApplicable
-from skinnode.conformance.eds import Eds, EdsEntry
+from skinnode.conformance.eds_reader import Eds, EdsEntry
 from skinnode.conformance.sdo import Aborted, SdoClient
+from skinnode.conformance.tester import QUIET_S, Failed, Tester, describe
 from skinnode.errors import NodeTimeout
 
 START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skinnode.conformance.bus import Failed, describe
 from skinnode.conformance.case import NotApplicable
 from skinnode.conformance.dut import Dut
 from skinnode.conformance.sdo import Aborted
+from skinnode.conformance.tester import Failed, describe
 from skinnode.text.words import counted
 from skinnode.transport import Frame
 

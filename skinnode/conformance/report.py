@@ -1,4 +1,4 @@
-"""A run as text, JSON and JUnit XML. HTML is in :mod:`skinnode.conformance.html`."""
+"""A run as text, JSON and JUnit XML. HTML is in :mod:`skinnode.conformance.html_report`."""
 
 from __future__ import annotations
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from skinnode.canopen import indices as od
-from skinnode.conformance.bus import Failed, Tester
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict, Warned
 from skinnode.conformance.configuration import read_configuration, write_back
 from skinnode.conformance.dut import Dut
-from skinnode.conformance.eds import Eds, parse_eds
+from skinnode.conformance.eds_reader import Eds, parse_eds
 from skinnode.conformance.sdo import SdoClient
+from skinnode.conformance.tester import Failed, Tester
 from skinnode.errors import BusError, ConfigError, NodeTimeout
 from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
 from skinnode.transport import CanPort

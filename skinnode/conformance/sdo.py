@@ -10,7 +10,7 @@ import struct
 from collections.abc import Collection
 from typing import Final
 
-from skinnode.conformance.bus import ANSWER_S, Failed, Tester, describe
+from skinnode.conformance.tester import ANSWER_S, Failed, Tester, describe
 from skinnode.text.words import counted
 from skinnode.transport import Frame
 

@@ -16,13 +16,13 @@ from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 
 from skinnode.errors import SkinError
-from skinnode.monitor.look import Ui, look_for
-from skinnode.monitor.maps import Colours, Scale
-from skinnode.monitor.paint import screen
+from skinnode.monitor.field_map import Colours, Scale
 from skinnode.monitor.report import FaultBook
+from skinnode.monitor.screen import screen
 from skinnode.monitor.source import Source
-from skinnode.monitor.state import History, Level, LogLine, View, log_line, time_of_day
-from skinnode.monitor.terminal import PatientDriver
+from skinnode.monitor.terminal_driver import PatientDriver
+from skinnode.monitor.theme import Ui, theme_for
+from skinnode.monitor.view_model import History, Level, LogLine, View, log_line, time_of_day
 from skinnode.monitor.widgets import Canvas, Dialog
 
 PERIOD_S: Final = 0.1
@@ -86,7 +86,7 @@ class MonitorApp(App[None]):
         self.failure: SkinError | None = None
         """What ended the source."""
         self._source, self._folder, self._told, self._seconds = source, folder, over, seconds
-        self._look = look_for(colours)
+        self._look = theme_for(colours)
         self.canvas = Canvas()
         self._names = [patch.name for patch in source.hand.patches]
         self._selected = 0
@@ -150,7 +150,7 @@ class MonitorApp(App[None]):
     def _look_at_source(self) -> None:
         snapshot = self._source.snapshot()
         view = self._history.add(snapshot)
-        self.faults.look(view, time.monotonic_ns())
+        self.faults.update(view, time.monotonic_ns())
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
             if not begins:  # that a hand begins is no news
@@ -158,7 +158,7 @@ class MonitorApp(App[None]):
         self._settle_tares()
         if not self._paused:
             self._view = view
-            self._scale.look(view.t_ns, view.deepest_m)
+            self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
         """Show how things are, unless the terminal has not taken the last picture yet: the next turn will."""

@@ -10,8 +10,8 @@ from typing import Any, Final
 from skinnode.host.accounting import losses_of_stream
 from skinnode.host.health import Condition, PatchHealth
 from skinnode.monitor.source import Source
-from skinnode.monitor.state import History, PatchView, View
 from skinnode.monitor.touches import Touch
+from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
 """How long a patch may take to become operational before the monitor counts it as a fault."""
@@ -34,7 +34,7 @@ class FaultBook:
         """A line each."""
         return list(self._found.values())
 
-    def look(self, view: View, real_ns: int, *, ending: bool = False) -> None:
+    def update(self, view: View, real_ns: int, *, ending: bool = False) -> None:
         """Write down what is wrong at ``real_ns``, by the clock of the monitor; ``ending``: for the last
         time, so that nothing is waited for any more."""
         if self._begun_ns is None:
@@ -84,7 +84,7 @@ def watch(
         now_s = time.monotonic()
         ending |= seconds is not None and now_s >= begun_s + seconds
         view = history.add(source.snapshot())
-        faults.look(view, time.monotonic_ns(), ending=ending)
+        faults.update(view, time.monotonic_ns(), ending=ending)
         pending += [str(event) for event in source.events()]
         if ending or now_s >= due_s:
             due_s += LINE_S

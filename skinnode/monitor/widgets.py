@@ -14,7 +14,7 @@ from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import Static
 
-from skinnode.monitor.maps import Line
+from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
 """Lines for a width and a height."""

@@ -15,8 +15,8 @@ from skinnode.cli._usage import run
 from skinnode.cli.main import app
 from skinnode.cli.scan import _faults
 from skinnode.config import load_hand
+from skinnode.diagnose.discovery import Discovery, FoundNode
 from skinnode.errors import ConfigError
-from skinnode.technician.survey import FoundNode, Survey
 from vcan_sim.cli import app as simulator
 from vcan_sim.fleet import Fleet
 
@@ -196,7 +196,7 @@ def test_of_a_device_that_tells_nothing_about_itself(folder: Path) -> None:
     )
     node = FoundNode(5, True, "unknown", "no heartbeat", boot_ups=0, duplicate="", **nothing)
     place = Place(hand.buses[0], hand)
-    for fault in _faults(Survey((node,), (), False, 1.0), place):
+    for fault in _faults(Discovery((node,), (), False, 1.0), place):
         check(f"fault: {fault}")
 
 

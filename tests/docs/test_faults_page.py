@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-import skinnode.doctor
+import skinnode.diagnose
 from skinnode.canopen.emergency import EmcyCode
-from skinnode.doctor.causes import RULES
+from skinnode.diagnose.root_causes import RULES
 from skinnode.host import events
 from skinnode.host.code_watch import WireState
 from skinnode.host.health import BusHealth, Condition, PatchHealth
@@ -25,7 +25,7 @@ FINDINGS = set(re.findall(r"doctor: ([^;|]*[^;| ])", PAGE))
 
 def _calls() -> Iterator[ast.Call]:
     """All calls by plain name in the doctor's source."""
-    for file in sorted(Path(skinnode.doctor.__path__[0]).glob("*.py")):
+    for file in sorted(Path(skinnode.diagnose.__path__[0]).rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 yield node

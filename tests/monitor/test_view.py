@@ -14,13 +14,13 @@ from skinnode.host import Host
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
-from skinnode.monitor import maps
-from skinnode.monitor.look import Ui, look_for
-from skinnode.monitor.maps import Colours, Scale, aspect_of, paint_map, paint_shear, surface_of
-from skinnode.monitor.paint import as_text, screen
+from skinnode.monitor import field_map
+from skinnode.monitor.field_map import Colours, Scale, aspect_of, paint_map, paint_shear, surface_of
 from skinnode.monitor.report import FaultBook, as_json
+from skinnode.monitor.screen import as_text, screen
 from skinnode.monitor.source import HostSource, ReplaySource
-from skinnode.monitor.state import History, View
+from skinnode.monitor.theme import Ui, theme_for
+from skinnode.monitor.view_model import History, View
 from skinnode.record import Recorder, replay
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet
@@ -45,7 +45,7 @@ def a_field(moved_m: dict[tuple[int, int], tuple[float, float, float]], std_m: f
     )
 
 
-def cells(lines: list[maps.Line], sign: str) -> set[tuple[int, int]]:
+def cells(lines: list[field_map.Line], sign: str) -> set[tuple[int, int]]:
     text = as_text(lines).split("\n")
     return {(x, y) for y, line in enumerate(text) for x, found in enumerate(line) if found == sign}
 
@@ -117,19 +117,19 @@ def test_shear_within_its_noise_is_no_arrow_and_unknown_skin_is_not_untouched() 
 def test_a_long_patch_is_drawn_long() -> None:
     long = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3, upper_wires=4, upper_electrodes=12)
     assert aspect_of(long.upper_m) == pytest.approx(3.0, rel=0.05)
-    assert maps.fit(60, 30, 3.0) == (60, 10)
-    assert maps.fit(60, 5, 3.0) == (30, 5)
+    assert field_map.fit(60, 30, 3.0) == (60, 10)
+    assert field_map.fit(60, 5, 3.0) == (30, 5)
 
 
 def test_the_scale_has_room_for_what_is_deepest_and_goes_back() -> None:
     scale, second = Scale(), 1_000_000_000
-    scale.look(0, 2e-6)
+    scale.update(0, 2e-6)
     assert scale.full_m == pytest.approx(5e-5)
-    scale.look(1 * second, 5.5e-4)
+    scale.update(1 * second, 5.5e-4)
     assert scale.full_m == pytest.approx(7e-4)
-    scale.look(2 * second, 1e-5)
+    scale.update(2 * second, 1e-5)
     assert scale.full_m == pytest.approx(7e-4)  # so that it does not flicker
-    scale.look(9 * second, 1e-5)
+    scale.update(9 * second, 1e-5)
     assert scale.full_m == pytest.approx(5e-5)
 
 
@@ -189,7 +189,7 @@ def test_every_line_has_its_width_at_every_size(patches: int, colours: Colours) 
     for width, height in ((80, 24), (50, 16), (132, 43), (200, 50), (20, 5)):
         for zoomed in (False, True):
             ui = Ui("hand", "p0", zoomed=zoomed, message="said" if zoomed else "")
-            lines = screen(view, ui, [], 1e-4, look_for(colours), width, height)
+            lines = screen(view, ui, [], 1e-4, theme_for(colours), width, height)
             assert len(lines) == height
             assert {sum(segment.cell_length for segment in line) for line in lines} == {width}
             if width >= 80 and not zoomed:
@@ -205,10 +205,10 @@ def test_untouched_skin_has_an_outline() -> None:
             time.sleep(0.02)
             view = history.add(source.snapshot())
     for width, height in ((80, 24), (132, 43)):
-        text = as_text(screen(view, Ui("hand", "p0"), [], 1e-4, look_for("rgb"), width, height))
+        text = as_text(screen(view, Ui("hand", "p0"), [], 1e-4, theme_for("rgb"), width, height))
         assert text.count("┌") == text.count("┘") == 2
         alone = Ui("hand", "p0", zoomed=True)
-        text = as_text(screen(view, alone, [], 1e-4, look_for("rgb"), width, height))
+        text = as_text(screen(view, alone, [], 1e-4, theme_for("rgb"), width, height))
         assert text.count("┌") == text.count("┘") == 2  # depth and shear
 
 
@@ -216,14 +216,14 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
     hand = a_hand(2, sync={"period_ms": 50})
     with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
         history = History(hand)
-        ui, look = Ui("hand", "p0"), look_for("rgb")
+        ui, theme = Ui("hand", "p0"), theme_for("rgb")
         begun_s = time.monotonic()
         while time.monotonic() < begun_s + 8.0:
             time.sleep(0.05)
             view = history.add(source.snapshot())
             if all(patch.level == "good" and patch.depth_m is not None for patch in view.patches):
                 break
-        well = as_text(screen(view, ui, [], 1e-4, look, 120, 40))
+        well = as_text(screen(view, ui, [], 1e-4, theme, 120, 40))
         fleet.inject(Faults(lost=0.05, open_upper=1), "p0")
         while time.monotonic() < begun_s + 20.0:
             time.sleep(0.05)
@@ -231,7 +231,7 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
             patch = view.patch("p0")
             if patch.level == "bad" and patch.stream.assembler.chunks_lost:
                 break
-        lines = screen(view, ui, [], 1e-4, look, 120, 40)
+        lines = screen(view, ui, [], 1e-4, theme, 120, 40)
     assert "nothing happened" in well
     assert "nothing lost" in well
     ill = as_text(lines)
@@ -241,7 +241,7 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
     (told,) = [segment for line in lines for segment in line if re.match(r"\d+ chunks? lost", segment.text)][
         :1
     ]
-    assert told.style != look.good
+    assert told.style != theme.good
 
 
 def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> None:
@@ -260,7 +260,7 @@ def test_a_recording_is_shown_as_it_was_and_cannot_be_tared(tmp_path: Path) -> N
         history = History(source.hand)
         end_s = time.monotonic() + 10.0
         while not source.over and time.monotonic() < end_s:
-            faults.look(history.add(source.snapshot()), time.monotonic_ns())
+            faults.update(history.add(source.snapshot()), time.monotonic_ns())
             time.sleep(0.01)
         view = history.add(source.snapshot())
         assert source.over

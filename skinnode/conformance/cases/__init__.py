@@ -1,24 +1,24 @@
 """The cases, a module an area, in the order of the plan."""
 
 from skinnode.conformance.cases import (
+    eds,
     emcy,
     guarding,
     heartbeat,
+    heartbeat_or_guarding,
     od,
     others,
     pdo,
     pdo_mapping,
     sdo,
     sdo_block,
-    sheet,
     states,
     sync,
     transitions,
-    versus,
 )
 
 AREAS = (
-    sheet,
+    eds,
     sdo,
     sdo_block,
     pdo,
@@ -28,7 +28,7 @@ AREAS = (
     sync,
     guarding,
     heartbeat,
-    versus,
+    heartbeat_or_guarding,
     others,
     states,
     transitions,

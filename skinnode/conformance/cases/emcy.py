@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from skinnode.conformance.bus import Failed, describe
 from skinnode.conformance.case import case
 from skinnode.conformance.dut import PRE_OPERATIONAL, Dut
-from skinnode.conformance.provoke import emcy_code, short_pdo
+from skinnode.conformance.provoked_errors import emcy_code, short_pdo
 from skinnode.conformance.sdo import expedited, mux
+from skinnode.conformance.tester import Failed, describe
 
 _COB_ID, _REGISTER, _HISTORY = 0x1014, 0x1001, 0x1003
 _NO_DATA = 0x0800_0024

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import case
 from skinnode.conformance.dut import GUARD_TIME, LIFE_TIME_FACTOR, RESET_COMMUNICATION, STATES, Dut
-from skinnode.conformance.provoke import COMMUNICATION_LOST, expect_emcy, expect_no_emcy, not_before
+from skinnode.conformance.provoked_errors import COMMUNICATION_LOST, expect_emcy, expect_no_emcy, not_before
+from skinnode.conformance.tester import Failed
 
 _TOGGLE = 0x80
 _GUARD_MS, _FACTOR = 100, 3

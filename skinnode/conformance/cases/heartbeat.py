@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from skinnode.conformance.bus import QUIET_S, Failed, describe
 from skinnode.conformance.case import case
 from skinnode.conformance.dut import HEARTBEAT, Dut
-from skinnode.conformance.pace import check_period
-from skinnode.conformance.provoke import (
+from skinnode.conformance.frame_period import check_period
+from skinnode.conformance.provoked_errors import (
     COMMUNICATION_LOST,
     CONSUMER,
     beat,
@@ -17,6 +16,7 @@ from skinnode.conformance.provoke import (
     not_before,
 )
 from skinnode.conformance.sdo import expedited
+from skinnode.conformance.tester import QUIET_S, Failed, describe
 
 _PERIOD_MS = 50
 _BEHAVIOUR = 0x1029

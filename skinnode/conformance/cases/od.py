@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import NotApplicable, Warned, case
 from skinnode.conformance.cases.sdo import NO_SUBINDEX, READ_ONLY, TOO_HIGH, TOO_LOW, WRITE_ONLY, limited
 from skinnode.conformance.dut import RESTORE, STORE, Dut
-from skinnode.conformance.eds import EdsEntry
+from skinnode.conformance.eds_reader import EdsEntry
 from skinnode.conformance.sdo import Aborted, expedited, mux
+from skinnode.conformance.tester import Failed
 from skinnode.text.words import counted
 
 _COMMUNICATION = 0x1000, 0x1FFF

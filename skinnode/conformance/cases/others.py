@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import HEARTBEAT, RESTORE, STORE, Dut
 from skinnode.conformance.pdo import COB_ID, INVALID
 from skinnode.conformance.sdo import expedited
+from skinnode.conformance.tester import Failed
 
 _EMCY_INHIBIT, _VERIFY, _EMCY = 0x1015, 0x1020, 0x1014
 _WRONG_SIGNATURE = (0x0800_0020,)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import statistics
 
-from skinnode.conformance.bus import ANSWER_S, QUIET_S, Failed
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import PRE_OPERATIONAL, START, STOP, Dut
-from skinnode.conformance.pace import check_period, gaps_ms
+from skinnode.conformance.frame_period import check_period, gaps_ms
 from skinnode.conformance.pdo import (
     CAN_ID,
     EVENT_TIMER,
@@ -26,6 +25,7 @@ from skinnode.conformance.pdo import (
     sync,
     tpdos,
 )
+from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import Dut
-from skinnode.conformance.eds import EdsEntry
+from skinnode.conformance.eds_reader import EdsEntry
 from skinnode.conformance.pdo import (
     CAN_ID,
     INVALID,
@@ -22,6 +21,7 @@ from skinnode.conformance.pdo import (
     tpdos,
 )
 from skinnode.conformance.sdo import Aborted, expedited
+from skinnode.conformance.tester import Failed
 from skinnode.text.words import counted
 
 NOT_MAPPABLE = (0x0602_0000, 0x0604_0041)

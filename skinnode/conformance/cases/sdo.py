@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, Dut
-from skinnode.conformance.eds import SIGNED, UNSIGNED, EdsEntry
+from skinnode.conformance.eds_reader import SIGNED, UNSIGNED, EdsEntry
 from skinnode.conformance.sdo import expedited, mux
+from skinnode.conformance.tester import Failed
 from skinnode.text.words import counted
 
 READ_ONLY = (0x0601_0000, 0x0601_0002)

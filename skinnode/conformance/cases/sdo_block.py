@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.cases.sdo import NO_OBJECT, UNKNOWN_COMMAND, check, long_object
 from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, RESET_COMMUNICATION, STORE, Dut
 from skinnode.conformance.sdo import Aborted, mux
+from skinnode.conformance.tester import Failed
 
 _BLOCK_SIZE, _SEQUENCE, _CRC = 0x0504_0002, 0x0504_0003, 0x0504_0004
 

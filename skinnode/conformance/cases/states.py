@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 
-from skinnode.conformance.bus import QUIET_S, Failed, describe
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.cases.guarding import guarded
 from skinnode.conformance.cases.sync import consume_only, produce
@@ -21,8 +20,9 @@ from skinnode.conformance.pdo import (
     sync,
     tpdos,
 )
-from skinnode.conformance.provoke import COMMUNICATION_LOST, expect_emcy, lose_partner
+from skinnode.conformance.provoked_errors import COMMUNICATION_LOST, expect_emcy, lose_partner
 from skinnode.conformance.sdo import mux
+from skinnode.conformance.tester import QUIET_S, Failed, describe
 from skinnode.text.words import counted
 
 _BEHAVIOUR = 0x1029

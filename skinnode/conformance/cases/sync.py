@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from skinnode.conformance.bus import QUIET_S, Failed, describe
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import STORE, Dut
-from skinnode.conformance.pace import check_period
+from skinnode.conformance.frame_period import check_period
 from skinnode.conformance.pdo import SYNC_ID, Pdo, drain, mapped, payload_bytes, set_up, sync, tpdos
 from skinnode.conformance.sdo import Aborted, expedited
+from skinnode.conformance.tester import QUIET_S, Failed, describe
 from skinnode.text.words import counted
 
 COB_ID, PERIOD, OVERFLOW = 0x1005, 0x1006, 0x1019

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from skinnode.conformance.bus import Failed
 from skinnode.conformance.case import case
 from skinnode.conformance.cases.sdo import limited
 from skinnode.conformance.dut import (
@@ -14,8 +13,9 @@ from skinnode.conformance.dut import (
     STOP,
     Dut,
 )
-from skinnode.conformance.eds import UNSIGNED, EdsEntry
+from skinnode.conformance.eds_reader import UNSIGNED, EdsEntry
 from skinnode.conformance.sdo import Aborted
+from skinnode.conformance.tester import Failed
 
 _COMMANDS = {PRE_OPERATIONAL: 127, START: 5, STOP: 4}
 _NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"}

@@ -1,0 +1,90 @@
+"""Heartbeat versus guarding 1 to 7: a device uses one of them at a time, heartbeat first (7.2.8.2.2)."""
+
+from __future__ import annotations
+
+from skinnode.conformance.case import case
+from skinnode.conformance.cases.guarding import guarded
+from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, LIFE_TIME_FACTOR, Dut
+from skinnode.conformance.frame_period import check_period
+from skinnode.conformance.provoked_errors import COMMUNICATION_LOST, expect_no_emcy
+from skinnode.conformance.tester import Failed, describe
+
+_PERIOD_MS = 50
+_CLAUSE = "7.2.8.2.2"
+
+
+def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
+    """Set both; NotApplicable where the device has but one of them."""
+    dut.need(HEARTBEAT)
+    dut.need(GUARD_TIME)
+    dut.need(LIFE_TIME_FACTOR)
+    dut.sdo.write_integer(GUARD_TIME, 0, guard_ms, 2)
+    dut.sdo.write_integer(LIFE_TIME_FACTOR, 0, 2 if guard_ms else 0, 1)
+    dut.sdo.write_integer(HEARTBEAT, 0, heartbeat_ms, 2)
+
+
+def _heartbeats(dut: Dut, *, remote: bool) -> None:
+    """Heartbeats come at their pace and nothing else does, though remote frames are sent between them."""
+    frames = []
+    for _ in range(8):
+        frames.append(dut.bus.expect(dut.error_control_id, "a heartbeat"))
+        if remote:
+            dut.bus.send(dut.error_control_id, remote=True)
+    for frame in frames:
+        if frame.data != b"\x7f":
+            raise Failed("heartbeats alone, 7F without a toggle bit", describe(frame))
+    check_period(frames, _PERIOD_MS, "one frame")
+
+
+@case("HBVG-01", "The device has heartbeat or guarding, and after a reset at most one of them runs", _CLAUSE)
+def supported(dut: Dut) -> None:
+    heartbeat, guarding = dut.eds.find(HEARTBEAT), dut.eds.find(GUARD_TIME)
+    if heartbeat is None and guarding is None:
+        raise Failed("heartbeat (0x1017) or guarding (0x100C) in the EDS", "neither")
+    running = heartbeat is not None and dut.sdo.integer(HEARTBEAT) > 0
+    guarded_too = guarding is not None and dut.sdo.integer(GUARD_TIME) > 0
+    if running and guarded_too:
+        raise Failed("heartbeat or guarding on after a reset", "both 0x1017 and 0x100C above 0")
+
+
+@case("HBVG-02", "Heartbeat off, guarding off: nothing comes by itself", _CLAUSE)
+def both_off(dut: Dut) -> None:
+    _both(dut, 0, 0)
+    dut.bus.expect_silence(dut.error_control_id, "frame of error control", 3 * _PERIOD_MS * 1e-3)
+
+
+@case("HBVG-03", "Heartbeat off, guarding on: remote frames are answered, nothing else comes", _CLAUSE)
+def guarding_on(dut: Dut) -> None:
+    _both(dut, 0, 1000)
+    for number in range(4):
+        guarded(dut, 127, number % 2, "heartbeat off")
+    dut.bus.expect_silence(dut.error_control_id, "frame of error control")
+
+
+@case("HBVG-04", "Heartbeat on, guarding off: heartbeats come", _CLAUSE)
+def heartbeat_on(dut: Dut) -> None:
+    _both(dut, _PERIOD_MS, 0)
+    _heartbeats(dut, remote=False)
+
+
+@case("HBVG-05", "Heartbeat on, guarding off: remote frames are not answered", _CLAUSE)
+def heartbeat_on_remote(dut: Dut) -> None:
+    _both(dut, _PERIOD_MS, 0)
+    _heartbeats(dut, remote=True)
+
+
+@case("HBVG-06", "Heartbeat on, guarding on: heartbeats come", _CLAUSE)
+def both_on(dut: Dut) -> None:
+    _both(dut, _PERIOD_MS, 50)
+    _heartbeats(dut, remote=False)
+
+
+@case(
+    "HBVG-07", "Heartbeat on, guarding on: remote frames are not answered and begin no life guarding", _CLAUSE
+)
+def both_on_remote(dut: Dut) -> None:
+    _both(dut, _PERIOD_MS, 50)
+    dut.bus.send(dut.error_control_id, remote=True)
+    _heartbeats(dut, remote=True)
+    dut.bus.wait(0.15)
+    expect_no_emcy(dut, COMMUNICATION_LOST, "with the heartbeat on")

@@ -1,0 +1,30 @@
+"""Distances between frames, held against a period.
+
+A shared machine delays single frames; what is checked is the mean, which nobody may undercut, and the median,
+which few late frames do not move.
+"""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+from collections.abc import Sequence
+
+from skinnode.conformance.tester import Failed
+from skinnode.transport import Frame
+
+
+def gaps_ms(frames: Sequence[Frame]) -> list[float]:
+    """Distances of neighbours."""
+    return [(after.t_ns - before.t_ns) * 1e-6 for before, after in itertools.pairwise(frames)]
+
+
+def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_sooner: bool = False) -> None:
+    """Raises Failed where frames do not come each ``period_ms``; ``or_sooner`` allows for events in
+    between."""
+    gaps = gaps_ms(frames)
+    mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms
+    too_seldom = mean > 1.3 or median > 1.25
+    too_often = (mean < 0.9 or median < 0.8) and not or_sooner
+    if too_seldom or too_often:
+        raise Failed(f"{what} each {period_ms:g} ms", f"gaps of {', '.join(f'{gap:.1f}' for gap in gaps)} ms")

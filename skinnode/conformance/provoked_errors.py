@@ -1,0 +1,91 @@
+"""Errors that can be provoked over the bus: a PDO too short, a heartbeat or a guarding that fails to come."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skinnode.conformance.case import NotApplicable
+from skinnode.conformance.dut import GUARD_TIME, LIFE_TIME_FACTOR, Dut
+from skinnode.conformance.pdo import CAN_ID, INVALID, mapped, rpdos
+from skinnode.conformance.tester import Failed, describe
+from skinnode.transport import Frame
+
+PDO_NOT_PROCESSED, COMMUNICATION_LOST = 0x8210, 0x8130
+CONSUMER: Final = 0x1016
+
+
+def emcy_code(frame: Frame) -> int:
+    """The error code of an emergency message. Raises Failed where it has no eight bytes."""
+    if len(frame.data) != 8:
+        raise Failed("an emergency message of 8 bytes", describe(frame))
+    return int.from_bytes(frame.data[:2], "little")
+
+
+def expect_emcy(dut: Dut, code: int, what: str) -> Frame:
+    """The next emergency message with ``code``."""
+    return dut.bus.expect(
+        dut.emcy_id, f"EMCY 0x{code:04X} {what}", match=lambda frame: emcy_code(frame) == code
+    )
+
+
+def expect_no_emcy(dut: Dut, code: int, what: str) -> None:
+    """None with ``code`` has come."""
+    for frame in dut.bus.pending(dut.emcy_id):
+        if emcy_code(frame) == code:
+            raise Failed(f"no EMCY 0x{code:04X} {what}", describe(frame))
+
+
+def short_pdo(dut: Dut) -> Frame:
+    """Send an RPDO without a byte in OPERATIONAL; the emergency message that follows."""
+    for pdo in rpdos(dut):
+        cob_id = dut.sdo.integer(pdo.parameter, 1)
+        if cob_id & INVALID or not mapped(dut, pdo):
+            continue
+        dut.operational()
+        dut.bus.pending(dut.emcy_id)
+        dut.bus.send(cob_id & CAN_ID)
+        return expect_emcy(dut, PDO_NOT_PROCESSED, f"to {pdo} without a byte")
+    raise NotApplicable("no RPDO is valid and maps something by default: no error can be provoked")
+
+
+def foreign_id(dut: Dut) -> int:
+    """A node-ID that is not the device's own."""
+    return 0x55 if dut.node_id != 0x55 else 0x56
+
+
+def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
+    """Have the device expect heartbeats of ``node_id``."""
+    dut.need(CONSUMER, subindex)
+    dut.sdo.write_integer(CONSUMER, subindex, node_id << 16 | within_ms, 4)
+
+
+def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int = 5) -> int:
+    """Send heartbeats of another node; returns when the last one was sent, ns."""
+    sent_ns = 0
+    for number in range(times):
+        if number:
+            dut.bus.wait(each_s)
+        sent_ns = dut.bus.send(0x700 + node_id, bytes((state,)))
+    return sent_ns
+
+
+def lose_partner(dut: Dut, within_ms: int = 100) -> None:
+    """Let the device miss a heartbeat or, where it consumes none, its guarding. NotApplicable where it has
+    neither."""
+    if dut.eds.find(CONSUMER, 1) is not None:
+        partner = foreign_id(dut)
+        consume(dut, partner, within_ms)
+        beat(dut, partner)
+    elif dut.eds.find(GUARD_TIME) is not None:
+        dut.sdo.write_integer(GUARD_TIME, 0, within_ms, 2)
+        dut.sdo.write_integer(LIFE_TIME_FACTOR, 0, 1, 1)
+        dut.guard("to begin life guarding")
+    else:
+        raise NotApplicable("neither heartbeat consumer (0x1016) nor life guarding (0x100C) in the EDS")
+
+
+def not_before(frame: Frame, since_ns: int, least_ms: int, what: str) -> None:
+    """``frame`` must not come sooner than ``least_ms`` after ``since_ns``."""
+    elapsed_ms = (frame.t_ns - since_ns) * 1e-6
+    if elapsed_ms < least_ms - 1:  # a millisecond for the time stamps of two clocks
+        raise Failed(f"{what} not before {least_ms} ms", f"after {elapsed_ms:.1f} ms")

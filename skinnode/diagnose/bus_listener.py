@@ -1,0 +1,111 @@
+"""What is heard on a bus: who beats, who tells of errors, which COB-IDs are in use.
+
+Written by the mainline of one link, read by whoever asks: readers copy, for there are no locks.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import STATE_MASK, NmtState
+from skinnode.transport import Frame
+
+_KEPT: Final = 256
+"""Messages of a kind and node that are kept: more than half a minute of heartbeats four times a second."""
+
+
+class Beat(NamedTuple):
+    """A boot-up, a heartbeat or the answer to guarding (CiA 301, 7.2.8.3)."""
+
+    t_ns: int
+    state: int
+    """0 for a boot-up; without the toggle bit of guarding."""
+
+
+class Emergency(NamedTuple):
+    """An EMCY message (CiA 301, 7.2.7)."""
+
+    t_ns: int
+    code: int
+    register: int
+    detail: bytes
+
+
+@dataclass(slots=True)
+class NodeTraffic:
+    """What one node-ID was heard to say."""
+
+    beats: deque[Beat] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    boot_ups: int = 0
+    emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    """When, and the eight bytes."""
+    newest_sdo: tuple[int, bytes] | None = None
+    """When the newest frame on the COB-ID of SDO answers was received, and its data, of any length."""
+
+
+class BusListener:
+    """Everything since construction. :meth:`on_frames` is for :meth:`skinnode.host.link.BusLink.listen`."""
+
+    def __init__(self) -> None:
+        self._nodes: dict[int, NodeTraffic] = {}
+        self.cob_ids: Counter[int] = Counter()
+        """Data frames with 11-bit identifiers."""
+        self.nmt: Counter[bytes] = Counter()
+        """Count of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
+    another length."""
+        self.extended = self.remote = self.errors = 0
+        """Frames with 29-bit identifiers, remote frames, error frames."""
+
+    @property
+    def nodes(self) -> dict[int, NodeTraffic]:
+        """By node-ID, a copy."""
+        return dict(self._nodes)
+
+    def node(self, node_id: int) -> NodeTraffic:
+        """Of one node-ID; empty if nothing was heard of it."""
+        return self._nodes.get(node_id) or NodeTraffic()
+
+    def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
+        """The newest heartbeat or answer to guarding after ``since_ns``, None for none."""
+        beats = self.node(node_id).beats
+        newest = beats[-1] if beats else None
+        return newest if newest is not None and newest.t_ns > since_ns else None
+
+    def on_frames(self, frames: Sequence[Frame]) -> None:
+        """Note a batch."""
+        for frame in frames:
+            if frame.error:
+                self.errors += 1
+            elif frame.remote:
+                self.remote += 1
+            elif frame.extended:
+                self.extended += 1
+            else:
+                self.cob_ids[frame.can_id] += 1
+                self._note(frame)
+
+    def _note(self, frame: Frame) -> None:
+        kind, node_id = frame.can_id & od.FUNCTION_MASK, frame.can_id & od.NODE_ID_MASK
+        if frame.can_id == od.NMT_COB_ID:
+            self.nmt[frame.data if len(frame.data) == 2 else b""] += 1
+        if node_id == 0:
+            return
+        data, t_ns = frame.data, frame.t_ns
+        if kind == od.heartbeat_cob_id(0) and len(data) == 1:
+            node = self._nodes.setdefault(node_id, NodeTraffic())
+            node.boot_ups += data[0] == NmtState.INITIALISING
+            node.beats.append(Beat(t_ns, data[0] & STATE_MASK))
+        elif kind == od.emcy_cob_id(0) and len(data) == 8:
+            code = int.from_bytes(data[:2], "little")
+            node = self._nodes.setdefault(node_id, NodeTraffic())
+            node.emergencies.append(Emergency(t_ns, code, data[2], data[3:]))
+        elif kind == od.sdo_response_cob_id(0):
+            node = self._nodes.setdefault(node_id, NodeTraffic())
+            node.newest_sdo = t_ns, data
+            if len(data) == 8:
+                node.sdo_answers.append((t_ns, data))

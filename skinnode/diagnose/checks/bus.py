@@ -1,0 +1,124 @@
+"""What the facts say of a bus: interface, controller, load, strangers, and who is its master."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from skinnode.config import MAX_BUS_LOAD
+from skinnode.diagnose.facts import BusFacts, Finding, Sure
+from skinnode.text.words import counted
+
+_SYNCS: Final = 10
+_ASTRAY: Final = 0.25
+"""Of two producers half of the counters follow the other's; of one that loses some, few do not follow."""
+
+_BEATS: Final = 4
+_TOO_OFTEN: Final = 0.7
+"""Of its period; two senders beat twice as often."""
+
+
+def check_bus(bus: BusFacts) -> Iterator[Finding]:
+    """Interface, controller, load, strangers."""
+
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("bus", bus.name, what, sure, evidence, advice)
+
+    if bus.failure:
+        yield found(
+            "the interface does not work",
+            Sure.CERTAIN,
+            bus.failure,
+            "bring it up: ip link set NAME up type can bitrate BPS; check that the adapter is plugged in",
+        )
+        return
+    if bus.link_state is not None and bus.link_state not in ("ERROR-ACTIVE", "ERROR-WARNING"):
+        yield found(
+            f"the controller is {bus.link_state}",
+            Sure.CERTAIN,
+            "the kernel says so (ip -details link show)",
+            "check bit rate, cable and the two terminations of 120 ohm; then take the interface down and up",
+        )
+    if bus.link_bitrate_bps not in (None, bus.bitrate_bps):
+        yield found(
+            "the interface has another bit rate than the hand file",
+            Sure.CERTAIN,
+            f"{bus.link_bitrate_bps} bit/s, the hand file says {bus.bitrate_bps}",
+            "set both to the same bit rate",
+        )
+    if bus.error_frames:
+        yield found(
+            "error frames on the bus",
+            Sure.CERTAIN,
+            f"{bus.error_frames} in {bus.seconds:.1f} s",
+            "termination, bit rate of each node, length of stubs, a node that is not powered",
+        )
+    if bus.load > MAX_BUS_LOAD:
+        yield found(
+            "the bus is loaded above what plans allow",
+            Sure.CERTAIN,
+            f"{bus.load:.0%} in the busiest second, {MAX_BUS_LOAD:.0%} allowed",
+            "a longer sync.period_ms, send mode changed, or fewer patches on this bus",
+        )
+    if bus.outages:
+        yield found(
+            "the interface failed while it was watched",
+            Sure.CERTAIN,
+            counted(bus.outages, "time"),
+            "cable and power of the adapter; kernel log (dmesg)",
+        )
+    if bus.foreign:
+        shown = ", ".join(f"0x{cob_id:03X}: {count}" for cob_id, count in Counter(bus.foreign).most_common(6))
+        yield found(
+            "frames that nothing in the hand explains",
+            Sure.POSSIBLE,
+            f"{shown} in {bus.seconds:.1f} s",
+            "fine if the bus is shared with drives or another master; else find who sends them",
+        )
+    for address in bus.unconfigured:
+        yield found(
+            "a node without a node-ID",
+            Sure.CERTAIN,
+            f"serial {address.serial_number} answers LSS",
+            f"skinnode lss set --serial {address.serial_number} --node-id N",
+        )
+
+
+def check_masters(bus: BusFacts) -> Iterator[Finding]:
+    """Who commands the nodes: of each thing that only a master sends there should be one sender."""
+
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("bus", bus.name, what, sure, evidence, advice)
+
+    stop_one = "one hand, one host: stop the other, or let the host be a guest (buses.role)"
+    counters = [counter for counter in bus.sync_counters if counter]
+    steps = list(pairwise(counters))
+    astray = sum(after not in (before + 1, 1) for before, after in steps)
+    if len(steps) >= _SYNCS and astray > _ASTRAY * len(steps):
+        yield found(
+            "two producers of SYNC",
+            Sure.CERTAIN,
+            f"{astray} of {len(steps)} SYNC counters do not follow the one before",
+            stop_one,
+        )
+    if bus.master_beats_s is not None and len(bus.master_beats_s) >= _BEATS and bus.heartbeat_ms:
+        period_s = float(np.mean(np.diff(bus.master_beats_s)))
+        if period_s < _TOO_OFTEN * bus.heartbeat_ms * 1e-3:
+            yield found(
+                "two masters with one heartbeat",
+                Sure.LIKELY,
+                f"node-ID {bus.master_node_id} beats every {period_s * 1e3:.0f} ms, "
+                f"the hand file says {bus.heartbeat_ms}",
+                stop_one,
+            )
+    if bus.nmt_commands and bus.role == "master" and not any(patch.boot_ups for patch in bus.patches):
+        yield found(
+            "somebody commands the nodes",
+            Sure.POSSIBLE,
+            f"{counted(bus.nmt_commands, 'NMT command')} in {bus.seconds:.1f} s",
+            f"fine while a host starts; else a second master: {stop_one}",
+        )

@@ -1,0 +1,125 @@
+"""What the facts say of the configuration of the nodes: sizes, layout, EDS, PDOs, times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from skinnode.canopen import indices as od
+from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, Sure
+from skinnode.diagnose.pdo_parameters import Pdo
+from skinnode.protocol.profile import PatchProfile
+
+
+def check_configuration(bus: BusFacts) -> Iterator[Finding]:
+    """Sizes, layout, EDS, PDOs, inhibit time, heartbeat."""
+    for patch in bus.patches:
+        if patch.info is None or patch.info.patch is None:
+            continue
+        yield from _check_layout(patch)
+        yield from _check_pdos(bus, patch)
+
+
+def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
+    info, wanted = patch.info, patch.wanted
+    assert info is not None
+    own = info.patch
+    assert own is not None
+    if patch.eds_problem:
+        yield Finding(
+            "configuration",
+            patch.name,
+            "the EDS of the hand file is of another patch",
+            Sure.CERTAIN,
+            patch.eds_problem,
+            "skinnode eds writes the right one",
+        )
+    if wanted is None:
+        return
+    if patch.layout_hash is not None and own.layout_hash != patch.layout_hash:
+        yield Finding(
+            "configuration",
+            patch.name,
+            "its electrodes are elsewhere than the hand file says",
+            Sure.CERTAIN,
+            f"layout hash 0x{own.layout_hash:08X} ({own.layout}, {own.upper_wires} × {own.lower_wires} "
+            f"wires), wanted 0x{patch.layout_hash:08X}",
+            "correct [patches.layout], or the wrong patch is mounted: fields solved with it are wrong",
+        )
+    if own.code_bits != wanted.code_bits:
+        yield Finding(
+            "configuration",
+            patch.name,
+            "codes of another width",
+            Sure.CERTAIN,
+            f"{own.code_bits} bits, the hand file says {wanted.code_bits}",
+            "correct code_bits in the hand file",
+        )
+
+
+def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
+    """Compare the PDOs with what the host sets. A value that the host has yet to write is no fault."""
+    info = patch.info
+    assert info is not None
+    if info.patch is None or patch.found is None:
+        return
+
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("configuration", patch.name, what, sure, evidence, advice)
+
+    again = "skinnode host sets it at bring-up: who else writes to the node?"
+    pdos = {(pdo.direction, pdo.number): pdo for pdo in info.pdos}
+    chunk, summary = pdos.get(("TPDO", 1)), pdos.get(("TPDO", 2))
+    running = patch.found.state == "operational"
+    for pdo, what, cob_id in (
+        (chunk, "chunk PDO (TPDO1)", od.chunk_cob_id(patch.node_id)),
+        (summary, "summary PDO (TPDO2)", od.summary_cob_id(patch.node_id)),
+    ):
+        if pdo is None or not pdo.enabled or pdo.cob_id != cob_id:
+            has = "missing" if pdo is None else "off" if not pdo.enabled else f"at 0x{pdo.cob_id:03X}"
+            yield found(
+                f"the {what} is not where it belongs", Sure.CERTAIN, f"{has}, wanted 0x{cob_id:03X}", again
+            )
+    if chunk is not None and bus.period_s is not None and chunk.inhibit_100us is not None:
+        yield from _check_inhibit(bus.period_s, patch, chunk, running, found)
+    if chunk is not None and chunk.kind < 254:
+        yield found("chunks are not sent on event", Sure.CERTAIN, f"transmission type {chunk.kind}", again)
+    if running and info.patch.period_ms:
+        yield found(
+            "the patch scans by its own timer, not at SYNC",
+            Sure.LIKELY,
+            f"period {info.patch.period_ms} ms (0x2021:1)",
+            f"write 0: skinnode od {patch.node_id} 2021:1 --write 0; patches then scan at the same instant",
+        )
+    if running and info.heartbeat_ms == 0:
+        yield found("no heartbeat: nobody sees it go", Sure.CERTAIN, "0x1017 is 0", again)
+    elif running and bus.heartbeat_ms is not None and info.heartbeat_ms not in (None, bus.heartbeat_ms):
+        evidence = f"every {info.heartbeat_ms} ms, the hand file says {bus.heartbeat_ms}"
+        yield found("another heartbeat than wanted", Sure.POSSIBLE, evidence, again)
+
+
+def _check_inhibit(
+    period_s: float, patch: PatchFacts, chunk: Pdo, running: bool, found: Callable[..., Finding]
+) -> Iterator[Finding]:
+    own = patch.info.patch if patch.info is not None else None
+    assert own is not None
+    sizes = own.upper_wires, own.lower_wires, own.upper_electrodes, own.lower_electrodes, own.code_bits
+    profile = PatchProfile(*sizes, bus="classic" if own.pdo_bytes == 8 else "fd")
+    at_default = chunk.inhibit_100us == profile.default_inhibit_100us
+    if at_default and not running and patch.inhibit_100us is not None:
+        return  # no host has configured the node since it was powered up; bring-up replaces the default
+    chunks, inhibit_s = profile.n_chunks, (chunk.inhibit_100us or 0) * 1e-4
+    if chunks * inhibit_s > period_s:
+        yield found(
+            "a scan takes longer than a SYNC period",
+            Sure.CERTAIN,
+            f"{chunks} chunks {inhibit_s * 1e3:g} ms apart are {chunks * inhibit_s * 1e3:.0f} ms, "
+            f"the period is {period_s * 1e3:g} ms",
+            "a shorter inhibit time (0x1800:3) or a longer sync.period_ms",
+        )
+    elif running and patch.inhibit_100us is not None and chunk.inhibit_100us != patch.inhibit_100us:
+        yield found(
+            "another inhibit time than the host sets",
+            Sure.POSSIBLE,
+            f"{chunk.inhibit_100us} × 100 µs, the host sets {patch.inhibit_100us}",
+            "fine if another master configures the patches",
+        )

@@ -1,0 +1,128 @@
+"""What the facts say of nodes: there, the right ones, alive, without errors."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+from skinnode.canopen.emergency import error_text, register_text
+from skinnode.diagnose.bus_connection import no_answer
+from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, Sure
+from skinnode.text.words import counted, known
+
+
+def check_nodes(bus: BusFacts) -> Iterator[Finding]:
+    """Present, the right ones, alive, without errors."""
+    if bus.failure:
+        return
+    if bus.patches and all(patch.found is None for patch in bus.patches):
+        yield Finding(
+            "nodes",
+            bus.name,
+            "no node of the hand answers",
+            Sure.CERTAIN,
+            f"{len(bus.patches)} asked, {counted(bus.frames, 'frame')} heard in {bus.seconds:.1f} s",
+            "supply of the patches, cable, termination, bit rate, channel",
+        )
+        return
+    for patch in bus.patches:
+        yield from _check_node(bus, patch)
+    for node in bus.strangers:
+        if node.duplicate:
+            yield Finding(
+                "nodes",
+                bus.name,
+                f"two nodes have node-ID {node.node_id}",
+                Sure.CERTAIN if "answers" in node.duplicate else Sure.LIKELY,
+                node.duplicate,
+                "unplug one and give it another node-ID",
+            )
+        if node.is_patch:
+            yield Finding(
+                "nodes",
+                bus.name,
+                f"patch at node {node.node_id} is not in the hand file",
+                Sure.CERTAIN,
+                f"serial {known(node.serial)}, {node.state}",
+                "add it, or give it the node-ID that it should have (skinnode lss set)",
+            )
+
+
+def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("nodes", patch.name, what, sure, evidence, advice)
+
+    node, wanted, info = patch.found, patch.wanted, patch.info
+    if node is None:
+        yield found(
+            "the node is not there",
+            Sure.CERTAIN,
+            f"node {patch.node_id} neither answers SDO nor sends heartbeats; other nodes on {bus.name} do",
+            "its supply and connector; skinnode scan shows whether it has another node-ID",
+        )
+        return
+    if node.duplicate:
+        yield found(
+            "two nodes have its node-ID",
+            Sure.CERTAIN if "answers" in node.duplicate else Sure.LIKELY,
+            node.duplicate,
+            "unplug one and give it another node-ID: skinnode lss set --serial …",
+        )
+    if not node.answers:
+        yield found(
+            f"the node is {node.state} and does not answer{' as CiA 301 says' if node.wrong_answer else ''}",
+            Sure.CERTAIN,
+            "its heartbeat is heard" + (f"; it {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
+            f"skinnode nmt {patch.node_id} reset-communication",
+        )
+        return
+    if wanted is not None and not node.is_patch:
+        yield found(
+            "another device has its node-ID",
+            Sure.CERTAIN,
+            ", ".join([f"'{node.name}'" if node.name else "unnamed", *node.identity]),
+            "give one of them another node-ID",
+        )
+        return
+    if wanted is not None and wanted.serial not in (None, node.serial):
+        yield found(
+            "another patch than the hand file says",
+            Sure.CERTAIN,
+            f"serial {known(node.serial)}, the hand file says {wanted.serial}",
+            "two patches exchanged? Put them back, or correct the hand file and its calibration",
+        )
+    if patch.failure:
+        yield found(
+            "it did not tell all about itself", Sure.CERTAIN, patch.failure, "skinnode info shows more"
+        )
+    if patch.boot_ups or node.boot_ups:
+        yield found(
+            "the node restarts by itself",
+            Sure.CERTAIN,
+            f"{counted(max(patch.boot_ups, node.boot_ups), 'boot-up message')} in {bus.seconds:.1f} s",
+            "supply voltage under load, connector, watchdog of the board",
+        )
+    if bus.running and node.state != "operational":
+        yield found(
+            f"the node is {node.state} while others run",
+            Sure.LIKELY,
+            f"NMT state by {node.state_known_by}",
+            "see its errors below; a host that runs takes it up again when they are gone",
+        )
+    if info is not None and info.error_register:
+        yield found(
+            "the node reports an error",
+            Sure.CERTAIN,
+            f"error register 0x{info.error_register:02X} ({register_text(info.error_register)}); "
+            f"last: {info.errors[0] if info.errors else 'none reported'}",
+            "fix the fault it names; skinnode info shows its history",
+        )
+    told = [emergency for emergency in patch.emergencies if emergency.code]
+    if told:
+        kinds = Counter(
+            error_text(emergency.code, emergency.detail, ours=node.is_patch) for emergency in told
+        )
+        shown = "; ".join(f"{count} × {text}" for text, count in kinds.most_common(3))
+        yield found(
+            "emergency messages while it was watched", Sure.CERTAIN, shown, "fix the faults they name"
+        )

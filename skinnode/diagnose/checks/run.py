@@ -1,0 +1,82 @@
+"""All that the facts say of a hand, room by room. Pure functions over :class:`BusFacts`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from skinnode.canopen.emergency import register_text
+from skinnode.diagnose.bus_connection import no_answer
+from skinnode.diagnose.checks import bus, configuration, nodes, skin, timing
+from skinnode.diagnose.facts import BusFacts, Finding, Sure
+from skinnode.diagnose.noise import LEAST_SCANS
+from skinnode.text.words import counted
+
+_SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
+
+
+def run_checks(facts: BusFacts) -> list[Finding]:
+    """All findings of a bus, the surest first within each area."""
+    checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
+        bus.check_bus,
+        bus.check_masters,
+        nodes.check_nodes,
+        configuration.check_configuration,
+        skin.check_wires,
+        skin.check_noise,
+        skin.check_baseline,
+        timing.check_timing,
+        timing.check_losses,
+    )
+    return [
+        finding
+        for check in checks
+        for finding in sorted(check(facts), key=lambda found: _SURENESS[found.sure])
+    ]
+
+
+def others(facts: BusFacts) -> list[str]:
+    """Describe each device that is neither a patch nor in the hand file, in one line: what it is, not what is
+    wrong."""
+    lines = []
+    for node in facts.strangers:
+        if node.is_patch:
+            continue
+        why = f" ({node.state_known_by})" if node.state == "unknown" else ""
+        known = [*node.identity, f"NMT state {node.state}{why}"]
+        if not node.answers:
+            known.append(no_answer(node.wrong_answer))
+        if node.error_register:
+            register = register_text(node.error_register)
+            known.append(f"error register 0x{node.error_register:02X} ({register})")
+        name = f" ({node.name})" if node.name else ""
+        whose = "not a skinnode patch" if facts.period_s is None else "not in the hand file"
+        lines.append(f"{facts.name}: node {node.node_id}{name}, {whose}: {', '.join(known)}")
+    return lines
+
+
+def not_judged(facts: BusFacts) -> list[str]:
+    """What could not be looked at, and why, a line each."""
+    if facts.failure:
+        return [f"{facts.name}: nothing but the interface"]
+    lines = []
+    for patch in facts.patches:
+        scans = 0 if patch.scans is None else patch.scans.scans
+        if patch.found is not None and scans < LEAST_SCANS:
+            came = counted(scans, "scan") if scans else "no scans"
+            lines.append(
+                f"{patch.name}: noise, steps and drift: {came} came, {LEAST_SCANS} needed"
+                + ("" if facts.running or facts.active else "; it does not run: --active starts it")
+            )
+        elif patch.scans is not None and skin.is_touched(patch.scans):
+            lines.append(
+                f"{patch.name}: noise of single crossings, and what is not at its baseline: something moves "
+                "on the skin; leave it alone while the doctor listens"
+            )
+        elif patch.scans is not None and skin.may_be_frozen(patch.scans):
+            lines.append(
+                f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the stated "
+                f"noise, {patch.scans.told_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch the "
+                "patch while the doctor listens; if this line comes again, the converter has stopped"
+            )
+    return lines

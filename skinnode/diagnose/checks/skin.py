@@ -1,0 +1,275 @@
+"""What some fifty scans say of the skin: wires, noise, frozen values, steps, baseline. Pure functions.
+
+Somebody who touches the skin is no defect: what touch may explain is not told of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, ScanFacts, Sure
+from skinnode.diagnose.noise import LEAST_SCANS, Mask, NoiseAnalysis, analyse_noise
+from skinnode.model.layout import Float
+from skinnode.protocol.codec import TIME_WRAP_US
+from skinnode.text.words import counted
+
+NOISY: Final = 5.0
+"""Times the noise told above which a crossing is noisy: far beyond what 20 scans leave open."""
+
+_DRIFT: Final = 0.003
+"""|R/R0 − 1| at rest that is worth a tare: a hundred times the noise of a good converter, 1 % of a press."""
+
+_MANY: Final = 0.8
+_FEW: Final = 0.1
+_SHARE: Final = 0.7
+"""Of the crossings of a noisy wire: a few may be quiet by chance or be spoilt otherwise."""
+
+
+def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysis]]:
+    for patch in bus.patches:
+        if patch.scans is not None and patch.scans.scans >= LEAST_SCANS:
+            yield patch, patch.scans, analyse_noise(patch.scans)
+
+
+def check_wires(bus: BusFacts) -> Iterator[Finding]:
+    """Open, short, out of range: by the node's own masks and by the codes."""
+    for patch in bus.patches:
+        own = patch.info.patch if patch.info is not None else None
+        upper: set[int] = set()
+        lower: set[int] = set()
+        if own is not None:
+            upper, lower = {*own.open_upper, *own.shorted_upper}, {*own.open_lower, *own.shorted_lower}
+            for what, wires, advice in (
+                ("upper wires open", own.open_upper, "connector and solder joint of these wires"),
+                ("lower wires open", own.open_lower, "connector and solder joint of these wires"),
+                ("upper wires shorted", own.shorted_upper, "a short to a lower wire, or moisture"),
+                ("lower wires shorted", own.shorted_lower, "a short to an upper wire, or moisture"),
+            ):
+                if wires:
+                    by = "the node says so (0x2030, 0x2031)"
+                    yield Finding("wires", patch.name, f"{what}: {_listed(wires)}", Sure.CERTAIN, by, advice)
+        if patch.scans is not None and patch.scans.scans:
+            yield from _check_crossings(patch, patch.scans, upper, lower)
+
+
+def _check_crossings(
+    patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
+) -> Iterator[Finding]:
+    """Crossings apart from the wires that are at fault as a whole."""
+    whole = max(1, int(scans.complete.sum()))  # a scan with holes says nothing of what was in them
+    rest = np.ones(scans.n_open.shape, dtype=np.bool_)
+    rest[sorted(upper), :] = False
+    rest[:, sorted(lower)] = False
+    for what, counts, advice in (
+        ("open", scans.n_open, "a broken electrode or wire; values there are left out"),
+        ("shorted", scans.n_short, "the rubber is squeezed through, or moisture"),
+        ("out of range", scans.n_over, "no baseline, an old one, or pressed beyond the range: tare at rest"),
+    ):
+        always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
+        for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
+            if wires.any():  # the node was asked before it scanned
+                yield Finding(
+                    "wires",
+                    patch.name,
+                    f"{side} wires {what}: {_listed(tuple(int(i) for i in np.flatnonzero(wires)))}",
+                    Sure.CERTAIN,
+                    f"every crossing, {_in_all(scans)}",
+                    "connector and solder joint of these wires" if what == "open" else advice,
+                )
+        always &= ~(always.all(axis=1, keepdims=True) | always.all(axis=0, keepdims=True))
+        if always.any():
+            yield Finding(
+                "wires",
+                patch.name,
+                f"{_crossings(always)} {what}",
+                Sure.CERTAIN,
+                f"{_in_all(scans)}: {_places(always)}",
+                advice,
+            )
+        if sometimes.any():
+            yield Finding(
+                "wires",
+                patch.name,
+                f"{_crossings(sometimes)} now and then {what}",
+                Sure.LIKELY if what == "open" else Sure.POSSIBLE,
+                f"in up to {int(counts[sometimes].max())} of {scans.scans} scans: {_places(sometimes)}",
+                "a loose contact: move the cable and watch" if what == "open" else advice,
+            )
+
+
+def check_noise(bus: BusFacts) -> Iterator[Finding]:
+    """Noise against what the hand file tells, steps, and values that stand still."""
+    for patch, scans, analysis in _judged(bus):
+        yield from _check_frozen(patch, scans)
+        yield from _check_noise(patch, scans, analysis)
+        if analysis.steps.any() and analysis.steps.mean() <= max(_FEW, 1.0 / min(analysis.steps.shape)):
+            row, column = (int(i) for i in np.argwhere(analysis.steps)[0])
+            yield Finding(
+                "wires",
+                patch.name,
+                f"{_crossings(analysis.steps)} jumped and stayed",
+                Sure.POSSIBLE,
+                f"{_places(analysis.steps)}; at {row}/{column} by {analysis.step_by[row, column]:.2%} of R0, "
+                f"scan {int(analysis.step_at[row, column]) + 1}",
+                "a loose contact, unless somebody touched the skin there just then",
+            )
+
+
+def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -> Iterator[Finding]:
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("wires", patch.name, what, sure, evidence, advice)
+
+    factor = analysis.noise / analysis.told
+    judged = np.isfinite(factor) & ~analysis.steps
+    noisy = judged & (factor > NOISY)
+    over = f"over {counted(scans.scans, 'scan')}"
+    figures = ""
+    if noisy.any():
+        median, worst = float(np.median(analysis.noise[noisy])), float(np.max(factor[noisy]))
+        figures = f"{median:.1e} of R0 in the median, {worst:.0f} times the stated noise at worst, {over}"
+    all_alike = noisy.sum() > 0.5 * judged.sum()
+    if analysis.is_touched:
+        levels = (analysis.floor, np.median(analysis.upper), np.median(analysis.lower))
+        all_alike &= bool(min(levels) > NOISY)
+    if all_alike or analysis.supply > NOISY:
+        yield found(
+            "the whole patch is noisier than the hand file says",
+            Sure.LIKELY,
+            f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
+            if all_alike
+            else f"all crossings together, {analysis.supply:.0f} times the stated noise, {over}",
+            "supply and shield of the patch; is relative_noise in the hand file the converter's?",
+        )
+        return
+    names = [
+        f"{side} wire {wire}"
+        for side, axis, levels in (("upper", 1, analysis.upper), ("lower", 0, analysis.lower))
+        for wire in np.flatnonzero(noisy.sum(axis=axis) > _SHARE * np.maximum(1, judged.sum(axis=axis)))
+        if not analysis.is_touched or _stands_out(levels, int(wire))
+    ]
+    if names:
+        shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
+        yield found(f"noise on {shown}", Sure.LIKELY, figures, "a bad contact of that wire")
+    elif noisy.any() and not analysis.is_touched:
+        yield found(
+            f"noise at {_crossings(noisy)}",
+            Sure.POSSIBLE,
+            f"{_places(noisy)}; {figures}",
+            "a bad contact at the electrodes, or a light touch",
+        )
+
+
+def _stands_out(levels: Float, wire: int) -> bool:
+    """Whether a wire is noisy where its neighbours are not: a touch takes the next wires with it."""
+    neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
+    return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
+
+
+def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
+    device = scans.device_us[scans.device_us >= 0] % TIME_WRAP_US  # upper bits: host clock
+    if len(device) >= LEAST_SCANS and len(np.unique(device)) == 1:
+        yield Finding(
+            "wires",
+            patch.name,
+            "the node sends the same scan again and again",
+            Sure.CERTAIN,
+            f"its clock stands still over {len(device)} scans",
+            "reset the node; its sampling has stopped",
+        )
+    known, still = _still(scans)
+    if _shows(scans) and known.any() and still.sum() > _MANY * known.sum():
+        yield Finding(
+            "wires",
+            patch.name,
+            "the values are frozen",
+            Sure.LIKELY,
+            f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
+            f"though the stated noise is {scans.told_noise:.0e} and a code is {scans.step:.0e}",
+            "the converter has stopped: power the patch off and on",
+        )
+
+
+def may_be_frozen(scans: ScanFacts) -> bool:
+    """Whether a converter gave the same codes in all of LEAST_SCANS or more, of which nothing follows: what
+    noise it has, as is told, does not show in every code."""
+    known, still = _still(scans)
+    return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
+
+
+def _shows(scans: ScanFacts) -> bool:
+    """Whether the noise told changes every code soon."""
+    return scans.told_noise > scans.step
+
+
+def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
+    """Crossings that were always measured; those of them that never changed."""
+    known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
+    return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
+
+
+def check_baseline(bus: BusFacts) -> Iterator[Finding]:
+    """A baseline that is missing, or no longer that of the skin at rest."""
+    for patch in bus.patches:
+        own = patch.info.patch if patch.info is not None else None
+        if own is not None and own.baseline_missing:
+            yield Finding(
+                "baseline",
+                patch.name,
+                f"{counted(own.baseline_missing, 'crossing has', 'crossings have')} no baseline",
+                Sure.CERTAIN,
+                "R0 is 0 (0x2301)",
+                f"leave the skin alone: skinnode tare {patch.node_id}",
+            )
+    for patch, scans, analysis in _judged(bus):
+        at_rest = np.isfinite(analysis.level) & ~analysis.touched & ~analysis.steps
+        if at_rest.sum() < 0.5 * at_rest.size:
+            continue  # somebody touches the skin
+        off = analysis.level[at_rest] - 1.0
+        share = float(np.mean(np.abs(off) > _DRIFT))
+        one_way = max(float(np.mean(off > 0)), float(np.mean(off < 0)))
+        figures = f"R/R0 − 1 is {np.median(off):+.2%} in the median over {scans.scans} scans, {share:.0%} of "
+        figures += f"{off.size} crossings off by more than {_DRIFT:.1%}"
+        if share > _MANY and one_way > 0.9:
+            yield Finding(
+                "baseline",
+                patch.name,
+                "the baseline is no longer that of the skin at rest",
+                Sure.LIKELY,
+                figures,
+                "temperature or age: skinnode tare with nothing touching the skin",
+            )
+        elif share > 0.02 and not analysis.is_touched:
+            yield Finding(
+                "baseline",
+                patch.name,
+                "a part of the skin is not at its baseline",
+                Sure.POSSIBLE,
+                figures,
+                "something presses there; if nothing does, skinnode tare",
+            )
+
+
+def is_touched(scans: ScanFacts) -> bool:
+    """Whether something moved on the skin, so that not all could be judged."""
+    return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
+
+
+def _in_all(scans: ScanFacts) -> str:
+    return "in the only scan" if scans.scans == 1 else f"in all {scans.scans} scans"
+
+
+def _crossings(mask: Mask) -> str:
+    return counted(int(mask.sum()), "crossing")
+
+
+def _listed(wires: tuple[int, ...]) -> str:
+    return ", ".join(map(str, wires[:12])) + (" …" if len(wires) > 12 else "")
+
+
+def _places(mask: Mask) -> str:
+    """Crossings as upper/lower wire."""
+    places = [f"{row}/{column}" for row, column in np.argwhere(mask)[:6]]
+    return ", ".join(places) + (" …" if mask.sum() > 6 else "")

@@ -1,0 +1,144 @@
+"""What the facts say of time and of losses: SYNC, scans after it, frames that went missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from skinnode.diagnose.facts import BusFacts, Finding, Sure
+from skinnode.text.words import counted
+
+_JITTER: Final = 0.1
+"""Share of the period that a SYNC may come early or late before somebody should know."""
+
+_PERIOD_ERROR: Final = 0.02
+_LATE: Final = 0.95
+"""Share of the period after which a scan that is not over runs into the next."""
+
+
+def check_timing(bus: BusFacts) -> Iterator[Finding]:
+    """SYNC, and how soon after it a scan is there."""
+
+    def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("timing", where, what, sure, evidence, advice)
+
+    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # whose master has to send it
+    if awaited and len(bus.sync_s) == 0 and bus.seconds > 0 and not bus.failure:
+        timers = any(p.info and p.info.patch and p.info.patch.period_ms for p in bus.patches)
+        if not timers:
+            yield found(
+                bus.name,
+                "nobody sends SYNC",
+                Sure.CERTAIN,
+                f"none in {bus.seconds:.1f} s, and "
+                + ("nodes are operational" if bus.running else "the host is a guest here"),
+                "is the host, or the robot's master, running? Patches scan at SYNC alone",
+            )
+    intervals = np.diff(bus.sync_s)
+    if len(intervals) >= 5:
+        period_s = float(np.median(intervals))
+        if bus.period_s is not None and abs(period_s / bus.period_s - 1) > _PERIOD_ERROR:
+            yield found(
+                bus.name,
+                "SYNC has another period than the hand file",
+                Sure.CERTAIN,
+                f"{period_s * 1e3:.2f} ms, the hand file says {bus.period_s * 1e3:g} ms",
+                "two masters, or another hand file in use",
+            )
+        missing = int(np.sum(np.rint(intervals / period_s) - 1))
+        if missing > 0:
+            yield found(
+                bus.name,
+                "SYNCs are missing",
+                Sure.CERTAIN,
+                f"{missing} of {len(intervals) + missing}",
+                "the machine that sends SYNC is overloaded, or the bus loses frames",
+            )
+        regular = intervals[intervals < 1.5 * period_s]
+        jitter_s = float(np.percentile(np.abs(regular - period_s), 99)) if len(regular) else 0.0
+        if jitter_s > _JITTER * period_s:
+            yield found(
+                bus.name,
+                "SYNC is irregular",
+                Sure.LIKELY,
+                f"99 % within {jitter_s * 1e3:.1f} ms of a period of {period_s * 1e3:.1f} ms",
+                "load of the machine that sends it; a real-time priority for the host",
+            )
+    for patch in bus.patches:
+        if patch.scans is None or bus.period_s is None:
+            continue
+        latency_s = patch.scans.latency_s[np.isfinite(patch.scans.latency_s)]
+        period_s = max(bus.period_s, bus.own_period_s)
+        if len(latency_s) and float(np.median(latency_s)) > _LATE * period_s:
+            yield found(
+                patch.name,
+                "scans end when the next has begun",
+                Sure.CERTAIN,
+                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
+                "a shorter inhibit time, a longer period, less load on the bus",
+            )
+
+
+def check_losses(bus: BusFacts) -> Iterator[Finding]:
+    """Where frames went missing: before this program, on the bus, at the node."""
+
+    def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("losses", where, what, sure, evidence, advice)
+
+    if bus.dropped:
+        yield found(
+            bus.name,
+            "this machine dropped frames",
+            Sure.CERTAIN,
+            f"{bus.dropped} of {bus.frames + bus.dropped}, by the kernel or the receive queue",
+            "raise net.core.rmem_max, less load; what is said of scans below may come from this",
+        )
+    for patch in bus.patches:
+        if patch.scans is None:
+            continue
+        stats, scans = patch.scans.stats, patch.scans.scans
+        if stats.chunks_lost or stats.scans_torn or stats.summaries_lost:
+            yield found(
+                patch.name,
+                "scans with holes",
+                Sure.LIKELY if bus.dropped else Sure.CERTAIN,
+                f"{stats.scans_torn} of {scans} torn, {counted(stats.chunks_lost, 'chunk')} and "
+                f"{counted(stats.summaries_lost, 'summary', 'summaries')} lost",
+                "bus errors, load, or a node that is interrupted; compare with the other patches",
+            )
+        if stats.scans_missed:
+            yield found(
+                patch.name,
+                "whole scans are missing",
+                Sure.CERTAIN,
+                f"{stats.scans_missed} of {scans + stats.scans_missed}",
+                "the node skips scans (EMCY 0x8110) when they take longer than the period",
+            )
+        if stats.conflicts:
+            yield found(
+                patch.name,
+                "two different chunks with one number",
+                Sure.LIKELY,
+                counted(stats.conflicts, "time"),
+                "two nodes with one node-ID: skinnode scan",
+            )
+        if stats.scans_corrupt:
+            yield found(
+                patch.name,
+                "codes are not those that the node packed",
+                Sure.CERTAIN,
+                f"the check of {stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed",
+                "check gateways on the path, memory and software of the node; CAN itself detects bus errors",
+            )
+        wrong = stats.bad_length + stats.bad_index + stats.bad_counter + stats.bad_form
+        if wrong:
+            yield found(
+                patch.name,
+                "frames that are no chunks of this patch",
+                Sure.CERTAIN,
+                f"{stats.bad_length} of wrong length, {stats.bad_index} of wrong index, "
+                f"{stats.bad_counter} of wrong counter, {stats.bad_form} summaries without a check",
+                "another node uses its COB-IDs, or its mapping was changed",
+            )

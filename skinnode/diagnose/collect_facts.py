@@ -1,0 +1,284 @@
+"""Gathers the facts of one bus. It listens and reads; unless told to be active it changes nothing, so that a
+hand that runs goes on as before."""
+
+from __future__ import annotations
+
+import functools
+import json
+import subprocess
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from typing import Final, TypeVar
+
+import numpy as np
+
+from skinnode.bus_load.plan import SCAN_SHARE, inhibit_time_100us
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import NmtCommand, encode
+from skinnode.config import BusConfig, HandConfig, PatchConfig
+from skinnode.diagnose.bus_connection import BusConnection
+from skinnode.diagnose.bus_listener import BusListener
+from skinnode.diagnose.data_sheet import read_profile
+from skinnode.diagnose.discovery import discover
+from skinnode.diagnose.facts import BusFacts, PatchFacts
+from skinnode.diagnose.node_info import read_info
+from skinnode.diagnose.scan_capture import ScanCapture
+from skinnode.errors import BusError, NodeError, ProfileError
+from skinnode.host.hand_files import check_eds
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
+
+SCANS: Final = 50
+"""Scans that noise is judged from: a standard deviation is then known to a tenth."""
+
+LONGEST_S: Final = 15.0
+"""How long scans are waited for, however long the period."""
+
+DEFAULT_NOISE: Final = 3e-6
+"""Of the converter, where no hand file tells."""
+
+_PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
+"""Before each time a node is asked: a host reads a baseline in 0.1 to 0.3 s."""
+
+_FIRST_SYNC_S: Final = 0.5
+_KNOWN_TO_ALL: Final = frozenset(
+    {od.NMT_COB_ID, od.SYNC_COB_ID, od.TIME_COB_ID, od.LSS_REQUEST_COB_ID, od.LSS_RESPONSE_COB_ID}
+)
+
+Progress = Callable[[str], None]
+Answer = TypeVar("Answer")
+
+
+def collect_facts(
+    bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
+) -> BusFacts:
+    """Everything of one bus. ``active``: nodes that do not run are started, SYNC is sent where nobody does,
+    and they are pre-operational again at the end. A bus that fails is a fact, not an error."""
+    facts = BusFacts(
+        bus.name,
+        bus.interface,
+        bus.channel,
+        bus.bitrate_bps,
+        period_s=None if hand is None else hand.sync.period_s,
+        heartbeat_ms=None if hand is None else hand.bring_up.heartbeat_ms,
+        role=bus.role,
+        master_node_id=bus.heartbeat_node_id,
+        patches=() if hand is None else tuple(_wanted(p, hand, bus) for p in hand.patches_on(bus.name)),
+    )
+    state, bitrate = link_facts(bus)
+    facts = replace(facts, link_state=state, link_bitrate_bps=bitrate)
+    try:
+        with BusConnection(bus) as connection:
+            return _examine(connection, facts, hand, active, progress)
+    except BusError as error:
+        return replace(facts, failure=str(error))
+
+
+def _wanted(patch: PatchConfig, hand: HandConfig, bus: BusConfig) -> PatchFacts:
+    profile = PatchProfile.from_config(patch, bus)
+    problem = ""
+    if patch.eds is not None:
+        try:
+            check_eds(patch.eds, profile)
+        except ProfileError as error:
+            problem = str(error)
+    known = patch.layout.coordinates == "preset"
+    configures = bus.role == "master" or bus.guest_sends == "sdo"
+    inhibit_100us = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1)
+    return PatchFacts(
+        patch.name,
+        patch.node_id,
+        patch,
+        layout_hash=patch.layout.build().layout_hash if known else None,
+        inhibit_100us=inhibit_100us if configures else None,
+        eds_problem=problem,
+    )
+
+
+def _examine(
+    connection: BusConnection, facts: BusFacts, hand: HandConfig | None, active: bool, progress: Progress
+) -> BusFacts:
+    begun_s = time.monotonic()
+    capture = ScanCapture()
+    connection.link.listen(capture.on_frames)
+    found = discover(connection, lambda text: progress(f"{facts.name}: {text}"))
+    nodes = {node.node_id: node for node in found.nodes}
+    patches = facts.patches
+    if hand is None:
+        patches = tuple(PatchFacts(f"node {n.node_id}", n.node_id) for n in found.nodes if n.is_patch)
+    profiles: dict[int, PatchProfile] = {}
+    asked: list[PatchFacts] = []
+    for patch in patches:
+        node = nodes.get(patch.node_id)
+        if node is not None and node.answers and node.is_patch:
+            progress(f"{facts.name}: reading {patch.name}")
+            info, failure = _asked(functools.partial(read_info, connection, patch.node_id))
+            patch = replace(patch, info=info, failure=failure)
+            profile, _ = _asked(functools.partial(read_profile, connection.od(patch.node_id)))
+            if profile is not None and info is not None:
+                profiles[patch.node_id] = profile
+        asked.append(replace(patch, found=node))
+    period_s = facts.period_s or DEFAULT_PERIOD_MS * 1e-3
+    if active:
+        period_s = max([period_s, *(_scan_s(patch, profiles) for patch in asked)])
+    ours, load = _listen(connection, capture, asked, profiles, period_s, active, facts.name, progress)
+    stats = connection.link.stats()
+    heard = connection.listener
+    return replace(
+        facts,
+        seconds=time.monotonic() - begun_s,
+        frames=stats.received,
+        load=max(load, stats.load),
+        error_frames=heard.errors,
+        dropped=stats.dropped,
+        outages=stats.outages,
+        foreign=_foreign(heard, {*nodes, *(patch.node_id for patch in patches)}, connection.bus),
+        unconfigured=found.unconfigured,
+        strangers=tuple(n for n in found.nodes if n.node_id not in {p.node_id for p in asked}),
+        sync_s=np.empty(0) if ours else np.array([t_ns for t_ns, _ in list(capture.syncs)]) * 1e-9,
+        sync_counters=() if ours else tuple(counter for _, counter in list(capture.syncs)),
+        sync_ours=ours,
+        own_period_s=period_s if ours else 0.0,
+        active=active,
+        nmt_commands=_commands_of_others(heard, {patch.node_id for patch in patches}),
+        master_beats_s=None
+        if facts.master_node_id is None
+        else np.array([beat.t_ns for beat in list(heard.node(facts.master_node_id).beats)]) * 1e-9,
+        patches=tuple(_with_scans(patch, heard, capture, profiles) for patch in asked),
+    )
+
+
+def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
+    """The answer, or why there is none. Asked anew where that fails: a host that runs may have asked the node
+    at the same time, and a server has room for one transfer."""
+    failure = ""
+    for pause_s in _PAUSES_S:
+        time.sleep(pause_s)
+        try:
+            return question(), ""
+        except NodeError as error:
+            failure = str(error)
+    return None, failure
+
+
+def _listen(
+    connection: BusConnection,
+    capture: ScanCapture,
+    patches: Sequence[PatchFacts],
+    profiles: dict[int, PatchProfile],
+    period_s: float,
+    active: bool,
+    name: str,
+    progress: Progress,
+) -> tuple[bool, float]:
+    """Take scans of the patches that run, or that are made to; whether SYNC was ours, and the load of the bus
+    in the busiest second of it."""
+    overflows: dict[int, int] = {}
+    for node_id, profile in profiles.items():
+        overflows[node_id] = _overflow(connection, node_id)
+        capture.add(node_id, profile, overflows[node_id], period_s)
+    states = {p.node_id: p.found.state for p in patches if p.found is not None and p.node_id in profiles}
+    start = [node_id for node_id, state in states.items() if active and state == "pre-operational"]
+    running = [node_id for node_id, state in states.items() if state == "operational"] + start
+    for node_id in start:
+        connection.link.send(od.NMT_COB_ID, encode(NmtCommand.START, node_id))
+    if not running:
+        return False, 0.0
+    try:
+        heard = len(capture.syncs)
+        connection.wait_until(lambda: len(capture.syncs) > heard, max(_FIRST_SYNC_S, 2.5 * period_s))
+        ours = active and len(capture.syncs) == heard
+        due_s, end_s = time.monotonic(), time.monotonic() + min(LONGEST_S, 2 * SCANS * period_s)
+        number, load = 0, 0.0
+        while min(map(capture.scans, running)) < SCANS and time.monotonic() < end_s:
+            if ours:
+                number += 1
+                overflow = max(overflows.values())
+                counter = (number - 1) % overflow + 1 if overflow else 0
+                capture.note_sync(time.monotonic_ns(), counter)
+                connection.link.send(od.SYNC_COB_ID, bytes((counter,)) if counter else b"")
+            due_s += period_s
+            connection.wait_until(lambda: False, max(0.0, due_s - time.monotonic()))
+            load = max(load, connection.link.stats().load)
+            progress(f"{name}: {min(map(capture.scans, running))} of {SCANS} scans")
+        return ours, load
+    finally:
+        for node_id in start:
+            connection.link.send(od.NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))
+
+
+def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
+    """Return the shortest SYNC period, s, at which a node that no host has configured finishes each scan
+    before the next; 0 for any other node. Bring-up sets an inhibit time that fits the hand's period."""
+    profile = profiles.get(patch.node_id)
+    if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
+        return 0.0
+    default = profile.default_inhibit_100us
+    if all(
+        pdo.inhibit_100us != default
+        for pdo in patch.info.pdos
+        if pdo.cob_id == od.chunk_cob_id(patch.node_id)
+    ):
+        return 0.0
+    return (profile.n_chunks + 1) * default * 1e-4 / SCAN_SHARE
+
+
+def _overflow(connection: BusConnection, node_id: int) -> int:
+    read = functools.partial(connection.od(node_id).read, od.SYNC_COUNTER_OVERFLOW, 0, "u8")
+    value = int(_asked(read)[0] or 0)
+    return value if 2 <= value <= 240 else 0
+
+
+def _with_scans(
+    patch: PatchFacts, heard: BusListener, capture: ScanCapture, profiles: dict[int, PatchProfile]
+) -> PatchFacts:
+    node = heard.node(patch.node_id)
+    scans = None
+    if patch.node_id in profiles and patch.info is not None and patch.info.patch is not None:
+        own = patch.info.patch
+        scale = CodeScale(own.code_bits, own.code_lo, own.code_hi)
+        noise = DEFAULT_NOISE if patch.wanted is None else patch.wanted.relative_noise
+        scans = capture.facts(patch.node_id, scale, noise)
+    return replace(patch, boot_ups=node.boot_ups, emergencies=tuple(node.emergencies), scans=scans)
+
+
+def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
+    """Count NMT commands that a host of this hand does not send: it starts its patches one by one, and
+    commands them to pre-operational. A second host of the same hand is detected by its SYNCs."""
+    return sum(
+        count
+        for data, count in dict(heard.nmt).items()
+        if len(data) != 2
+        or data[0] not in (NmtCommand.START, NmtCommand.ENTER_PRE_OPERATIONAL)
+        or data[1] not in node_ids
+    )
+
+
+def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
+    """Count the frames of COB-IDs that neither the services, nor the nodes, nor ``others`` of the hand file
+    explain. COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the
+    device; those of a patch of the hand that does not answer come from a host that polls it."""
+    explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
+    explained |= {other.can_id for other in bus.others}
+    return {cob_id: count for cob_id, count in dict(heard.cob_ids).items() if cob_id not in explained}
+
+
+def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
+    """State and bit rate of a kernel interface, as `ip` tells; None where it does not, or there is none."""
+    if bus.interface != "socketcan":
+        return None, None
+    try:
+        done = subprocess.run(
+            ["ip", "-details", "-json", "link", "show", "dev", bus.channel],
+            capture_output=True,
+            text=True,
+            timeout=2,
+            check=True,
+        )
+        (link,) = json.loads(done.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return None, None
+    data = link.get("linkinfo", {}).get("info_data", {})
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    return data.get("state"), bitrate if isinstance(bitrate, int) else None

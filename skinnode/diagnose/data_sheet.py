@@ -1,0 +1,57 @@
+"""What a node's object dictionary looks like: of a patch of ours by its identity, of others by a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from skinnode.canopen import indices as od
+from skinnode.conformance.eds_reader import Eds, parse_eds, parse_eds_file
+from skinnode.errors import ConfigError, NodeError, ProfileError, Shown
+from skinnode.host.sdo_client import RemoteOd
+from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
+
+
+class DataSheet(NamedTuple):
+    """An electronic data sheet, read and as text."""
+
+    eds: Eds
+    text: str
+    """See :class:`~skinnode.canopen.eds_encoding.EdsText`."""
+    codec: str = "utf-8"
+    """Codec of its non-ASCII characters."""
+    note: str = ""
+    """Encoding that was assumed, in one line; empty for an ASCII file."""
+
+
+def read_profile(remote: RemoteOd) -> PatchProfile | None:
+    """The sizes of a patch of ours, None for another device. Raises NodeError where it does not answer."""
+    try:
+        identity = [remote.read(od.IDENTITY, sub, "u32") for sub in (od.IDENTITY_VENDOR, od.IDENTITY_PRODUCT)]
+        if identity != [od.VENDOR_ID, od.PRODUCT_CODE]:
+            return None
+        subs = od.ROWS, od.COLUMNS, od.UPPER_ELECTRODES, od.LOWER_ELECTRODES, od.CODE_BITS, od.PDO_BYTES
+        rows, columns, upper, lower, bits, pdo_bytes = (remote.read(od.DESCRIPTOR, sub, "u8") for sub in subs)
+        checked = remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32") > od.UNCHECKED_REVISION_NUMBER
+        bus: BusType = "classic" if pdo_bytes == 8 else "fd"
+        return PatchProfile(rows, columns, upper, lower, bits, bus=bus, checked=checked)
+    except ConfigError as error:
+        raise NodeError(remote.node_id, f"its descriptor (0x2000) is of no patch: {error}") from None
+
+
+def load_data_sheet(path: Path) -> DataSheet:
+    """An EDS or DCF. Raises ConfigError for a file that cannot be read, ProfileError for one that is none."""
+    eds, read = parse_eds_file(path)
+    return DataSheet(eds, read.text, read.codec, f"{path} {read.note}" if read.note else "")
+
+
+def data_sheet_of(remote: RemoteOd, path: Path | None) -> DataSheet:
+    """That of the file, or of a patch of ours. Raises ProfileError for another device without a file."""
+    if path is not None:
+        return load_data_sheet(path)
+    profile = read_profile(remote)
+    if profile is None:
+        allowed = f"the EDS of node {remote.node_id}, which is not a skinnode patch"
+        raise ProfileError("--eds", Shown("no file"), allowed)
+    text = eds_text(profile)
+    return DataSheet(parse_eds(text, eds_name(profile)), text)

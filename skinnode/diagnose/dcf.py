@@ -1,0 +1,168 @@
+"""Writes and reads the configuration of one device as a file (DCF, CiA 306) without losing a byte.
+
+Numbers and printable ASCII are written to ``ParameterValue``, as in the standard; an OCTET_STRING and a
+DOMAIN there in hexadecimal. The standard has no form for text that a reader of INI files would change (bytes
+other than printable ASCII, leading or trailing blanks, comment signs): it is written in a comment, which
+other tools skip and :func:`expected` reads::
+
+    ;ParameterBytes=63 61 66 c3 a9
+"""
+
+from __future__ import annotations
+
+import configparser
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.eds_encoding import for_people, octets, octets_text
+from skinnode.conformance.eds_reader import Eds, EdsEntry
+from skinnode.diagnose.data_sheet import DataSheet
+from skinnode.diagnose.object_dictionary import NOT_CONFIGURATION, Reading
+
+_BYTES_KEY: Final = ";ParameterBytes"
+_BYTES_LINE: Final = re.compile(r"^;(ParameterBytes=)", re.MULTILINE)
+_SECTION: Final = re.compile(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?", re.IGNORECASE)
+_VALUES: Final = ("parametervalue", "parameterbytes", _BYTES_KEY.lower())
+_COMMISSIONING: Final = "DeviceComissioning"  # spelt like this in CiA 306
+_STRINGS: Final = {"VISIBLE_STRING": "ascii", "UNICODE_STRING": "utf-16-le"}
+_OCTETS: Final = ("OCTET_STRING", "DOMAIN")
+_VISIBLE_STRING: Final = 0x09
+_AMBIGUOUS: Final = ";#$%\"'\\"
+"""Characters that begin comments, formulas, substitutions, quotations or escapes in some INI readers."""
+
+
+class Dcf(NamedTuple):
+    """Text of a DCF, with a summary of its content."""
+
+    text: str
+    values: int
+    """Number of the node's values in the file."""
+    as_bytes: tuple[Reading, ...]
+    """Readings that the standard has no form for, written byte by byte."""
+
+
+def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
+    """Return the DCF of a device: its EDS with the value of each writable object and device commissioning.
+
+    The file is UTF-8, whatever the encoding of the EDS; a string that UTF-8 would change is written byte by
+    byte."""
+    parser = _parser(sheet.text)
+    sections = {title.lower(): title for title in parser.sections()}
+    written, as_bytes = 0, []
+    for reading in readings:
+        title = sections.get(f"{reading.index:04x}sub{reading.subindex:x}") or (
+            sections.get(f"{reading.index:04x}") if reading.subindex == 0 else None
+        )
+        if title is None:
+            continue
+        data = reading.content
+        if not _is_configuration(reading):
+            default = next((v for k, v in parser.items(title) if k.lower() == "defaultvalue"), None)
+            foreign = reading.data_type in _STRINGS and default and not default.isascii()
+            if foreign and data is not None:
+                parser.set(title, _BYTES_KEY, data.hex(" "))
+            continue
+        for key in [key for key, _ in parser.items(title) if key.lower() in _VALUES]:
+            parser.remove_option(title, key)
+        if data is None:
+            continue
+        value = _standard_form(reading, data)
+        written += 1
+        if value is not None:
+            parser.set(title, "ParameterValue", value)
+        else:
+            as_bytes.append(reading)
+            parser.set(title, _BYTES_KEY, data.hex(" "))
+    name = octets_text(name.encode(sheet.codec, "replace"))
+    _commission(parser, sections, node_id, bitrate_bps, name)
+    text = io.StringIO()
+    parser.write(text, space_around_delimiters=False)
+    return Dcf(for_people(text.getvalue(), sheet.codec), written, tuple(as_bytes))
+
+
+def expected(sheet: DataSheet) -> Eds:
+    """Return the EDS with its defaults replaced by the values of a DCF; unchanged if it has none."""
+    parser = _parser(_BYTES_LINE.sub(r"\1", sheet.text))
+    entries = dict(sheet.eds.entries)
+    for section in parser.sections():
+        match = _SECTION.fullmatch(section)
+        key = None if match is None else (int(match[1], 16), int(match[2] or "0", 16))
+        if key is None or key not in entries:
+            continue
+        options = {name.lower(): value for name, value in parser.items(section)}
+        entries[key] = _with_value(entries[key], options.get("parametervalue"), options.get("parameterbytes"))
+    return replace(sheet.eds, entries=entries)
+
+
+def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> EdsEntry:
+    if as_bytes is not None:
+        try:
+            return replace(entry, given=bytes.fromhex(as_bytes))
+        except ValueError:
+            return entry  # a comment by another tool
+    if (
+        value and entry.data_type == _VISIBLE_STRING
+    ):  # exactly these bytes: trailing zeros are written as bytes
+        return replace(entry, given=octets(value.strip()))
+    return replace(entry, default=value.strip()) if value else entry
+
+
+def _is_configuration(reading: Reading) -> bool:
+    """Return whether a tool that configures a device from its DCF must write this value."""
+    measured = reading.index in (*NOT_CONFIGURATION, od.BASELINE_DOMAIN)
+    command = (reading.index, reading.subindex) in od.COMMANDS
+    return reading.access in ("rw", "rww", "rwr") and not measured and not command
+
+
+def _standard_form(reading: Reading, data: bytes) -> str | None:
+    """Return the value in the form of CiA 306: numbers in hexadecimal, reals as their bit pattern, as
+    conforming tools expect. Returns None if no form of the standard preserves these bytes."""
+    if reading.data_type in _STRINGS:
+        return _plain(data, _STRINGS[reading.data_type])
+    if reading.data_type in _OCTETS:
+        return data.hex().upper() or None
+    if isinstance(reading.value, float):
+        return f"0x{int.from_bytes(data, 'little'):0{2 * len(data)}X}"
+    if isinstance(reading.value, int):
+        return str(reading.value) if reading.value < 10 else f"0x{reading.value:X}"
+    return None
+
+
+def _plain(data: bytes, codec: str) -> str | None:
+    """Return the bytes as text if every INI reader preserves it, otherwise None."""
+    try:
+        text = data.decode(codec)
+    except UnicodeDecodeError:
+        return None
+    plain = text.isascii() and text.isprintable() and text == text.strip() and text.encode(codec) == data
+    return text if plain and text and not any(sign in text for sign in _AMBIGUOUS) else None
+
+
+def _commission(
+    parser: configparser.ConfigParser, sections: dict[str, str], node_id: int, bitrate_bps: int, name: str
+) -> None:
+    title = sections.get(_COMMISSIONING.lower(), _COMMISSIONING)
+    if not parser.has_section(title):
+        parser.add_section(title)
+    for key, value in (
+        ("NodeID", str(node_id)),
+        ("NodeName", name),
+        ("Baudrate", str(bitrate_bps // 1000)),
+        ("NetNumber", "0"),
+        ("NetworkName", ""),
+        ("CANopenManager", "0"),
+    ):
+        parser.set(title, key, value)
+
+
+def _parser(text: str) -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(
+        interpolation=None, strict=False, comment_prefixes=(";",), delimiters=("=",), allow_no_value=True
+    )
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read_string(text)
+    return parser

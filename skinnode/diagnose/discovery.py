@@ -1,0 +1,258 @@
+"""Who is on a bus: every node-ID is asked at once, what beats is heard meanwhile, LSS finds the rest.
+
+Nothing is written but LSS switches, which concern nodes without a node-ID alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.lss import LssAddress
+from skinnode.canopen.sdo import upload_request
+from skinnode.diagnose.bus_connection import BusConnection
+from skinnode.errors import NodeError
+from skinnode.text.printable import printable
+
+PACE_S: Final = 0.001
+"""Between two questions: a sixth of a bus at 1 Mbit/s, so that PDOs under way are not held up."""
+
+ANSWER_S: Final = 0.12
+"""How long after the last question of a sweep answers may come."""
+
+SWEEPS: Final = 2
+"""A node that was busy with the first question hears a second one."""
+
+LISTEN_S: Final = 1.2
+"""How long heartbeats are heard at least: of nodes that are stopped there is nothing else."""
+
+LSS_S: Final = 1.5
+"""Nodes without a node-ID are counted for this long; what is left is told as more."""
+
+OTHERS_S: Final = 1.0
+"""How long another client's SDO transfers are waited for at most."""
+
+_QUIET_S: Final = 0.1
+_THREADS: Final = 16
+_ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
+_ASK_SERIAL: Final = upload_request(od.IDENTITY, od.IDENTITY_SERIAL)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundNode:
+    """A node-ID that was heard. What the node does not have, or did not answer, is None."""
+
+    node_id: int
+    answers: bool
+    """By SDO; a stopped node does not."""
+    state: str
+    state_known_by: str
+    """Or why it is not known."""
+    name: str | None
+    """0x1008."""
+    device_type: int | None
+    """0x1000: the number of the device profile in the lower half."""
+    error_register: int | None
+    """0x1001."""
+    vendor_id: int | None
+    product_code: int | None
+    revision: int | None
+    serial: int | None
+    heartbeat_ms: int | None
+    boot_ups: int
+    """Heard during the survey."""
+    duplicate: str
+    """What speaks for two nodes with this node-ID; empty for nothing."""
+    wrong_answer: str = ""
+    """Newest frame in place of an SDO answer, as hexadecimal text, if none of its answers was valid."""
+
+    @property
+    def profile(self) -> str:
+        """Device profile in words; empty if the node does not report it."""
+        if self.device_type is None:
+            return ""
+        number = self.device_type & 0xFFFF
+        return f"device profile {number}" if number else "no device profile"
+
+    @property
+    def identity(self) -> list[str]:
+        """Profile, vendor and product in words, as far as the node reports them."""
+        known = [self.profile] if self.profile else []
+        for what, number in (("vendor", self.vendor_id), ("product", self.product_code)):
+            if number is not None:
+                known.append(f"{what} 0x{number:08X}")
+        return known
+
+    @property
+    def is_patch(self) -> bool:
+        """Whether it is one of ours by vendor and product."""
+        return (self.vendor_id, self.product_code) == (od.VENDOR_ID, od.PRODUCT_CODE)
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """What was found."""
+
+    nodes: tuple[FoundNode, ...]
+    """By ascending node-ID."""
+    unconfigured: tuple[LssAddress, ...]
+    """Nodes without a node-ID."""
+    more_unconfigured: bool
+    """There are others that time did not allow to tell apart."""
+    seconds: float
+
+
+def discover(connection: BusConnection, progress: Callable[[str], None] = lambda _: None) -> Discovery:
+    """Find everybody. ``progress`` is told what is being done. Raises BusError."""
+    begun_s = time.monotonic()
+    _let_others_finish(connection)
+    asked_ns = time.monotonic_ns()
+    with ThreadPoolExecutor(_THREADS, thread_name_prefix="survey") as pool:
+        try:
+            lss = pool.submit(find_unconfigured, connection)
+            progress("asking node-IDs 1 to 127")
+            answered = _sweep(connection)
+            progress(f"{len(answered)} answer; who are they?")
+            jobs = [pool.submit(_examine, connection, node_id, count) for node_id, count in answered.items()]
+            nodes = [job.result() for job in jobs]
+            connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
+            unconfigured, more = lss.result()
+        except BaseException:  # Ctrl-C too: the threads of the pool would go on
+            connection.abandon()
+            raise
+    heard = connection.listener.nodes
+    silent = [_only_heard(connection, node_id, asked_ns) for node_id in heard if node_id not in answered]
+    found = sorted((*nodes, *filter(None, silent)), key=lambda node: node.node_id)
+    return Discovery(tuple(found), unconfigured, more, time.monotonic() - begun_s)
+
+
+def _let_others_finish(connection: BusConnection) -> None:
+    """Wait while another client's SDO transfers are under way: a question of ours would abort them. A host
+    has some at bring-up, and none while it runs."""
+    end_s = time.monotonic() + OTHERS_S
+    while time.monotonic() < end_s:
+        before = _sdo_frames(connection)
+        connection.wait_until(lambda: False, _QUIET_S)
+        if _sdo_frames(connection) == before:
+            return
+
+
+def _sdo_frames(connection: BusConnection) -> int:
+    first, end = od.sdo_response_cob_id(1), od.sdo_request_cob_id(od.MAX_NODE_ID + 1)
+    return sum(count for cob_id, count in dict(connection.listener.cob_ids).items() if first <= cob_id < end)
+
+
+def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
+    """Nodes without a node-ID, and whether there are more than time allowed to find. They wait again at the
+    end."""
+    found: list[LssAddress] = []
+    end_s = time.monotonic() + LSS_S
+    if not connection.lss.any_unconfigured():
+        return (), False
+    try:
+        while time.monotonic() < end_s:
+            address = connection.lss.find_unconfigured()
+            if address is None or address in found:
+                return tuple(found), not found
+            found.append(address)
+        return tuple(found), connection.lss.find_unconfigured() is not None
+    finally:
+        connection.lss.release()
+
+
+def _sweep(connection: BusConnection) -> dict[int, int]:
+    """Node-IDs that answer, and the most answers that one question got."""
+    answers: dict[int, int] = {}
+    for _ in range(SWEEPS):
+        asked_ns = time.monotonic_ns()
+        for node_id in range(1, od.MAX_NODE_ID + 1):
+            if node_id not in answers:
+                connection.link.send(od.sdo_request_cob_id(node_id), _ASK_DEVICE_TYPE)
+                time.sleep(PACE_S)
+        connection.wait_until(lambda: False, ANSWER_S)
+        for node_id, heard in connection.listener.nodes.items():
+            count = sum(
+                t_ns >= asked_ns and data[1:4] == _ASK_DEVICE_TYPE[1:4]
+                for t_ns, data in list(heard.sdo_answers)
+            )
+            if count and node_id not in answers:
+                answers[node_id] = count
+    return dict(sorted(answers.items()))
+
+
+def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode:
+    duplicate = _two_serials(connection, node_id) if answers > 1 else ""
+    identity = [_number(connection, node_id, od.IDENTITY, sub) for sub in (1, 2, 3, 4)]
+    if not duplicate and identity[:2] == [od.VENDOR_ID, od.PRODUCT_CODE]:
+        strangers = _number(connection, node_id, od.REJECTED_FRAMES, 7)
+        if strangers:
+            duplicate = f"the node heard its own node-ID from somebody else {strangers} times (0x2040:7)"
+    heartbeat_s = connection.heartbeat_s(node_id)
+    state = connection.state(node_id, heartbeat_s, guarding=not connection.guarded(node_id))
+    return FoundNode(
+        node_id=node_id,
+        answers=True,
+        state=str(state),
+        state_known_by=state.how,
+        name=_text(connection, node_id, od.DEVICE_NAME_INDEX),
+        device_type=_number(connection, node_id, od.DEVICE_TYPE, 0),
+        error_register=_number(connection, node_id, od.ERROR_REGISTER, 0),
+        vendor_id=identity[0],
+        product_code=identity[1],
+        revision=identity[2],
+        serial=identity[3],
+        heartbeat_ms=None if heartbeat_s is None else round(heartbeat_s * 1e3),
+        boot_ups=connection.listener.node(node_id).boot_ups,
+        duplicate=duplicate,
+    )
+
+
+def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> FoundNode | None:
+    """A node-ID that sends heartbeats and no valid SDO answer, asked from ``asked_ns`` on."""
+    beat = connection.listener.newest_beat(node_id)
+    if beat is None:
+        return None
+    state = connection.state(node_id, None, guarding=False)
+    boot_ups = connection.listener.node(node_id).boot_ups
+    identity = ("vendor_id", "product_code", "revision", "serial")
+    nothing = dict.fromkeys(("device_type", "error_register", *identity, "heartbeat_ms"))
+    return FoundNode(
+        node_id,
+        False,
+        str(state),
+        state.how,
+        name=None,
+        boot_ups=boot_ups,
+        duplicate="",
+        wrong_answer=connection.wrong_answer(node_id, asked_ns),
+        **nothing,
+    )
+
+
+def _two_serials(connection: BusConnection, node_id: int) -> str:
+    """What speaks for two nodes; empty where the second answer was a late one to the sweep before."""
+    answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
+    answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
+    if len(answers) < 2:
+        return ""
+    serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
+    shown = " and ".join(map(str, serials))
+    return f"one question got {len(answers)} answers" + (f": serials {shown}" if shown else "")
+
+
+def _number(connection: BusConnection, node_id: int, index: int, subindex: int) -> int | None:
+    try:
+        return int.from_bytes(connection.od(node_id).read_bytes(index, subindex), "little")
+    except NodeError:
+        return None
+
+
+def _text(connection: BusConnection, node_id: int, index: int) -> str | None:
+    try:
+        return printable(connection.od(node_id).read_bytes(index, 0))
+    except NodeError:
+        return None

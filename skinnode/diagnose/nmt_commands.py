@@ -1,0 +1,120 @@
+"""NMT commands (CiA 301, 7.2.8) whose effect is looked at."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, state_name
+from skinnode.diagnose.bus_connection import BusConnection, State
+
+FOLLOW_S: Final = 1.5
+"""How long a node may take to say that it is in its new state, beyond its heartbeat period."""
+
+BOOT_S: Final = 5.0
+"""How long a node may take to boot."""
+
+_GUARD_EACH_S: Final = 0.1
+
+
+class Command(StrEnum):
+    """What a node is told."""
+
+    START = "start"
+    STOP = "stop"
+    PRE_OPERATIONAL = "pre-operational"
+    RESET_NODE = "reset-node"
+    RESET_COMMUNICATION = "reset-communication"
+
+    @property
+    def resets(self) -> bool:
+        return self in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
+
+
+_SPECIFIERS: Final = {
+    Command.START: NmtCommand.START,
+    Command.STOP: NmtCommand.STOP,
+    Command.PRE_OPERATIONAL: NmtCommand.ENTER_PRE_OPERATIONAL,
+    Command.RESET_NODE: NmtCommand.RESET_NODE,
+    Command.RESET_COMMUNICATION: NmtCommand.RESET_COMMUNICATION,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What became of a command at one node."""
+
+    node_id: int
+    before: str
+    after: str
+    followed: bool
+    known_by: str
+    """How the state after is known, or why the node counts as not following."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Watch:
+    """How the state of a node can be known."""
+
+    node_id: int
+    heartbeat_s: float | None
+    guarding: bool
+    before: State
+    boot_ups: int
+
+
+def command_nodes(
+    connection: BusConnection, node_ids: Sequence[int], command: Command, *, at_once: bool
+) -> list[Change]:
+    """Command these nodes, ``at_once`` by one message to all nodes of the bus, else one after the other, and
+    see what they do. Raises BusError."""
+    watches = [_watch(connection, node_id) for node_id in node_ids]
+    sent_ns = time.monotonic_ns()
+    for node_id in [ALL_NODES] if at_once else node_ids:
+        connection.link.send(od.NMT_COB_ID, encode(_SPECIFIERS[command], node_id))
+    if command.resets:
+        return [_booted(connection, watch, sent_ns) for watch in watches]
+    return [_followed(connection, watch, command, sent_ns) for watch in watches]
+
+
+def _watch(connection: BusConnection, node_id: int) -> _Watch:
+    """What can only be asked beforehand: a stopped node does not answer."""
+    heartbeat_s = connection.heartbeat_s(node_id)
+    guarding = not connection.guarded(node_id)
+    before = connection.state(node_id, heartbeat_s, guarding=guarding)
+    return _Watch(node_id, heartbeat_s, guarding, before, connection.listener.node(node_id).boot_ups)
+
+
+def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
+    """Whether the node says that it is in the state it was told to enter."""
+    wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
+    end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
+    while True:
+        now = connection.state(watch.node_id, watch.heartbeat_s, guarding=watch.guarding, since_ns=since_ns)
+        if now.state == wanted:
+            return Change(watch.node_id, str(watch.before), str(now), True, now.how)
+        if time.monotonic() > end_s:
+            why = now.how if now.state is None else f"by {now.how}, not {state_name(wanted)}"
+            return Change(watch.node_id, str(watch.before), str(now), False, why)
+        since_ns = time.monotonic_ns()
+        connection.wait_until(lambda: False, _GUARD_EACH_S)
+
+
+def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
+    """Whether the node booted, and the state in which it then is."""
+    node_id = watch.node_id
+    if not connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > watch.boot_ups, BOOT_S):
+        why = f"no boot-up message within {BOOT_S:g} s"
+        now = connection.listener.newest_beat(node_id, sent_ns)
+        after = "silent" if now is None else state_name(now.state)
+        return Change(node_id, str(watch.before), after, False, why)
+    booted_ns = time.monotonic_ns()
+    heartbeat_s = connection.heartbeat_s(node_id)  # it may have been reset, too
+    guarding = not connection.guarded(node_id)
+    now_in = connection.state(node_id, heartbeat_s, guarding=guarding, since_ns=booted_ns)
+    how = "boot-up message" + (f", {now_in.how}" if now_in.state is not None else "")
+    return Change(node_id, str(watch.before), str(now_in), True, how)

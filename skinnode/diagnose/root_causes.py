@@ -1,0 +1,191 @@
+"""Groups findings by root cause: a consequence of another finding is listed below it.
+
+One overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All these findings
+are true, but none of them is the fault to repair. A rule names a cause and its possible consequences, at the
+same patch or at every patch of a bus. If the finding alone does not decide, the evidence does: an emergency
+follows from an overload only if each of its texts reports an overrun.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from skinnode.diagnose.checks.run import run_checks
+from skinnode.diagnose.facts import BusFacts, Finding, Sure
+
+_RANK: Final = {sure: rank for rank, sure in enumerate(Sure)}
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A finding that no other finding causes, with its consequences."""
+
+    cause: Finding
+    consequences: tuple[Finding, ...] = ()
+
+    @property
+    def rank(self) -> int:
+        """Rank of its most certain finding; 0 is certain."""
+        return min(_RANK[finding.sure] for finding in (self.cause, *self.consequences))
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Patterns of a cause and its consequences, each matched at the beginning of a finding's text."""
+
+    cause: str
+    follow: tuple[str, ...]
+    evidence: Mapping[str, str]
+    """For a pattern of ``follow``: pattern that each part of the evidence must contain for the finding to be
+    a consequence."""
+
+
+_HOLES: Final = ("scans with holes", "whole scans are missing")
+_LATE: Final = (*_HOLES, "scans end when the next has begun")
+_OF_SYNC: Final = ("SYNCs are missing", "SYNC is irregular")
+_ERRORS: Final = ("emergency messages while it was watched", "the node reports an error")
+_CONFIGURED_BY_OTHERS: Final = (
+    "the (chunk|summary) PDO .* is not where it belongs",
+    "chunks are not sent on event",
+    "another inhibit time than the host sets",
+    "another heartbeat than wanted",
+    "no heartbeat: nobody sees it go",
+    "the patch scans by its own timer",
+)
+_SAID: Final = "^error register 0x|^last: none reported$"
+"""Pattern of the evidence of a reported error that leaves its cause open."""
+_OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_SAID}")
+_WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_SAID}")
+_RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_SAID}")
+_COLLISION: Final = dict.fromkeys(_ERRORS, f"collision|{_SAID}")
+_CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_SAID}")
+_ANYTHING: Final[Mapping[str, str]] = {}
+
+# The first rule that fits a finding takes it. Rules about a patch come before rules about its bus; a rule
+# comes before those whose causes may be its consequences.
+RULES: Final = (
+    Rule(
+        "two nodes have its node-ID",
+        (
+            "two different chunks with one number",
+            "frames that are no chunks of this patch",
+            "another patch than the hand file says",
+            *_LATE,
+            *_ERRORS,
+        ),
+        _COLLISION,
+    ),
+    Rule(
+        "the node restarts by itself",
+        (
+            *_LATE,
+            *_CONFIGURED_BY_OTHERS,
+            "the node is .* while others run",
+            "the node is .* and does not answer",
+            "it did not tell all about itself",
+            *_ERRORS,
+        ),
+        _RESTARTED,
+    ),
+    Rule("(upper|lower) wires (open|shorted|out of range)", (*_ERRORS, "noise on .* wire"), _WIRE),
+    Rule("the controller is", ("error frames on the bus", "no node of the hand answers", *_LATE), _ANYTHING),
+    Rule(
+        "the interface has another bit rate",
+        ("error frames on the bus", "no node of the hand answers", "the controller is", *_LATE),
+        _ANYTHING,
+    ),
+    Rule(
+        "the interface failed while it was watched",
+        (*_LATE, *_OF_SYNC, "the node is .* and does not answer", "it did not tell all about itself"),
+        _ANYTHING,
+    ),
+    Rule(
+        "two producers of SYNC",
+        (
+            "two masters with one heartbeat",
+            "somebody commands the nodes",
+            "SYNC has another period",
+            "another heartbeat than wanted",
+            *_LATE,
+            *_OF_SYNC,
+            *_ERRORS,
+        ),
+        _OVERRUN,
+    ),
+    Rule("two masters with one heartbeat", ("somebody commands the nodes", *_OF_SYNC), _ANYTHING),
+    Rule(
+        "the bus is loaded above what plans allow",
+        (*_LATE, *_OF_SYNC, "this machine dropped frames", "it did not tell all about itself", *_ERRORS),
+        _OVERRUN,
+    ),
+    Rule("this machine dropped frames", (*_HOLES, *_OF_SYNC), _ANYTHING),
+    Rule("error frames on the bus", (*_HOLES, *_OF_SYNC, *_ERRORS), _CONTROLLER),
+    Rule(
+        "a scan takes longer than a SYNC period",
+        (*_LATE, *_ERRORS),
+        _OVERRUN,
+    ),
+    Rule("SYNC has another period", (*_LATE, *_ERRORS), _OVERRUN),
+    Rule(
+        ".*crossings? have no baseline|.*crossing has no baseline", (".*crossings? out of range",), _ANYTHING
+    ),
+    Rule("its electrodes are elsewhere", ("codes of another width", "the EDS of the hand file"), _ANYTHING),
+    Rule("SYNCs are missing", ("whole scans are missing", "SYNC is irregular"), _ANYTHING),
+    Rule(
+        "the node reports an error",
+        ("emergency messages while it was watched", "the node is .* while others run"),
+        _ANYTHING,
+    ),
+)
+
+
+def grouped(buses: Sequence[BusFacts]) -> list[Group]:
+    """Return all findings of these buses grouped by root cause: groups with the most certain finding first,
+    then those with the most consequences."""
+    groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
+    return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))
+
+
+def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]:
+    """Return each distinct finding once, with the places where it was made; an overload affects every
+    patch."""
+    places: dict[str, list[Finding]] = {}
+    for finding in findings:
+        places.setdefault(finding.what, []).append(finding)
+    return [(same[0], tuple(each.where for each in same)) for same in places.values()]
+
+
+def _of_bus(bus: str, findings: list[Finding]) -> list[Group]:
+    """Give each finding to the first rule that fits; a chain of causes ends at its root."""
+    cause_of: dict[int, int] = {}
+    for rule in RULES:
+        for at, cause in enumerate(findings):
+            if at in cause_of or re.match(rule.cause, cause.what) is None:
+                continue
+            for number, finding in enumerate(findings):
+                near = cause.where in (bus, finding.where)
+                if number != at and number not in cause_of and near and _follows(finding, rule):
+                    cause_of[number] = at
+    groups = []
+    for at, finding in enumerate(findings):
+        if at not in cause_of:
+            below = [item for number, item in enumerate(findings) if _root(number, cause_of) == at != number]
+            groups.append(Group(finding, tuple(sorted(below, key=lambda item: _RANK[item.sure]))))
+    return groups
+
+
+def _root(number: int, cause_of: Mapping[int, int]) -> int:
+    for _ in range(len(cause_of)):
+        number = cause_of.get(number, number)
+    return number
+
+
+def _follows(finding: Finding, rule: Rule) -> bool:
+    for pattern in rule.follow:
+        if re.match(pattern, finding.what):
+            needed = rule.evidence.get(pattern)
+            return needed is None or all(re.search(needed, part) for part in finding.evidence.split("; "))
+    return False

@@ -1,0 +1,114 @@
+"""Scans as they come off a bus: the assembler of the host, without its solvers."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from skinnode.canopen import indices as od
+from skinnode.diagnose.facts import ScanFacts
+from skinnode.protocol.assembler import Scan, ScanAssembler
+from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.profile import PatchProfile
+from skinnode.transport import Frame
+
+_MOST_SCANS: Final = 1000
+_MOST_SYNCS: Final = 100_000
+_LONGEST_NS: Final = 10_000_000_000
+"""From a SYNC to the scan that it began."""
+
+
+class ScanCapture:
+    """Assembles the scans of some patches and notes every SYNC. :meth:`on_frames` is for the mainline of a
+    link; what it has is read when it is quiet."""
+
+    def __init__(self) -> None:
+        self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
+        """When, and the counter; 0 for none."""
+        self._patches: dict[int, _Patch] = {}
+        self._takers: dict[int, tuple[_Patch, bool]] = {}
+
+    def add(self, node_id: int, profile: PatchProfile, overflow: int, period_s: float) -> None:
+        """Take the scans of this patch from now on."""
+        assembler = ScanAssembler(
+            profile, counter_overflow=overflow, period_ns=round(period_s * 1e9), node_id=node_id
+        )
+        patch = self._patches[node_id] = _Patch(assembler)
+        takers = {**self._takers, od.chunk_cob_id(node_id): (patch, True)}
+        self._takers = {**takers, od.summary_cob_id(node_id): (patch, False)}
+
+    def scans(self, node_id: int) -> int:
+        """How many there are of a patch."""
+        return len(self._patches[node_id].scans)
+
+    def on_frames(self, frames: Sequence[Frame]) -> None:
+        """Take a batch."""
+        for frame in frames:
+            if frame.error or frame.remote or frame.extended:
+                continue
+            if frame.can_id == od.SYNC_COB_ID:
+                self.note_sync(frame.t_ns, frame.data[0] if frame.data else 0)
+            elif (taker := self._takers.get(frame.can_id)) is not None:
+                patch, chunk = taker
+                if not patch.begun:  # the scan that was under way when somebody began to listen is nobody's
+                    patch.begun = not chunk
+                    continue
+                take = patch.assembler.on_chunk if chunk else patch.assembler.on_summary
+                patch.keep(take(frame.data, frame.t_ns), self._sync_ns)
+        for patch in self._patches.values():
+            patch.keep(patch.assembler.poll(frames[-1].t_ns), self._sync_ns)
+
+    def note_sync(self, t_ns: int, counter: int) -> None:
+        """A SYNC, heard or sent."""
+        self.syncs.append((t_ns, counter))
+
+    def facts(self, node_id: int, scale: CodeScale, told_noise: float) -> ScanFacts | None:
+        """All that came of a patch, None for nothing."""
+        patch = self._patches[node_id]
+        patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
+        scans = list(patch.scans)
+        if not scans:
+            return None
+        codes = np.stack([scan.codes for scan, _ in scans]).astype(np.int64)
+        valid = np.stack([scan.valid for scan, _ in scans])
+        last_ns = np.array([scan.t_last_ns for scan, _ in scans], dtype=np.float64)
+        sync_ns = np.array([np.nan if sync is None else float(sync) for _, sync in scans])
+        device = [-1 if scan.device_time_us is None else scan.device_time_us for scan, _ in scans]
+        return ScanFacts(
+            ratio=np.where(valid, scale.lo + codes * scale.step, np.nan),
+            n_open=(codes == scale.open).sum(axis=0),
+            n_short=(codes == scale.short).sum(axis=0),
+            n_over=(codes == scale.over_range).sum(axis=0),
+            t_s=(last_ns - last_ns[0]) * 1e-9,
+            latency_s=(last_ns - sync_ns) * 1e-9,
+            device_us=np.array(device, dtype=np.int64),
+            complete=np.array([scan.complete for scan, _ in scans]),
+            step=scale.step,
+            told_noise=told_noise,
+            stats=patch.assembler.stats,
+        )
+
+    def _sync_ns(self, scan: Scan) -> int | None:
+        """When the SYNC of a scan came: the newest before its first frame, of its counter where SYNCs have
+        one. The next SYNC may be there before the last frame."""
+        for t_ns, number in reversed(list(self.syncs)):  # another thread may note one meanwhile
+            if scan.t_first_ns - t_ns > _LONGEST_NS:
+                return None
+            if t_ns <= scan.t_first_ns and number in (scan.counter, 0):
+                return t_ns
+        return None
+
+
+class _Patch:
+    def __init__(self, assembler: ScanAssembler) -> None:
+        self.assembler = assembler
+        self.begun = False
+        self.scans: deque[tuple[Scan, int | None]] = deque(maxlen=_MOST_SCANS)
+
+    def keep(self, scan: Scan | None, sync_ns: Callable[[Scan], int | None]) -> None:
+        if scan is not None:
+            self.scans.append((scan, sync_ns(scan)))

@@ -1,0 +1,164 @@
+"""Tares patches from the technician's side, by SDO, even while a host runs on the bus.
+
+The node responds to the write to 0x2021:4 after it has measured, so the response is the confirmation. The
+summary of its next scan says that the baseline changed, and a running host then reads the baseline. An SDO
+server handles one transfer at a time, so a request from here would abort that upload: the baseline is read
+back once the node's SDO channel is quiet.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.abort import AbortCode
+from skinnode.canopen.nmt import NmtState
+from skinnode.config import BusConfig, PatchConfig
+from skinnode.diagnose.bus_connection import BusConnection
+from skinnode.diagnose.data_sheet import read_profile
+from skinnode.errors import BusError, NodeError, SdoAbort
+from skinnode.host.sdo_client import RemoteOd
+from skinnode.model.layout import Float
+from skinnode.protocol.profile import PatchProfile
+
+QUIET_S: Final = 0.3
+"""Silence of a node's SDO channel that shows that no other client is in a transfer with it."""
+
+HOST_BEGINS_S: Final = 1.0
+"""Maximum time, besides a SYNC period, from the tare to the host's first SDO request; 0.3 s on an idle
+host."""
+
+OTHERS_S: Final = 4.0
+"""Maximum wait for other SDO clients."""
+
+_ATTEMPTS: Final = 3
+_POLL_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Tared:
+    """Result of a tare of one patch."""
+
+    patch: str
+    """Its name; empty if no hand names it."""
+    node_id: int
+    bus: str
+    problem: str
+    """Why the patch was not tared; empty if it was."""
+    crossings: int = 0
+    """Crossings with a new R0."""
+    median_ohm: float | None = None
+    """Median R0 afterwards."""
+    median_change: float | None = None
+    """Median of the ratio of new to old R0, minus one; None if there was no old R0."""
+
+    @property
+    def done(self) -> bool:
+        return not self.problem
+
+
+def refusal(patch: PatchConfig, bus: BusConfig) -> str:
+    """Return why the hand file forbids taring this patch; empty if it allows it."""
+    if patch.baseline is not None:
+        return f"its baseline is kept in {patch.baseline}, which a host would write back"
+    if bus.role == "guest" and bus.guest_sends == "nothing":
+        return f"the hand sends nothing on {bus.name} (role guest, guest_sends nothing)"
+    return ""
+
+
+def tare(
+    connection: BusConnection,
+    node_id: int,
+    patch: str,
+    *,
+    sync_period_s: float = 0.0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Tared:
+    """Tare one node and read its new baseline back. A node that does not answer, or refuses, gives a result,
+    not an exception. ``sync_period_s``: SYNC period of a host that may be running. Raises BusError if the bus
+    fails."""
+    try:
+        return _tare(connection, node_id, patch, sync_period_s, progress)
+    except NodeError as error:
+        problem = str(error).removeprefix(f"node {node_id}: ")
+        return Tared(patch, node_id, connection.bus.name, problem)
+
+
+def _tare(
+    connection: BusConnection, node_id: int, patch: str, sync_period_s: float, progress: Callable[[str], None]
+) -> Tared:
+    who = patch or f"node {node_id}"
+    remote = connection.od(node_id)
+    progress(f"{who}: waiting for other SDO clients")
+    _let_others_finish(connection, node_id, at_least_s=0.0)
+    connection.require_answer(node_id)
+    profile = read_profile(remote)
+    if profile is None:
+        raise NodeError(node_id, "is not a skinnode patch")
+    before = _baseline(connection, remote, profile)
+    progress(f"{who}: taring")
+    try:
+        remote.write(od.ACQUISITION, od.TARE, "u32", od.TARE_SIGNATURE)
+    except SdoAbort as abort:
+        if abort.code != AbortCode.HARDWARE:
+            raise
+        raise NodeError(node_id, f"its converter gave no reading (SDO abort 0x{abort.code:08X})") from None
+    runs = _runs(connection, node_id)
+    progress(f"{who}: reading its baseline")
+    _let_others_finish(connection, node_id, at_least_s=HOST_BEGINS_S + sync_period_s if runs else 0.0)
+    after = _baseline(connection, remote, profile)
+    good = np.isfinite(after) & (after > 0)
+    missing = int((~good).sum())
+    known = good & np.isfinite(before) & (before > 0)
+    change = float(np.median(after[known] / before[known] - 1.0)) if known.any() else None
+    median_ohm = float(np.median(after[good])) if good.any() else None
+    problem = f"{missing} of {after.size} crossings have no baseline" if missing else ""
+    return Tared(patch, node_id, connection.bus.name, problem, int(good.sum()), median_ohm, change)
+
+
+def _runs(connection: BusConnection, node_id: int) -> bool:
+    """Return whether a host has started the node: it then sends chunks, or operational heartbeats."""
+    beat = connection.listener.newest_beat(node_id)
+    operational = beat is not None and beat.state == NmtState.OPERATIONAL
+    return operational or connection.listener.cob_ids[od.chunk_cob_id(node_id)] > 0
+
+
+def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
+    """Read the baseline: (U, K) R0 in ohm. Repeats the upload if another client interrupted it. Raises
+    NodeError if the upload fails or has the wrong size."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            data = remote.read_block(od.BASELINE_DOMAIN)
+            break
+        except NodeError:
+            if attempt == _ATTEMPTS:
+                raise
+            _let_others_finish(connection, remote.node_id, at_least_s=QUIET_S)
+    values = np.frombuffer(data, dtype="<f4").astype(np.float64)
+    if values.size != profile.n_codes:
+        wanted = f"{profile.rows} × {profile.columns}"
+        raise NodeError(remote.node_id, f"baseline (0x2301): got {values.size} values, allowed: {wanted}")
+    return values.reshape(profile.rows, profile.columns)
+
+
+def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
+    """Wait until the node's SDO channel has been quiet for QUIET_S, or for ``at_least_s`` if no other client
+    begins; at most OTHERS_S."""
+    begun_s = quiet_s = time.monotonic()
+    request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)
+    count, heard = -1, False
+    while (now_s := time.monotonic()) - begun_s < OTHERS_S:
+        counted = connection.listener.cob_ids[request] + connection.listener.cob_ids[response]
+        if counted != count:
+            heard, count, quiet_s = count >= 0, counted, now_s
+        waited = heard or now_s - begun_s >= at_least_s
+        if waited and now_s - quiet_s >= QUIET_S:
+            return
+        connection.wait_until(lambda: False, _POLL_S)
+    if connection.link.failure is not None:
+        raise BusError(str(connection.link.failure))

@@ -1,0 +1,231 @@
+"""The screen as lines of text: header, buses, patches, touches and log, of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from rich.segment import Segment
+
+from skinnode.monitor import field_map
+from skinnode.monitor.field_map import Line
+from skinnode.monitor.patch_panel import GONE, alone, facts, tiles
+from skinnode.monitor.theme import Theme, Ui, beside, pad, spread, width_of
+from skinnode.monitor.touches import Touch
+from skinnode.monitor.view_model import BusView, LogLine, PatchView, View
+from skinnode.text.words import counted
+
+LEAST_WIDTH: Final = 50
+LEAST_HEIGHT: Final = 16
+"""A smaller screen shows only how large it would have to be."""
+
+
+def screen(
+    view: View, ui: Ui, log: Sequence[LogLine], full_m: float, theme: Theme, width: int, height: int
+) -> list[Line]:
+    """``height`` lines of ``width`` characters; the log's newest line is its last."""
+    if width < LEAST_WIDTH or height < LEAST_HEIGHT:
+        told = f"{width} × {height} is too small: {LEAST_WIDTH} × {LEAST_HEIGHT} at least"
+        return [pad([Segment(told[:width], theme.text)], width, theme)] + [
+            pad([], width, theme) for _ in range(height - 1)
+        ]
+    worst_first = sorted(view.buses, key=lambda bus: ("bad", "note", "good").index(bus.level))
+    shown = view.buses if len(view.buses) <= height // 6 else worst_first[: height // 6]
+    buses = [_bus_line(bus, _losses(view, bus), theme, width) for bus in shown]
+    upper = height - 2 - len(buses) - (8 if height < 28 else 12)
+    if ui.zoomed:
+        patch = view.patch(ui.selected)
+        middle = alone(patch, ui, full_m, theme, width, upper)
+        log = [line for line in log if line.subject in (patch.name, patch.bus, "")]
+    else:
+        middle = tiles(view.patches, ui, full_m, theme, width, upper)
+    lower = height - 2 - len(buses) - len(middle)
+    return [
+        _header(view, ui, theme, width),
+        *buses,
+        *middle,
+        *_lower(view, ui, log, full_m, theme, width, lower),
+        _keys(ui, theme, width),
+    ]
+
+
+def as_text(lines: Sequence[Line]) -> str:
+    """Without styles, for tests and for people who cannot see colours."""
+    return "\n".join("".join(segment.text for segment in line) for line in lines)
+
+
+def _header(view: View, ui: Ui, theme: Theme, width: int) -> Line:
+    bar = theme.bar
+    seconds = int(ui.elapsed_s)
+    left = [
+        Segment(" ", bar),
+        Segment(ui.title if len(ui.title) < 25 else f"{ui.title[:23]}…", theme.key),
+        Segment(f"  {seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}", bar),
+    ]
+    wrong = sum(patch.level == "bad" for patch in view.patches) + sum(
+        bus.level == "bad" for bus in view.buses
+    )
+    if wrong:
+        left += [Segment("  ", bar), Segment(f" {wrong} {'fault' if wrong == 1 else 'faults'} ", theme.alarm)]
+    if ui.paused:
+        left += [Segment("  ", bar), Segment(" PAUSED ", theme.alarm)]
+    if ui.over:
+        left += [Segment("  ", bar), Segment(" END OF RECORDING ", theme.alarm)]
+    if ui.recording is not None:
+        frames = f" ● REC {ui.recording.frames} frames "
+        left += [Segment("  ", bar), Segment(frames, theme.alarm)]
+    rates = f"{view.scans_hz:.1f} scans/s  "
+    if width >= 100:
+        rates += f"{view.fields_hz:.0f} fields/s  "
+    if view.latency_s is not None and view.latency_max_s is not None:
+        rates += f"latency {1e3 * view.latency_s:.1f} ms, worst {1e3 * view.latency_max_s:.1f} "
+    return spread(left, [Segment(rates, bar)], width, theme, bar)
+
+
+def _losses(view: View, bus: BusView) -> str:
+    """Describe the losses of the patches of a bus, the worst in words; empty if there are none."""
+    counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
+    for name, one, several in (
+        ("chunks_lost", "chunk lost", "chunks lost"),
+        ("summaries_lost", "summary lost", "summaries lost"),
+        ("scans_torn", "scan torn", "scans torn"),
+        ("scans_missed", "scan missed", "scans missed"),
+        ("scans_mixed", "scan mixed", "scans mixed"),
+    ):
+        if total := sum(getattr(count, name) for count in counts):
+            return counted(total, one, several)
+    return ""
+
+
+def _bus_line(bus: BusView, losses: str, theme: Theme, width: int) -> Line:
+    cells = 12 if width < 110 else 24
+    full = min(cells, round(bus.load * cells))
+    words = [*bus.words, losses] if losses else list(bus.words)
+    style = theme.note if losses and bus.level == "good" else theme.of(bus.level)
+    load = theme.bad if bus.load > 0.9 else theme.note if bus.load > 0.7 else theme.gauge
+    line = [
+        Segment(f" {bus.name:<6.12}", theme.strong),
+        Segment("load ", theme.dim),
+        Segment("█" * full, load),
+        Segment("·" * (cells - full), theme.dim),
+        Segment(f"{100 * bus.load:4.0f} %  ", theme.text),
+        Segment(f"{bus.frames_hz:5.0f}", theme.text),
+        Segment(" frames/s  ", theme.dim),
+        Segment("; ".join(words) or "nothing lost", style),
+    ]
+    where = [Segment(f"  {bus.where} ({bus.role}) ", theme.dim)]
+    if width_of(line) + width_of(where) > width:
+        return pad(line, width, theme)
+    return spread(line, where, width, theme)
+
+
+def _keys(ui: Ui, theme: Theme, width: int) -> Line:
+    if ui.message:
+        style = theme.alarm if ui.message_level == "bad" else theme.key
+        return pad([Segment(f" {ui.message} ", style)], width, theme, theme.bar)
+    keys = [("1-9", "patch"), ("z", "back" if ui.zoomed else "zoom")]
+    if ui.live:
+        keys += [("t", "tare"), ("r", "stop recording" if ui.recording else "record")]
+    keys += [("space", "go on" if ui.paused else "pause"), ("a", "arrows"), ("?", "help"), ("q", "quit")]
+    line = [Segment(" ", theme.bar)]
+    for key, what in keys:
+        line += [Segment(key, theme.key), Segment(f" {what}  ", theme.bar)]
+    return pad(line, width, theme, theme.bar)
+
+
+# --- touches and log
+
+
+def _lower(
+    view: View, ui: Ui, log: Sequence[LogLine], full_m: float, theme: Theme, width: int, height: int
+) -> list[Line]:
+    """Touches and events: below each other, or beside where there is room. Where there is a lot, the figures
+    of the patch that is chosen as well."""
+    chosen = view.patch(ui.selected)
+    patches = (chosen,) if ui.zoomed else view.patches
+    scale = [] if ui.zoomed else field_map.legend(full_m, 10, theme.colours, theme.text)
+    if width >= 130:
+        left = min(80, width // 2)
+        figures = [] if ui.zoomed else [[], *facts(chosen, theme, left - 2)]
+        share = height - len(figures) if height - len(figures) >= 7 else height
+        below = [[Segment(" ", theme.text), *line] for line in figures[: height - share]]
+        lines = [*_touches(patches, scale, theme, left - 2, share), *below]
+        blocks = [(lines, left), (_log(log, _quiet(view), theme, width - left, height), width - left)]
+        return beside(blocks, height, theme)
+    share = min(4, max(2, height // 2))
+    lines = [
+        *_touches(patches, scale, theme, width, share),
+        *_log(log, _quiet(view), theme, width, height - share),
+    ]
+    return [pad(line, width, theme) for line in lines]
+
+
+def _rule(title: str, tail: Line, theme: Theme, width: int) -> Line:
+    left = [Segment("─ ", theme.dim), Segment(title, theme.dim), Segment(" ", theme.dim)]
+    dashes = max(0, width - width_of(left) - width_of(tail) - 1)
+    return pad(
+        [*left, Segment("─" * dashes, theme.dim), Segment(" " if tail else "", theme.text), *tail],
+        width,
+        theme,
+    )
+
+
+def _touches(patches: Sequence[PatchView], scale: Line, theme: Theme, width: int, height: int) -> list[Line]:
+    rows = [(patch, touch) for patch in patches if patch.condition not in GONE for touch in patch.touches]
+    rows.sort(key=lambda row: -(row[1].force_n or 1e3 * row[1].depth_m))
+    hidden = len(rows) - (height - 1)
+    title = "touches" + (f" ({hidden} more)" if hidden > 0 else "")
+    lines = [_rule(title, scale, theme, width)]
+    name = min(14, max((len(patch.name) for patch in patches), default=0))
+    lines += [
+        pad(_touch_line(patch, touch, theme, name), width, theme) for patch, touch in rows[: height - 1]
+    ]
+    if not rows:
+        known = any(patch.depth_m is not None for patch in patches)
+        lines.append([Segment(" nothing touches" if known else " nothing known yet", theme.dim)])
+    return [*lines, *([[]] * (height - len(lines)))]
+
+
+def _touch_line(patch: PatchView, touch: Touch, theme: Theme, name: int) -> Line:
+    if touch.force_n is None:
+        force = [Segment("force not known ", theme.dim)]
+    else:
+        std = "" if touch.force_std_n is None else f" ± {touch.force_std_n:.2f}"
+        force = [Segment(f"{touch.force_n:6.2f}{std} N  ", theme.strong)]
+    line = [Segment(f" {patch.name:<{name}.{name}} ", theme.text), *force]
+    if touch.shear_n is not None:
+        size = float((touch.shear_n[0] ** 2 + touch.shear_n[1] ** 2) ** 0.5)
+        sign = field_map.arrow(*touch.shear_n) if size >= 0.005 else "·"
+        line.append(Segment(f"{sign} {size:4.2f} N  ", theme.text))
+    return [
+        *line,
+        Segment(f"x {1e3 * touch.x_m:5.1f}  y {1e3 * touch.y_m:5.1f} mm  ", theme.text),
+        Segment(f"{1e6 * touch.area_m2:4.0f} mm²  {1e6 * touch.depth_m:4.0f} µm", theme.dim),
+    ]
+
+
+def _quiet(view: View) -> str:
+    """Return the text of an empty event log; a fault may be older than the log."""
+    wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
+    wrong += [bus.name for bus in view.buses if bus.level == "bad"]
+    if wrong:
+        return f" no event yet; faults from before: {', '.join(wrong)}"
+    lost = any(_losses(view, bus) for bus in view.buses)
+    return " no event" if lost else " nothing happened"
+
+
+def _log(log: Sequence[LogLine], quiet: str, theme: Theme, width: int, height: int) -> list[Line]:
+    lines = [_rule("events", [], theme, width)]
+    shown = log[-(height - 1) :] if height > 1 else []
+    for line in shown:
+        subject = f"{line.subject} " if line.subject else ""
+        lines.append(
+            [
+                Segment(f" {line.time} ", theme.dim),
+                Segment(subject, theme.strong),
+                Segment(line.text, theme.of(line.level) if line.level != "good" else theme.text),
+            ]
+        )
+    if not shown:
+        lines.append([Segment(quiet, theme.dim)])
+    return [*lines, *([[]] * (height - len(lines)))]

@@ -1,0 +1,298 @@
+"""What is shown, as data: a frozen view made of snapshots of a host. Plain functions, no terminal."""
+
+from __future__ import annotations
+
+import functools
+import statistics
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from skinnode.canopen.emergency import register_text
+from skinnode.config import HandConfig, PatchConfig
+from skinnode.config.patches import LayoutConfig
+from skinnode.host.dispatcher import BusStats
+from skinnode.host.events import HealthEvent
+from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.patch_stream import StreamStats
+from skinnode.model.layout import Float
+from skinnode.monitor.field_map import Surface, mean_shear_m, surface_of
+from skinnode.monitor.source import Snapshot
+from skinnode.monitor.touches import Touch, touches_of
+
+Level = Literal["good", "note", "bad"]
+"""How much it matters: all is well, worth a look, a fault."""
+
+HISTORY_NS: Final = 2_000_000_000
+"""Rates and latencies are of this long."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchView:
+    """One patch."""
+
+    name: str
+    node_id: int
+    bus: str
+    condition: str
+    level: Level
+    words: tuple[str, ...]
+    """What is wrong beside the condition, the worst first."""
+    health: PatchHealth
+    stream: StreamStats
+    rate_hz: float
+    """Fields a second."""
+    latency_s: float | None
+    """Last frame to field, the median of those shown lately."""
+    latency_max_s: float | None
+    scan: int | None
+    trusted: bool
+    method: str
+    surface: Surface | None
+    depth_m: float | None
+    depth_std_m: float | None
+    """Of the deepest electrode."""
+    shear_m: tuple[float, float]
+    """Mean, weighted by depth."""
+    touches: tuple[Touch, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BusView:
+    """One bus."""
+
+    name: str
+    where: str
+    role: str
+    level: Level
+    words: tuple[str, ...]
+    load: float
+    """Share of the last second that frames took."""
+    frames_hz: float
+    lost: int
+    """Frames that the kernel or the host had no room for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """The whole hand at one instant."""
+
+    t_ns: int
+    patches: tuple[PatchView, ...]
+    buses: tuple[BusView, ...]
+    scans_hz: float
+    """Fields a second, of the fastest patch: the pace of SYNC where all is well."""
+    fields_hz: float
+    """Of all patches together."""
+    latency_s: float | None
+    latency_max_s: float | None
+
+    @property
+    def deepest_m(self) -> float:
+        return max((patch.depth_m or 0.0 for patch in self.patches), default=0.0)
+
+    def patch(self, name: str) -> PatchView:
+        """Raises KeyError."""
+        return {patch.name: patch for patch in self.patches}[name]
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """Something that happened, with the time of the day."""
+
+    time: str
+    subject: str
+    text: str
+    level: Level
+
+
+class History:
+    """The snapshots of the last seconds."""
+
+    def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
+        self._hand, self._live = hand, live
+        self._kept: deque[Snapshot] = deque()
+
+    def add(self, snapshot: Snapshot) -> View:
+        """Take a new snapshot, the newest; the view of it."""
+        kept = self._kept
+        if kept and kept[-1].t_ns > snapshot.t_ns:
+            kept.clear()  # a recording whose time jumps
+        elif kept and kept[-1].t_ns == snapshot.t_ns:
+            kept.pop()
+        kept.append(snapshot)
+        while len(kept) > 2 and kept[1].t_ns < snapshot.t_ns - HISTORY_NS:
+            kept.popleft()
+        return view_of(self._hand, kept, live=self._live)
+
+
+def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True) -> View:
+    """The view of the newest snapshot; rates are since the oldest, latencies of all, where they are those of
+    a host that is ``live``."""
+    now, before = history[-1], history[0]
+    elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
+    patches = tuple(_patch_view(patch, history, elapsed_s, live) for patch in hand.patches)
+    buses = tuple(
+        _bus_view(hand, now.bus_health[bus.name], now.buses[bus.name], before.buses[bus.name], elapsed_s)
+        for bus in hand.buses
+        if bus.name in now.buses
+    )
+    slowest = [patch.latency_max_s for patch in patches if patch.latency_max_s is not None]
+    medians = [patch.latency_s for patch in patches if patch.latency_s is not None]
+    return View(
+        t_ns=now.t_ns,
+        patches=patches,
+        buses=buses,
+        scans_hz=max(patch.rate_hz for patch in patches),
+        fields_hz=sum(patch.rate_hz for patch in patches),
+        latency_s=statistics.median(medians) if medians else None,
+        latency_max_s=max(slowest, default=None),
+    )
+
+
+def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: float, live: bool) -> PatchView:
+    now, before, name = history[-1], history[0], patch.name
+    health, stream, field = now.health[name], now.streams[name], now.fields[name]
+    condition, level, words = judge_patch(health, stream, before.streams[name])
+    surface = None if field is None else surface_of(field, upper_m(patch.layout))
+    depth_m = depth_std_m = None
+    if field is not None and surface is not None:
+        known = np.where(surface.unknown, -np.inf, surface.depth_m)
+        depth_m = max(0.0, surface.deepest_m)
+        std_m = float(field.displacement_std_m[..., 2].flat[int(known.argmax())])
+        depth_std_m = std_m if np.isfinite(std_m) else None
+    latencies = _latencies_s(history, name) if live else []
+    return PatchView(
+        name=name,
+        node_id=patch.node_id,
+        bus=patch.bus,
+        condition=condition,
+        level=level,
+        words=words,
+        health=health,
+        stream=stream,
+        rate_hz=max(0, stream.solved - before.streams[name].solved) / elapsed_s,
+        latency_s=statistics.median(latencies) if latencies else None,
+        latency_max_s=max(latencies, default=None),
+        scan=None if field is None or field.stamp is None else field.stamp.scan,
+        trusted=field is not None and field.trusted,
+        method="" if field is None else field.method,
+        surface=surface,
+        depth_m=depth_m,
+        depth_std_m=depth_std_m,
+        shear_m=(0.0, 0.0) if surface is None else mean_shear_m(surface),
+        touches=() if field is None else touches_of(field, upper_m(patch.layout)),
+    )
+
+
+def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
+    """Of the fields of a patch that were made during these snapshots, each once."""
+    found: dict[int, float] = {}
+    since_ns = history[-1].t_ns - HISTORY_NS
+    for snapshot in history:
+        field = snapshot.fields[name]
+        if field is not None and field.stamp is not None and field.stamp.t_solved_ns >= since_ns:
+            stamp = field.stamp
+            found[stamp.scan] = max(0, stamp.t_solved_ns - stamp.t_receive_ns) * 1e-9
+    return list(found.values())
+
+
+@functools.lru_cache(maxsize=128)
+def upper_m(layout: LayoutConfig) -> Float:
+    """(U, N, 3) electrodes at rest; of a patch that knows its own, those that stand for them."""
+    return layout.build().upper_m
+
+
+def judge_patch(
+    health: PatchHealth, stream: StreamStats, before: StreamStats
+) -> tuple[str, Level, tuple[str, ...]]:
+    """The condition, how much it matters, and what else is wrong."""
+    condition, words = health.condition, []
+    if condition is Condition.STALE and not stream.solved and not stream.withheld:
+        return "starting", "note", ()
+    if health.refusal:
+        words.append(health.refusal)
+    if health.defect:
+        words.append(health.defect)
+    if health.duplicate_id:
+        words.append(f"two nodes have node-ID {health.node_id}")
+    if health.restarts_in_a_loop:
+        words.append("restarts in a loop: supply, or watchdog?")
+    words += [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
+    if health.error_register:
+        words.append(health.emergency_text or f"error: {register_text(health.error_register)}")
+    losses = stream.assembler.chunks_lost - before.assembler.chunks_lost
+    missed = stream.assembler.scans_missed - before.assembler.scans_missed
+    lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
+    if condition is not Condition.OPERATIONAL:
+        lossy = []  # what is gone loses all
+    level: Level = "good"
+    if lossy or words:
+        level = "note"
+    if condition is Condition.BOOTING:
+        level = "note"
+    elif condition is not Condition.OPERATIONAL or health.duplicate_id:
+        level = "bad"
+    return str(condition), level, (*words, *lossy)
+
+
+def _bus_view(
+    hand: HandConfig, health: BusHealth, stats: BusStats, before: BusStats, elapsed_s: float
+) -> BusView:
+    bus = hand.bus(health.bus)
+    words = []
+    if health.away is not None:
+        words.append(f"away: {health.away}")
+    if health.no_sync:
+        words.append("no SYNC of its master")
+    if health.controller not in (None, "error active"):
+        words.append(f"the controller is {health.controller}")
+    lost = health.kernel_dropped + health.dropped
+    for count, text in (
+        (health.bus_offs, "bus-off"),
+        (lost, "frames lost"),
+        (health.error_frames, "error frames"),
+        (health.malformed, "frames malformed"),
+        (health.other_masters, "commands of another master"),
+        (health.other_syncs, "SYNCs of another producer"),
+    ):
+        if count:
+            words.append(f"{count} {text}")
+    level: Level = "bad" if words else "good"
+    if health.foreign:
+        shown = ", ".join(f"0x{cob_id:03X}" for cob_id in health.foreign_ids[:3])
+        words.append(
+            f"{health.foreign} foreign frames ({shown}{' …' if len(health.foreign_ids) > 3 else ''})"
+        )
+        level = "note" if level == "good" else level
+    frames = stats.received + stats.sent - before.received - before.sent
+    return BusView(
+        name=health.bus,
+        where=f"{bus.interface} {bus.channel}",
+        role=bus.role,
+        level=level,
+        words=tuple(words),
+        load=health.load,
+        frames_hz=max(0, frames) / elapsed_s,
+        lost=lost,
+    )
+
+
+def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
+    """An event as a line of the log."""
+    level: Level = "bad"
+    if event.what in ("operational", "well", "back", "rejoins", "baselines"):
+        level = "good"
+    elif event.what in ("booting", "boot_ups", "foreign", "noisy", "drifting"):
+        level = "note"
+    return LogLine(time_of_day(event.t_ns + wall_minus_mono_ns), event.subject, event.text, level)
+
+
+def time_of_day(t_ns: int) -> str:
+    """Local time of the day, to the second."""
+    import datetime
+
+    return datetime.datetime.fromtimestamp(t_ns * 1e-9).strftime("%H:%M:%S")

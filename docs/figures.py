@@ -57,14 +57,14 @@ def solve(figures: dict[str, Any]) -> str:
         ]
         for row in figures["rows"]
     ]
-    return f"{machine(figures)}\n\n" + table(["who", "µs a wire", "ratio", "error", "tolerance"], rows)
+    return f"{machine(figures)}\n\n" + table(["who", "µs per wire", "ratio", "error", "tolerance"], rows)
 
 
 def path(figures: dict[str, Any]) -> str:
     paper = figures["paper"]
     calls, errors = paper["table2_function_calls_per_step"], paper["table3_accuracy_percent"]
     parts = [
-        f"{machine(figures)} {figures['experiments']} random presses a setting, one wire, 30 unknowns. "
+        f"{machine(figures)} {figures['experiments']} random presses per setting, one wire, 30 unknowns. "
         "*Plain*: as in the paper, `Uniform(plain=True)`; *ours*: `Uniform()`. A call evaluates F with J; "
         "calls are per step, and the paper counts 31 for each, by finite differences. *Lost*: wires not "
         "CONVERGED; the error is the mean of the others."
@@ -100,7 +100,7 @@ def path(figures: dict[str, Any]) -> str:
 
 
 def step_control(figures: dict[str, Any]) -> str:
-    """The whole path by dogleg with each schedule, means a wire; the first and the last setting."""
+    """The whole path by dogleg with each schedule, means per wire; the first and the last setting."""
     rows = []
     for setting in (figures["settings"][0], figures["settings"][-1]):
         plain, own, adaptive = setting["dogleg"], setting["ours"], setting["adaptive"]
@@ -154,7 +154,7 @@ def front(figures: dict[str, Any]) -> str:
             rows.append(
                 [f"`{panel['scene']}`" if i == 0 else "", name, row["how"], f"{row['us']:.0f}", error]
             )
-    found = table(["scene", "who", "how", "µs a wire", "error"], rows)
+    found = table(["scene", "who", "how", "µs per wire", "error"], rows)
     return f"{machine(figures)} **Bold**: on the Pareto front of all rows.\n\n{found}"
 
 
@@ -254,7 +254,7 @@ def _pair(row: dict[str, Any]) -> str:
 
 def stability(figures: dict[str, Any]) -> str:
     parts = [
-        f"{machine(figures)} {figures['seeds']} seeds a row, {len(figures['rows'])} rows, "
+        f"{machine(figures)} {figures['seeds']} seeds per row, {len(figures['rows'])} rows, "
         f"**{figures['wrong']} wires CONVERGED and wrong**. Wrong is an error above 5 deviations and beyond "
         "chance, with exact data above 1e-6. Below: the rows with noise, by `auto` (by the method it chose); "
         "errors and standard deviations in the deepest frame, median over the seeds."
@@ -293,8 +293,8 @@ def exact_data(figures: dict[str, Any]) -> str:
         for name, some in totals.items()
     ]
     summary = (
-        f"{figures['seeds']} seeds a row, {len(figures['rows'])} rows: **{figures['wrong']} wires CONVERGED "
-        "and wrong**. With exact data, all hard cases together:"
+        f"{figures['seeds']} seeds per row, {len(figures['rows'])} rows: **{figures['wrong']} wires "
+        "CONVERGED and wrong**. With exact data, all hard cases together:"
     )
     return f"{summary}\n\n" + table(["method", "wires", "accurate", "flagged", "wrong"], rows)
 

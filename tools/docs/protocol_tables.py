@@ -40,20 +40,20 @@ _FEW: Final = 3
 def cob_ids() -> str:
     """List the identifiers of a patch, lowest first: the order in which they win the bus."""
     rows = (
-        ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "master → node", 2),
-        ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "master → node", "1 (counter)"),
+        ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "NMT master → node", 2),
+        ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "producer → node", "1 (counter)"),
         ("EMCY", od.emcy_cob_id(0), od.emcy_cob_id(NODE_ID), "node →", 8),
         ("TIME", od.TIME_COB_ID, od.TIME_COB_ID, "producer → node", 6),
         ("TPDO1, chunk", od.chunk_cob_id(0), od.chunk_cob_id(NODE_ID), "node →", "8; CAN FD up to 64"),
         ("RPDO1, command", od.command_cob_id(0), od.command_cob_id(NODE_ID), "→ node", 6),
         ("TPDO2, summary", od.summary_cob_id(0), od.summary_cob_id(NODE_ID), "node →", 8),
-        ("SDO answer", od.sdo_response_cob_id(0), od.sdo_response_cob_id(NODE_ID), "node →", 8),
+        ("SDO response", od.sdo_response_cob_id(0), od.sdo_response_cob_id(NODE_ID), "node →", 8),
         ("SDO request", od.sdo_request_cob_id(0), od.sdo_request_cob_id(NODE_ID), "→ node", 8),
         ("heartbeat, boot-up", od.heartbeat_cob_id(0), od.heartbeat_cob_id(NODE_ID), "node →", 1),
-        ("LSS answer", od.LSS_RESPONSE_COB_ID, od.LSS_RESPONSE_COB_ID, "node →", 8),
+        ("LSS response", od.LSS_RESPONSE_COB_ID, od.LSS_RESPONSE_COB_ID, "node →", 8),
         ("LSS request", od.LSS_REQUEST_COB_ID, od.LSS_REQUEST_COB_ID, "→ node", 8),
     )
-    head = ("frame", "COB-ID", f"of node {NODE_ID}", "direction", "bytes")
+    head = ("frame", "COB-ID", f"node {NODE_ID}", "direction", "bytes")
     return md.table(
         head,
         (
@@ -92,9 +92,9 @@ def formats() -> str:
         )
     head = (
         "data sheet",
-        "codes a chunk",
-        "frames a scan",
-        "ms a scan, at worst",
+        "codes per chunk",
+        "frames per scan",
+        "ms per scan, at worst",
         "scans/s, bus full",
         "step",
     )

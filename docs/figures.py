@@ -92,7 +92,7 @@ def path(figures: dict[str, Any]) -> str:
     worst = max(row["error"] for row in figures["ten_steps"])
     parts.append(
         f"Ten-step path of one wire at the first setting, to {percent(worst)}: {ten}. "
-        "The paper prints 2.03 s."
+        "The paper reports 2.03 s."
     )
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _all_rows(setting))
     parts.append(f"Converged and wrong, all settings and schedules: {wrong}.")

@@ -12,7 +12,7 @@ import re
 import time
 from pathlib import Path
 
-from skinnode.cli.demo import demo_hand
+from skinnode.demo.hand import demo_hand
 from skinnode.host import Host
 from skinnode.monitor.app import MonitorApp
 from skinnode.monitor.source import HostSource

@@ -1,12 +1,12 @@
 """Entry point of ``vcan-sim``. The command is in :mod:`vcan_sim.command`, exit statuses in
-:mod:`skinnode.cli._ending`."""
+:mod:`skinnode.cli._exit_status`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from skinnode.cli._ending import main_of
+from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._usage import Seconds
+from skinnode.cli._errors import Seconds
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
     from skinnode.node import NmtState
     from vcan_sim.fleet import Fleet, NodeReport
 
-_TOLD_AGAIN_S = 10.0
+_WARN_AGAIN_S = 10.0
 """Time after which the warning about a busy machine is repeated."""
 
 app = typer.Typer(
@@ -48,7 +48,7 @@ def simulate(
     Bring them up with `skinnode host` and the same file in another terminal.
     """
     from skinnode.config import load_hand
-    from skinnode.process.garbage_collection import short_pauses
+    from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
     from vcan_sim.faults import faults_of
     from vcan_sim.fleet import Fleet
@@ -57,10 +57,10 @@ def simulate(
     simulated = Fleet(plan)
     for patch, faults in faults_of(fault or [], [each.name for each in plan.patches]).items():
         simulated.inject(faults, patch)
-    with stop_on_signal() as ended, simulated as fleet, short_pauses():
+    with stop_on_signal() as stop, simulated as fleet, without_long_collections():
         where = ", ".join(f"{bus.name} ({bus.interface} {bus.channel})" for bus in plan.buses)
         _say(f"{counted(len(plan.patches), 'patch', 'patches')} of {plan.name!r} on {where}; Ctrl-C ends")
-        _watch(fleet, ended.wait, seconds)
+        _watch(fleet, stop.wait, seconds)
         injected = _injected(fleet) if fault else []
     reports = fleet.report()
     _say(_summary(reports))
@@ -74,16 +74,16 @@ def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -
     """Print a line a second until ``wait`` returns True, time is up, or a node thread has failed."""
     start = time.monotonic()
     before = fleet.report()
-    told_until = 0.0
+    silent_until_s = 0.0
     for second in range(1, sys.maxsize):
         due = float(second) if seconds is None else min(second, seconds)
         if wait(max(0.0, start + due - time.monotonic())) or fleet.failed:
             return
         now = fleet.report()
         _say(_progress(due, before, now))
-        if due >= told_until and (slow := _too_slow(before, now)):
+        if due >= silent_until_s and (slow := _too_slow(before, now)):
             print(slow, file=sys.stderr, flush=True)
-            told_until = due + _TOLD_AGAIN_S
+            silent_until_s = due + _WARN_AGAIN_S
         before = now
         if seconds is not None and due >= seconds:
             return
@@ -126,8 +126,8 @@ def _injected(fleet: Fleet) -> list[str]:
     lines = []
     for patch in fleet.patches:
         counts = dataclasses.asdict(fleet.injected(patch))
-        told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        lines.append(f"{patch}: {told or 'nothing injected'}")
+        shown = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        lines.append(f"{patch}: {shown or 'nothing injected'}")
     return lines
 
 

@@ -36,12 +36,12 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
         "parts": parts,
         "time": times.run(rounds),
     }
-    figures["must"] = musts(figures)
+    figures["must"] = requirements(figures)
     found: dict[str, Any] = plain(figures)
     return found
 
 
-def musts(figures: dict[str, Any]) -> list[dict[str, Any]]:
+def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Every line that has to be reached: what, the figure, the limit as text, whether it is reached, and
     whether it is ``absolute``, a time: that is the machine's as well, and fails nothing."""
     found = []

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinnode.bench import dense as _bench_dense
+from skinnode.bench import dense_kernels
 from skinnode.bench.timing import machine, take_turns
 from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.forward import resistance_ohm
@@ -177,7 +177,7 @@ def run(rounds: int) -> dict[str, Any]:
             rows.append(
                 {"what": what, "who": name, "us": timing.call_us / wires_a_call, "ratio": timing.ratio}
             )
-    return {"benchmark": "kernel", "machine": machine(), "rows": rows + _bench_dense.measure(rounds)}
+    return {"benchmark": "kernel", "machine": machine(), "rows": rows + dense_kernels.measure(rounds)}
 
 
 def potential_of(x: Float, lower: Float) -> Float:

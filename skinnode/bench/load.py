@@ -30,7 +30,7 @@ from skinnode.errors import BusError
 from skinnode.model.forward import resistance_ohm
 from skinnode.node import EXACT, PatchNode
 from skinnode.process.child_processes import starting_children
-from skinnode.process.garbage_collection import short_pauses
+from skinnode.process.garbage_collection import without_long_collections
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport.datagram import LOOPBACK, datagram
 from vcan_sim.scene import Scene
@@ -74,7 +74,7 @@ class Generator:
         theirs.close()
         self._hear()
 
-    def beat(self, buses: Sequence[str]) -> None:
+    def send_heartbeats(self, buses: Sequence[str]) -> None:
         """Send the heartbeats of the patches on ``buses`` from now on, so that a host finds them."""
         self._pipe.send(list(buses))
 
@@ -113,7 +113,7 @@ def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, co
         if core is not None:
             os.sched_setaffinity(0, {core})
         streams = {bus.name: stream_of(hand, bus, seconds, touched=touched) for bus in hand.buses}
-        with short_pauses():
+        with without_long_collections():
             pipe.send(True)
             while True:
                 chosen = [hand.bus(name) for name in pipe.recv()]

@@ -23,7 +23,7 @@ from skinnode.solve.tracker import Tracker
 Method = Callable[[Stream], Solved]
 
 
-def of(case: Case, name: str) -> Method:
+def set_up(case: Case, name: str) -> Method:
     """The method ``name`` set up for ``case``, starting afresh with every stream."""
     if last_only(name):
         return functools.partial(_path, case, name.removeprefix("path "))

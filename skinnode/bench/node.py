@@ -23,7 +23,7 @@ from skinnode.config import BusConfig
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import EXACT, THRIFTY, NodeRunner, Pacing, PatchNode
-from skinnode.process.garbage_collection import short_pauses
+from skinnode.process.garbage_collection import without_long_collections
 from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
@@ -88,7 +88,7 @@ class _Rig:
 def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dict[str, Any]:
     """All rows. ``seconds``: length of each measurement on the bus."""
     config = BusConfig(interface=interface, channel=channel or uuid.uuid4().hex)
-    with short_pauses():
+    with without_long_collections():
         rows = _scans(config, seconds, EXACT, "exact") + _scans(config, seconds, THRIFTY, "thrifty")
         rows.append(_heartbeat(config, seconds, 0))
         rows.append(_heartbeat(config, seconds, FULL_BUS_HZ))

@@ -28,7 +28,7 @@ from skinnode.host import Host, Subscription
 from skinnode.host.accounting import discrepancies
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import ScanStamp
-from skinnode.process.garbage_collection import short_pauses
+from skinnode.process.garbage_collection import without_long_collections
 from skinnode.transport import CanPort
 from skinnode.transport.datagram import DatagramPort, free_channel
 
@@ -84,7 +84,10 @@ def run(
             plain = touched and not (fd or short or stagger_ms)
             fewer = [buses for buses in (1, 2) if buses < fullest and plain]
             core = cores[-1] if apart else None
-            with closing(Generator(hand, seconds, touched=touched, core=core)) as generator, short_pauses():
+            with (
+                closing(Generator(hand, seconds, touched=touched, core=core)) as generator,
+                without_long_collections(),
+            ):
                 for buses in (*fewer, fullest):
                     rows.append(_measure(_part(hand, buses), generator) | {"touched": touched})
                     report(rows[-1])
@@ -148,7 +151,7 @@ def _part(hand: HandConfig, buses: int) -> HandConfig:
 def _measure(hand: HandConfig, generator: Generator) -> Row:
     names = [bus.name for bus in hand.buses]
     open_port = CanPort if hand.buses[0].interface == "socketcan" else DatagramPort
-    generator.beat(names)
+    generator.send_heartbeats(names)
     with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
         begin_ns = generator.begin()
         time.sleep(LEAD_S / 2)  # the last of the heartbeats before it have come
@@ -204,7 +207,7 @@ def lost(row: Row) -> int:
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
 
-def name_of(row: Row) -> str:
+def hand_name(row: Row) -> str:
     """What the hand of a row is, in a few words."""
     kind = "CAN FD" if row["fd"] else "classic"
     scene = "touched" if row["touched"] else "at rest"
@@ -223,7 +226,7 @@ def _must(rows: list[Row]) -> list[Row]:
             asked.append(("received to assembled, µs a frame", row["receive_us"], RECEIVE_US))
         for what, got, most in asked:
             reached = got is not None and got <= most
-            said = f"{name_of(row)}: {what}"
+            said = f"{hand_name(row)}: {what}"
             must.append({"what": said, "got": got, "asked": most, "reached": reached, "time": what != "lost"})
     return must
 
@@ -309,7 +312,7 @@ def line(row: Row) -> str:
 
     cpu = row["cpu"]
     return (
-        f"{name_of(row):39}{row['frames_hz']:9.0f}{row['bus_load']:6.0%}{row['sent']:9}{row['received']:9}"
+        f"{hand_name(row):39}{row['frames_hz']:9.0f}{row['bus_load']:6.0%}{row['sent']:9}{row['received']:9}"
         f"{lost(row):6}{row['scans_hz']:8.0f}{row['scans_skipped']:8}"
         f"  {ms(row['published_ms'], 'p50', 'p99', 'max')}  {ms(row['read_ms'], 'p50', 'p99')}"
         f"{row['receive_us']:6.1f}{cpu['receive']:9.0%}{cpu['mainline']:9.0%}{cpu['solve']:7.0%}"

@@ -189,7 +189,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     return figures
 
 
-def told(figures: dict[str, Any]) -> list[str]:
+def summary_lines(figures: dict[str, Any]) -> list[str]:
     """Return the figures as readable lines."""
     lines = [
         f"{figures['rounds']} rounds, {figures['starved_rounds']} of them with a starved processor; "
@@ -239,7 +239,7 @@ def _soak(
         if first is None and passed_s > WARM_UP * seconds:
             _all_at_once(host, fleet, names)
             first = _size()
-            say(_told(first))
+            say(_size_text(first))
         hungry = chance.random() < STARVED
         with ExitStack() as round_:
             what = _inject(fleet, chance, names)
@@ -265,7 +265,7 @@ def _soak(
             say(f"round {rounds}, {what}: all patches back after {back_s:.2f} s{late}")
     time.sleep(CALM_S)
     last = _size()
-    say(_told(last))
+    say(_size_text(last))
     first = first or last
     return {
         "seconds": time.monotonic() - begin_s,
@@ -385,7 +385,7 @@ def _size() -> _Size:
     )
 
 
-def _told(size: _Size) -> str:
+def _size_text(size: _Size) -> str:
     return (
         f"{size.blocks} blocks, {size.resident_mb:.1f} MB resident, {size.threads} threads, "
         f"{size.descriptors} file descriptors"

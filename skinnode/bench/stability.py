@@ -82,7 +82,7 @@ def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[
 def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
     """One row a method; all of them get the same streams."""
     chosen = [name for name in case.methods if only is None or name in only]
-    solvers = {name: methods.of(case, name) for name in chosen}
+    solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
     name_code = zlib.crc32(case.name.encode())  # a case added or moved leaves the streams of the others

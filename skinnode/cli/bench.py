@@ -233,7 +233,7 @@ def soak(
         _prepare(json)
         raise typer.Exit(_soak_on_damaged_cache(json, minutes, seed))
     figures = bench.run(minutes, seed, typer.echo)
-    for line in bench.told(figures):
+    for line in bench.summary_lines(figures):
         typer.echo(line)
     _print_must(figures["must"])
     _write(json, figures)

@@ -1,23 +1,17 @@
-"""``skinnode demo``: simulated patches pressed, gathered over a virtual CAN bus, decoded and scored.
-
-This is the one place of the package that knows the simulator as well as the host. Both talk only through
-the bus; the truth that the simulator keeps is used for the score alone.
-"""
+"""``skinnode demo``: simulated patches pressed, read over a virtual CAN bus, decoded and scored."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from skinnode.config import HandConfig
+from skinnode.moved import moved
 
 MAX_PATCHES = 16
-_NAMES = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
-_SYNC_MS_PER_PATCH = 20
-"""A 10 × 30 patch takes up to 101 × 135 bits a scan: at 20 ms a patch a plan needs 68 % of 1 Mbit/s."""
+
+__getattr__ = moved("skinnode.cli.demo", "skinnode.demo.hand")
 
 
 def demo(
@@ -46,6 +40,7 @@ def demo(
     from skinnode.cli._console import console
     from skinnode.demo import plot as demo_plot
     from skinnode.demo import run as demo_run
+    from skinnode.demo.hand import demo_hand
     from skinnode.files.output_file import require_writable, write_text
     from skinnode.files.plot_file import require_matplotlib
 
@@ -67,24 +62,3 @@ def demo(
         out.print(f"plot written to {plot}")
     if run.report.faults:
         raise typer.Exit(1)
-
-
-def demo_hand(patches: int, seed: int) -> HandConfig:
-    """The hand of the demo: ``patches`` reference patches on one virtual bus of its own."""
-    import uuid
-
-    from skinnode.config import parse_hand
-
-    names = [_NAMES[i] if i < len(_NAMES) else f"patch{i + 1}" for i in range(patches)]
-    return parse_hand(
-        {
-            "name": "demo",
-            "buses": [{"name": "can0", "interface": "virtual", "channel": f"demo-{uuid.uuid4().hex[:8]}"}],
-            "patches": [
-                {"name": name, "node_id": i + 1, "layout": {"preset": "staggered"}}
-                for i, name in enumerate(names)
-            ],
-            "sync": {"period_ms": _SYNC_MS_PER_PATCH * patches},
-            "simulation": {"seed": seed, "depth": 0.3},
-        }
-    )

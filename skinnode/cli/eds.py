@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._layouts import HELP as LAYOUT_HELP
+from skinnode.cli._layout_option import HELP as LAYOUT_HELP
 
 if TYPE_CHECKING:
     from skinnode.protocol.profile import PatchProfile
@@ -85,7 +85,7 @@ def eds(
 
 
 def _profile(sizes: dict[str, int], layout: str | None, code_bits: int, fd: bool) -> PatchProfile:
-    from skinnode.cli._layouts import find_layout, import_from_here
+    from skinnode.cli._layout_option import find_layout, import_from_here
     from skinnode.errors import ConfigError
     from skinnode.protocol.profile import PatchProfile
 

@@ -1,12 +1,15 @@
-"""Entry point of ``skinnode``, kept small so that signal handlers are installed before anything slow is
-imported. The subcommands are in :mod:`skinnode.cli._app`, exit statuses in :mod:`skinnode.cli._ending`."""
+"""Entry point of ``skinnode``.
+
+It imports nothing slow, so that its signal handlers are installed first. The subcommands are in
+:mod:`skinnode.cli._app`, exit statuses in :mod:`skinnode.cli._exit_status`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from skinnode.cli._ending import main_of
+from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:

@@ -76,15 +76,15 @@ def monitor(
     from skinnode.host import BringUpCancelled
     from skinnode.process.signals import stop_on_signal
 
-    with stop_on_signal() as told, ExitStack() as stack:
+    with stop_on_signal() as stop, ExitStack() as stack:
         try:
             if replay is not None:
                 source = _recording(stack, replay, 1.0 if speed is None else speed)
             else:
-                source = _running(stack, _plan(hand, interface, channel, simulate), told, simulate, as_json)
+                source = _running(stack, _plan(hand, interface, channel, simulate), stop, simulate, as_json)
         except BringUpCancelled:
             return
-        faults = _print(source, told, seconds) if as_json else _show(source, told, seconds, Path(output))
+        faults = _print(source, stop, seconds) if as_json else _show(source, stop, seconds, Path(output))
         faults = [*faults, *source.flaws]
     for fault in faults:
         print(f"fault: {fault}", file=sys.stderr if as_json else sys.stdout)
@@ -121,8 +121,8 @@ def _require_screen() -> None:
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
     """The hand to run, missing patches waited for."""
-    from skinnode.cli.demo import demo_hand
     from skinnode.config import load_hand
+    from skinnode.demo.hand import demo_hand
 
     if hand is not None:
         plan = load_hand(hand).on(interface, channel)
@@ -140,7 +140,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 
 
 def _running(
-    stack: ExitStack, plan: HandConfig, told: threading.Event, simulate: bool, quiet: bool
+    stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
     """A host of that hand; ``stack`` ends it. Raises as :meth:`Host.from_config`."""
     from skinnode.cli._console import progress
@@ -148,7 +148,7 @@ def _running(
     from skinnode.host import Host
     from skinnode.host.patch_stream import check_solvable
     from skinnode.monitor.source import HostSource
-    from skinnode.process.garbage_collection import responsive_threads, short_pauses
+    from skinnode.process.garbage_collection import responsive_threads, without_long_collections
     from skinnode.text.words import counted
 
     if not quiet:
@@ -164,8 +164,8 @@ def _running(
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
-        stack.enter_context(short_pauses())  # it collects before the first SYNC
-        host = stack.enter_context(Host.from_config(plan, cancelled=told.is_set))
+        stack.enter_context(without_long_collections())  # it collects before the first SYNC
+        host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
 
 
@@ -177,12 +177,12 @@ def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
     return stack.enter_context(ReplaySource(replay(path, speed=speed)))
 
 
-def _show(source: Source, told: threading.Event, seconds: float | None, output: Path) -> list[str]:
+def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:
     """The screen; what was wrong meanwhile. Raises the SkinError that ended the source."""
     from skinnode.monitor.app import MonitorApp, terminal_colours
 
     app = MonitorApp(
-        source, folder=output, colours=terminal_colours(os.environ), over=told.is_set, seconds=seconds
+        source, folder=output, colours=terminal_colours(os.environ), over=stop.is_set, seconds=seconds
     )
     app.run(mouse=False)  # the terminal's own: text can be selected and copied
     if app.failure is not None:
@@ -194,12 +194,12 @@ def _show(source: Source, told: threading.Event, seconds: float | None, output: 
     return app.faults.lines
 
 
-def _print(source: Source, told: threading.Event, seconds: float | None) -> list[str]:
+def _print(source: Source, stop: threading.Event, seconds: float | None) -> list[str]:
     """A line of JSON a second; what was wrong meanwhile. Raises the SkinError that ended the source."""
     from skinnode.monitor.report import FaultBook, watch
     from skinnode.text.json_values import plain
 
     faults = FaultBook()
-    for line in watch(source, told, seconds, faults):
+    for line in watch(source, stop, seconds, faults):
         print(json.dumps(plain(line)), flush=True)
     return faults.lines

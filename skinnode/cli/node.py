@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._layouts import HELP as LAYOUT_HELP
-from skinnode.cli._usage import Seconds
+from skinnode.cli._errors import Seconds
+from skinnode.cli._layout_option import HELP as LAYOUT_HELP
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -65,14 +65,14 @@ def node(
     what --store names was of no use; 2 if it could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
-    from skinnode.cli._layouts import find_layout, import_from_here
+    from skinnode.cli._layout_option import find_layout, import_from_here
     from skinnode.config import BusConfig
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable
     from skinnode.node import NodeRunner, PatchNode
     from skinnode.node.clock import EXACT, THRIFTY
     from skinnode.node.patch.find_source import make_source
-    from skinnode.process.garbage_collection import short_pauses
+    from skinnode.process.garbage_collection import without_long_collections
     from skinnode.process.signals import stop_on_signal
     from skinnode.protocol.profile import PatchProfile
     from skinnode.transport import CanPort
@@ -93,7 +93,7 @@ def node(
         data_bitrate_bps=data_bitrate,
     )
     measuring = make_source(source, patch, "--source")
-    with _memory(store) as memory, stop_on_signal() as told, CanPort(bus) as port:
+    with _memory(store) as memory, stop_on_signal() as stop, CanPort(bus) as port:
         board = PatchNode(
             NOT_CONFIGURED if node_id is None else node_id,
             patch,
@@ -105,12 +105,12 @@ def node(
             pacing=EXACT if strict_timing else THRIFTY,
             set_bit_rate=port.set_bitrate,
         )
-        with short_pauses(), NodeRunner(port, [board]) as runner:
+        with without_long_collections(), NodeRunner(port, [board]) as runner:
             where = f"{interface} {channel}{', CAN FD' if fd else ''}"
             sizes = f"{profile.rows} × {profile.columns} wires, {code_bits}-bit codes"
             who = _who(board.node_id, node_id)
             _note(f"{who} ({sizes}, source {source}) on {where}; Ctrl-C ends", as_json)
-            _watch(runner, port, told, seconds, as_json)
+            _watch(runner, port, stop, seconds, as_json)
         faults = _faults(_progress(runner, port, 0.0))
     for fault in faults:
         _note(f"fault: {fault}", as_json)
@@ -211,13 +211,13 @@ def _faults(end: _Progress) -> list[str]:
 
 
 def _watch(
-    runner: NodeRunner, port: CanPort, told: threading.Event, seconds: float | None, as_json: bool
+    runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """A line a second until told to end, time is up, or the thread of the node has ended."""
+    """A line a second until stopped, time is up, or the thread of the node has ended."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0
-    while not told.wait(max(0.0, min(due_s, end_s) - time.monotonic())) and not runner.failed:
+    while not stop.wait(max(0.0, min(due_s, end_s) - time.monotonic())) and not runner.failed:
         now_s = time.monotonic()
         now = _progress(runner, port, now_s - start_s)
         print(json.dumps(asdict(now)) if as_json else _line(before, now), flush=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._usage import Seconds
+from skinnode.cli._errors import Seconds
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -57,9 +57,9 @@ def record(
     from skinnode.record import Recorder
 
     plan = load_hand(hand).on(interface, channel)
-    with stop_on_signal() as told, Recorder(plan, output, kind) as recorder:
+    with stop_on_signal() as stop, Recorder(plan, output, kind) as recorder:
         _say(as_json, file=str(recorder.path))
-        faults = (_listen if listen else _run)(plan, recorder, told, seconds, as_json)
+        faults = (_listen if listen else _run)(plan, recorder, stop, seconds, as_json)
     stats = recorder.stats()
     _say(as_json, frames=stats.frames, dropped=stats.dropped, failure=stats.failure)
     for fault in faults:
@@ -69,21 +69,21 @@ def record(
 
 
 def _run(
-    plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
+    plan: HandConfig, recorder: Recorder, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
     """What was wrong meanwhile, a line each."""
-    from skinnode.cli.host import verdict
+    from skinnode.cli._host_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.patch_stream import check_solvable
 
     for patch in plan.patches:
         check_solvable(patch, plan.solver)
     try:
-        with Host.from_config(plan, cancelled=told.is_set, tap=recorder) as running:
+        with Host.from_config(plan, cancelled=stop.is_set, tap=recorder) as running:
             _say(as_json, note=f"{counted(len(plan.patches), 'patch', 'patches')} operational; Ctrl-C ends")
             with running.fields(capacity=1) as fields:
-                _follow(recorder, told, seconds, as_json, lambda: fields.get(0.0))
-            faults, notes = verdict(running)
+                _follow(recorder, stop, seconds, as_json, lambda: fields.get(0.0))
+            faults, notes = faults_and_notes(running)
             for note in notes:
                 _say(as_json, note=f"note: {note}")
             return faults
@@ -92,7 +92,7 @@ def _run(
 
 
 def _listen(
-    plan: HandConfig, recorder: Recorder, told: threading.Event, seconds: float | None, as_json: bool
+    plan: HandConfig, recorder: Recorder, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
     from skinnode.errors import SkinError
     from skinnode.host.link import BusLink
@@ -106,7 +106,7 @@ def _listen(
             tap_link(recorder, link)
         stack.enter_context(Mainline(links))
         _say(as_json, note="listening; Ctrl-C ends")
-        _follow(recorder, told, seconds, as_json)
+        _follow(recorder, stop, seconds, as_json)
     if failures:
         raise failures[0]
     return []
@@ -114,16 +114,16 @@ def _listen(
 
 def _follow(
     recorder: Recorder,
-    told: threading.Event,
+    stop: threading.Event,
     seconds: float | None,
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """A line a second until told to end or time is up; ``check`` raises what ends it early."""
+    """A line a second until stopped or time is up; ``check`` raises what ends it early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0
-    while not told.wait(max(0.0, min(due_s, end_s) - time.monotonic())):
+    while not stop.wait(max(0.0, min(due_s, end_s) - time.monotonic())):
         now_s = time.monotonic()
         check()
         stats = recorder.stats()

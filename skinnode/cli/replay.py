@@ -34,8 +34,8 @@ def replay(
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
 
-    with stop_on_signal() as told:
-        run = play(recording, speed=None if fast else speed, cancelled=told.is_set)
+    with stop_on_signal() as stop:
+        run = play(recording, speed=None if fast else speed, cancelled=stop.is_set)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
             assert field.stamp is not None  # the host stamps every field

@@ -25,7 +25,7 @@ from skinnode.host import Host
 from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
-from skinnode.process.garbage_collection import responsive_threads, short_pauses
+from skinnode.process.garbage_collection import responsive_threads, without_long_collections
 from skinnode.protocol.codec import CodeScale
 from skinnode.text.json_values import plain
 from vcan_sim.fleet import Fleet
@@ -202,7 +202,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with responsive_threads(), Fleet(hand) as fleet:
-        with short_pauses(), Host.from_config(hand) as host:  # it collects before the first SYNC
+        with without_long_collections(), Host.from_config(hand) as host:  # it collects before the first SYNC
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
             progress = _Progress(console, hand, list(watches.values()), seconds)

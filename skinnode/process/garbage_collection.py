@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def short_pauses() -> Iterator[None]:
+def without_long_collections() -> Iterator[None]:
     """Within the block, collections do not walk through the objects that exist at its begin.
 
     What numba and canopen load makes a full collection take 30 ms of a small machine, with every thread

@@ -1,4 +1,4 @@
-"""How a program that runs until it is told ends the ordinary way."""
+"""How a program that runs until it is stop ends the ordinary way."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ def stop_on_signal() -> Iterator[threading.Event]:
     """An event that SIGINT (Ctrl-C), SIGTERM and, unless it is ignored as under nohup, SIGHUP (the terminal
     is gone) set. The handlers from before are back at the end of the block. For the main thread; Python
     allows no other to handle signals (ValueError)."""
-    told = threading.Event()
+    stop = threading.Event()
 
-    def tell(_signal: int, _frame: FrameType | None) -> None:
-        told.set()
+    def set_stop(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
 
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
-    kept = {number: signal.signal(number, tell) for number in numbers}
+    kept = {number: signal.signal(number, set_stop) for number in numbers}
     try:
-        yield told
+        yield stop
     finally:
         for number, handler in kept.items():
             signal.signal(number, handler)

@@ -163,9 +163,9 @@ def test_lines_are_judged_by_their_limits() -> None:
         ],
         "time": [{"what": "exact", "us": 501.0, "limit_us": 500.0, "active": 10.0}],
     }
-    musts = bench.musts(figures)
-    assert [row["reached"] for row in musts] == [False, True, True, False, False, False, False]
-    assert [row["absolute"] for row in musts] == 6 * [False] + [True]
+    requirements = bench.requirements(figures)
+    assert [row["reached"] for row in requirements] == [False, True, True, False, False, False, False]
+    assert [row["absolute"] for row in requirements] == 6 * [False] + [True]
 
 
 @pytest.mark.long

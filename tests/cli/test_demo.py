@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from skinnode.cli.demo import demo_hand
 from skinnode.config import HandConfig
 from skinnode.demo import run as _demo
+from skinnode.demo.hand import demo_hand
 from skinnode.demo.view import BusView, PatchView, render
 from skinnode.model.layout import Float
 from skinnode.transport import CanPort

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from skinnode.cli._bus import Place
-from skinnode.cli._usage import run
+from skinnode.cli._errors import run
 from skinnode.cli.main import app
 from skinnode.cli.scan import _faults
 from skinnode.config import load_hand

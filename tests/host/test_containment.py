@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from skinnode.bus_load.timing import BusLoad
-from skinnode.cli.host import faults_of
+from skinnode.cli._host_report import faults_and_notes
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import SkinError
 from skinnode.host import Condition, Host, containment
@@ -176,7 +176,7 @@ def test_a_defect_in_serving_a_patch_costs_that_patch_while_it_lasts(
         assert streams(host, "p0")
         assert eventually(lambda: host.health("p0").condition is Condition.OPERATIONAL)
         assert host.health("p0").defect is None
-        assert any(line.startswith("p0: ") and line.endswith(defect) for line in faults_of(host))
+        assert any(line.startswith("p0: ") and line.endswith(defect) for line in faults_and_notes(host)[0])
         assert undisturbed(host, "p1") == before
         assert (host.stats().defects["p1"].count, host.stats().defects["host"].count) == (0, 0)
         told = [(event.subject, event.what, event.text) for event in iter(lambda: events.get(0.0), None)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import can
 import pytest
 
-from skinnode.cli.host import faults_of
+from skinnode.cli._host_report import faults_and_notes
 from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Host
 from skinnode.host.accounting import discrepancies, losses_of_bus
@@ -42,8 +42,8 @@ def test_states_of_a_controller_as_linux_tells_them(
 def test_an_error_frame_is_a_fault_of_the_bus(hand: HandConfig, fleet: Fleet) -> None:
     bus = hand.buses[0]
     with Host.from_config(hand) as host, can.Bus(interface="virtual", channel=bus.channel) as driver:
-        assert "can0: 1 error frame" not in faults_of(host)
+        assert "can0: 1 error frame" not in faults_and_notes(host)[0]
         driver.send(can.Message(arbitration_id=0x04, data=bytes(8), is_error_frame=True))
         assert eventually(lambda: host.bus_health("can0").error_frames == 1)
-        assert "can0: 1 error frame" in faults_of(host)
+        assert "can0: 1 error frame" in faults_and_notes(host)[0]
     assert discrepancies(host.stats()) == []

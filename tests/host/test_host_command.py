@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from skinnode.cli.host import left, operational, verdict
+from skinnode.cli._host_report import faults_and_notes, final_state_text, operational_text
 from skinnode.cli.main import main
 from skinnode.config import BusConfig, HandConfig, load_hand, parse_hand
 from skinnode.host import Host
@@ -315,7 +315,7 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_what_is_said_of_a_master_that_is_a_guest_too() -> None:
     """Nothing that holds for one of its buses alone."""
-    assert left(parse_hand(TWO_ROLES)) == (
+    assert final_state_text(parse_hand(TWO_ROLES)) == (
         "nodes on can0 are pre-operational; nodes on can1 are left to their master"
     )
 
@@ -323,7 +323,7 @@ def test_what_is_said_of_a_master_that_is_a_guest_too() -> None:
 def test_who_is_awaited_is_not_called_operational(make_hand: Callable[..., HandConfig]) -> None:
     hand = make_hand(bring_up={"missing": "wait"})
     with Fleet(hand.model_copy(update={"patches": hand.patches[:1]})), Host.from_config(hand) as host:
-        assert operational(host) == f"1 of 2 patches of {hand.name!r} operational (p1 never seen)"
+        assert operational_text(host) == f"1 of 2 patches of {hand.name!r} operational (p1 never seen)"
 
 
 class Busy:
@@ -372,15 +372,15 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
             )
 
         def faulty_and_a_note() -> bool:
-            faults, notes = verdict(host)
+            faults, notes = faults_and_notes(host)
             return not faults and any("faulty at the end: EMCY 0x8110" in note for note in notes)
 
         before = fleet.report()
         assert eventually(lambda: host.stats().patches["thumb"].solved > 3)
         assert held_up_until(sources[0], missed)
         assert "the computer that runs the node is too slow" in host.health("thumb").emergency_text
-        assert eventually(lambda: verdict(host)[0] == [])
-        notes = verdict(host)[1]
+        assert eventually(lambda: faults_and_notes(host)[0] == [])
+        notes = faults_and_notes(host)[1]
         assert any("while the computer that runs the node was too slow" in note for note in notes), notes
         monkeypatch.setattr("skinnode.cli.host._OVERRUN_S", 0.0)  # it is not waited for
         monkeypatch.setattr("skinnode.cli.host._OVERRUN_SYNCS", 0)
@@ -393,7 +393,7 @@ def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatc
         fleet.inject(Faults(corrupted=0.5), "thumb")  # nothing that a slow computer would do
         assert eventually(lambda: host.stats().patches["thumb"].assembler.scans_corrupt > 0)
         fleet.inject(NO_FAULTS, "thumb")
-        faults, _ = verdict(host)
+        faults, _ = faults_and_notes(host)
         assert any(fault.startswith("thumb:") and "discarded by" in fault for fault in faults), faults
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.cli.host import faults_of
+from skinnode.cli._host_report import faults_and_notes
 from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError, NodeError
 from skinnode.host import Condition, Host
@@ -138,7 +138,7 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
             with Host.from_config(hand) as host:
                 take(host.fields(timeout_s=10), 8)
                 assert eventually(functools.partial(all_operational, host))
-                assert faults_of(host) == []
+                assert faults_and_notes(host)[0] == []
             assert discrepancies(host.stats()) == []
             joined += sum(stream.assembler.scans_joined for stream in host.stats().patches.values())
     assert joined > 0
@@ -153,12 +153,12 @@ def test_a_guest_that_hears_no_sync_says_so(hand: HandConfig, rack: Rack, listen
     with Host.from_config(hand) as host:
         events = host.events()
         assert eventually(lambda: host.bus_health("can0").no_sync)
-        assert faults_of(host) == ["can0: no SYNC of its master is heard"]
+        assert faults_and_notes(host)[0] == ["can0: no SYNC of its master is heard"]
         assert "no SYNC" in {told.what for told in iter(lambda: events.get(0.5), None)}
         with SyncProducer([(listener.send, Ticks(240))], hand.sync.period_s):
             assert eventually(lambda: not host.bus_health("can0").no_sync)
             take(host.fields(timeout_s=10), 4)
-            assert "can0: no SYNC of its master is heard" not in faults_of(host)
+            assert "can0: no SYNC of its master is heard" not in faults_and_notes(host)[0]
         assert eventually(lambda: host.bus_health("can0").no_sync)  # and again
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinnode.cli._usage import run
+from skinnode.cli._errors import run
 from skinnode.cli.main import app
 from skinnode.host import Host
 from skinnode.record import Recorder, replay

@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 from typing import Any, Final
 
-from skinnode.bench.pipeline import LATENCY_MS, lost, name_of
+from skinnode.bench.pipeline import LATENCY_MS, hand_name, lost
 from skinnode.files.plot_file import save_figure
 
 _GROUPS: Final = {"receive": "tab:blue", "mainline": "tab:orange", "solve": "tab:green", "subscriber": "0.5"}
@@ -21,7 +21,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
     figure = Figure(figsize=(11, 2.2 + 0.55 * len(rows)), layout="constrained")
     FigureCanvasAgg(figure)
     latency, cpu = figure.subplots(1, 2, sharey=True)
-    names = [f"{name_of(row)}\n{row['frames_hz']:.0f} frames/s, {lost(row)} lost" for row in rows]
+    names = [f"{hand_name(row)}\n{row['frames_hz']:.0f} frames/s, {lost(row)} lost" for row in rows]
     heights = range(len(rows))
     for quantile, shade in (("max", "0.85"), ("p99", "0.65"), ("p50", "tab:blue")):
         latency.barh(

@@ -26,7 +26,7 @@ ONE_THREAD: Final = {
 
 def measure(rounds: int) -> list[dict[str, Any]]:
     """Rows of the benchmark, µs a call."""
-    command = [sys.executable, "-m", "skinnode.bench.dense", str(rounds)]
+    command = [sys.executable, "-m", "skinnode.bench.dense_kernels", str(rounds)]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, check=True)
     rows: list[dict[str, Any]] = json.loads(done.stdout)
     return rows

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
-from skinnode.cli._ending import COULD_NOT_RUN, FINE, closed_pipe
+from skinnode.cli._exit_status import COULD_NOT_RUN, FINE, closed_pipe
 from skinnode.errors import ConfigError, SkinError
 from skinnode.text.printable import PrintableStream
 

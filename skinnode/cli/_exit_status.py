@@ -45,7 +45,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     """Run the typer application ``app`` of ``module`` and exit with its status. From here on, signals end it
     as the table says."""
     _handle(_exit_at_once)
-    run: Callable[..., int] = import_module("skinnode.cli._usage").run
+    run: Callable[..., int] = import_module("skinnode.cli._errors").run
     app = import_module(module).app
     _handle(_stop)
     try:

@@ -79,7 +79,7 @@ def folder(tmp_path: Path, multicast_group: str) -> Path:
     ("module", "arguments"),
     [
         ("typer", ["skinnode", "scan"]),
-        ("skinnode.cli._usage", ["skinnode", "--help"]),
+        ("skinnode.cli._errors", ["skinnode", "--help"]),
         ("skinnode.cli.lss", ["skinnode", "--help"]),
         ("pydantic", ["skinnode", "hand", "check", "hand.toml"]),
         ("numpy", ["skinnode", "hand", "check", "hand.toml"]),

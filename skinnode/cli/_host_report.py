@@ -1,0 +1,273 @@
+"""What ``skinnode host`` reports: a line or a JSON object a second, and its faults at the end."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final, Protocol
+
+from skinnode.text.words import counted
+
+if TYPE_CHECKING:
+    from skinnode.config import HandConfig
+    from skinnode.host import Host, HostStats
+    from skinnode.host.health import PatchHealth
+    from skinnode.host.patch_stream import StreamStats
+    from skinnode.model.frames import FieldFrame
+
+_OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
+"""Maximum wait at the end for an overrun to clear: seconds, or SYNC periods if that is longer."""
+
+_POLL_S = 0.01
+
+_FIRST_SCANS = 3
+"""SYNCs after which a patch must have sent a scan."""
+
+_EXPLAINED_BY_SLOWNESS: Final = (
+    "scans_torn",
+    "scans_missed",
+    "scans_mixed",
+    "chunks_lost",
+    "summaries_lost",
+)
+"""Counters that a node on a slow computer explains: missing and late frames. Wrong frames remain a fault."""
+
+
+def operational_text(running: Host) -> str:
+    """Return how many patches are operational by their heartbeat, and the condition of each other patch."""
+    from skinnode.canopen.nmt import NmtState
+
+    patches, name = running.hand.patches, running.hand.name
+    healths = [running.health(patch.name) for patch in patches]
+    others = [f"{h.patch} {h.condition}" for h in healths if h.nmt_state != NmtState.OPERATIONAL]
+    if not others:
+        return f"{counted(len(patches), 'patch', 'patches')} of {name!r} operational"
+    up = len(patches) - len(others)
+    return (
+        f"{up} of {counted(len(patches), 'patch', 'patches')} of {name!r} operational ({', '.join(others)})"
+    )
+
+
+def final_state_text(plan: HandConfig) -> str:
+    """Return the NMT state in which the host leaves the nodes of each bus."""
+    ends = {"master": "pre-operational", "guest": "left to their master"}
+    used = [bus for bus in plan.buses if plan.patches_on(bus.name)]
+    if len({bus.role for bus in used}) == 1:
+        return f"nodes are {ends[used[0].role]}"
+    return "; ".join(f"nodes on {bus.name} are {ends[bus.role]}" for bus in used)
+
+
+def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
+    """Return the faults of the run, and notes that are not faults, one line each.
+
+    A node that skips scans because its own computer is too slow sends EMCY 0x8110. Its missing and late
+    frames are then a note, and so is that emergency at the end. Wrong frames remain a fault.
+    """
+    _let_overruns_end(running)
+    stats = running.stats()
+    faults, notes = _bus_faults(running, stats), list[str]()
+    first_scans_due = stats.sync.sent + stats.sync.received > _FIRST_SCANS
+    for name, stream in stats.patches.items():
+        patch_faults, patch_notes = _patch_faults_and_notes(running.health(name), stream, first_scans_due)
+        faults += [f"{name}: {text}" for text in patch_faults]
+        notes += [f"{name}: {text}" for text in patch_notes]
+    for name, defects in stats.defects.items():
+        if defects.count:
+            faults.append(f"{name}: {counted(defects.count, 'defect')} of the host, last {defects.newest}")
+    return faults, notes
+
+
+def _bus_faults(running: Host, stats: HostStats) -> list[str]:
+    from skinnode.host.accounting import losses_of_bus
+
+    faults = [
+        f"{name}: {text}" for name, counts in stats.buses.items() for text in losses_of_bus(counts).values()
+    ]
+    for name in stats.buses:
+        bus = running.bus_health(name)
+        if bus.no_sync:
+            faults.append(f"{name}: no SYNC of its master is heard")
+        if bus.controller in ("error warning", "error passive", "bus-off"):
+            faults.append(f"{name}: its controller is {bus.controller} at the end")
+    return faults
+
+
+def _patch_faults_and_notes(
+    health: PatchHealth, stream: StreamStats, first_scans_due: bool
+) -> tuple[list[str], list[str]]:
+    from skinnode.canopen.emergency import EmcyCode
+    from skinnode.host.accounting import losses_of_stream
+
+    faults, notes = list[str](), list[str]()
+    condition = health.condition
+    overrun = health.last_emergency == EmcyCode.CAN_OVERRUN and health.defect is None
+    slow_still = condition == "faulty" and overrun and health.slow_overruns > 0
+    if slow_still:
+        notes.append(f"{condition} at the end{reason(health, ': ')}")
+    elif condition != "operational" and (first_scans_due or stream.offered > 0):
+        faults.append(f"{condition} at the end{reason(health, ': ')}")
+    elif first_scans_due and not stream.solved:
+        faults.append("no scan was solved")
+    losses = losses_of_stream(stream)
+    slow = slow_still or (condition == "operational" and health.slow_overruns > 0)
+    explained = [losses.pop(counter) for counter in _EXPLAINED_BY_SLOWNESS if slow and counter in losses]
+    if explained:
+        notes.append(
+            f"{', '.join(explained)}, while the computer that runs the node was too slow "
+            f"(EMCY 0x8110{'' if slow_still else ', since cleared'})"
+        )
+    return [*faults, *losses.values()], notes
+
+
+def reason(health: PatchHealth, before: str = "") -> str:
+    """Return why a patch is faulty or refused, prefixed with ``before``; empty for other conditions."""
+    if health.condition == "refused" and health.refusal:
+        return f"{before}{health.refusal}"
+    if health.condition == "faulty" and health.defect is not None:
+        return f"{before}{health.defect}"
+    if health.condition == "faulty":
+        from skinnode.canopen.emergency import register_text
+
+        if health.last_emergency is None:  # the fault is older than the host
+            text = register_text(health.error_register)
+            return f"{before}error register 0x{health.error_register:02X} ({text})"
+        return f"{before}EMCY 0x{health.last_emergency:04X} {health.emergency_text}"
+    return ""
+
+
+def _let_overruns_end(running: Host) -> None:
+    """Wait briefly for nodes on slow computers to clear the emergency, which lasts one scan."""
+    end_s = time.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
+    while time.monotonic() < end_s:
+        healths = [running.health(patch.name) for patch in running.hand.patches]
+        if not any(h.condition in ("faulty", "stale") and h.slow_overruns for h in healths):
+            return
+        time.sleep(_POLL_S)
+
+
+class Second:
+    """Figures of one second; its attributes are the keys of the JSON object."""
+
+    def __init__(
+        self,
+        running: Host,
+        elapsed_s: float,
+        before: HostStats,
+        now: HostStats,
+        latencies_s: Sequence[float],
+        dropped: int,
+    ) -> None:
+        ordered = sorted(latencies_s)
+        self.elapsed_s = elapsed_s
+        self.latency_p50_ms = _percentile(ordered, 0.50)
+        self.latency_p99_ms = _percentile(ordered, 0.99)
+        self.fields_dropped = dropped
+        self.patches = {
+            name: _patch(running, name, before, now)
+            for name in (patch.name for patch in running.hand.patches)
+        }
+        self.buses = {
+            name: {
+                "frames": new.received - before.buses[name].received,
+                "dropped": new.dropped,
+                "malformed": new.malformed,
+                "foreign": new.foreign,
+                "load": new.load,
+            }
+            for name, new in now.buses.items()
+        }
+
+
+def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[str, object]:
+    from skinnode.cli._contacts import contact_tables
+
+    new, old, field = now.patches[name], before.patches[name], running.latest(name)
+    health = running.health(name)
+    return {
+        "condition": str(health.condition),
+        "reason": reason(health) or health.reason or None,
+        "solved": new.solved - old.solved,
+        "skipped": new.skipped,
+        "torn": new.assembler.scans_torn,
+        "corrupt": new.assembler.scans_corrupt,
+        "missed": new.assembler.scans_missed,
+        "chunks_lost": new.assembler.chunks_lost,
+        "trusted": field.trusted if field is not None else None,
+        "scan": field.stamp.scan if field is not None and field.stamp is not None else None,
+        **_deepest(field),
+        "contacts": contact_tables(field),
+    }
+
+
+def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
+    """Return the depth of the deepest electrode and its standard deviation; a press moves to −z."""
+    if field is None:
+        return {"deepest_m": None, "deepest_std_m": None}
+    z = field.displacement_m[..., 2]
+    figures = {"deepest_m": -z.min(), "deepest_std_m": field.displacement_std_m[..., 2].flat[z.argmin()]}
+    return {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def _percentile(ordered: Sequence[float], share: float) -> float | None:
+    """Return the percentile in milliseconds, or None without values."""
+    return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
+
+
+class Report(Protocol):
+    """Where the host reports to: a person or a program."""
+
+    def note(self, text: str) -> None:
+        """Report an event or a fault."""
+
+    def second(self, second: Second) -> None:
+        """Report the figures of a second."""
+
+
+class TextReport:
+    """A line for the buses and a line for each patch, every second."""
+
+    def note(self, text: str) -> None:
+        """Print ``text``."""
+        print(text, flush=True)
+
+    def second(self, second: Second) -> None:
+        """Print the figures of a second."""
+        buses = "  ".join(
+            f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
+            for name, facts in second.buses.items()
+        )
+        latency = ""
+        if second.latency_p50_ms is not None:
+            latency = f"  latency {second.latency_p50_ms:.1f}, p99 {second.latency_p99_ms:.1f} ms"
+        lines = [f"{second.elapsed_s:6.1f} s  {buses}{latency}"]
+        lines += [f"          {_patch_text(name, facts)}" for name, facts in second.patches.items()]
+        print("\n".join(lines), flush=True)
+
+
+def _patch_text(name: str, facts: Mapping[str, object]) -> str:
+    deepest_m, std_m = facts["deepest_m"], facts["deepest_std_m"]
+    deepest = ""
+    if facts["solved"] and isinstance(deepest_m, float):
+        std = f" ± {std_m * 1e6:.1f}" if isinstance(std_m, float) else ""
+        deepest = f"  deepest {deepest_m * 1e6:.1f}{std} µm"
+    worst = "".join(f"  {facts[key]} {key}" for key in ("torn", "corrupt", "missed", "skipped") if facts[key])
+    trust = "  untrusted" if facts["trusted"] is False else ""
+    why = f" ({facts['reason']})" if facts["reason"] else ""
+    return (
+        f"{name} {facts['condition']}{why}  {facts['solved']} fields{deepest}{trust}"
+        f"{worst and '  in all' + worst}"
+    )
+
+
+class JsonReport:
+    """A JSON object a line: {"note": …} or the figures of a second."""
+
+    def note(self, text: str) -> None:
+        """Print ``text`` as a note."""
+        print(json.dumps({"note": text}), flush=True)
+
+    def second(self, second: Second) -> None:
+        """Print the figures of a second."""
+        print(json.dumps(vars(second)), flush=True)

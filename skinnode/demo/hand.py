@@ -1,0 +1,34 @@
+"""The simulated hand of ``skinnode demo`` and of ``skinnode monitor --simulate``."""
+
+from __future__ import annotations
+
+import uuid
+from typing import Final
+
+from skinnode.config import HandConfig, parse_hand
+
+_NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
+_SYNC_MS_PER_PATCH: Final = 20
+"""A 10 × 30 patch takes up to 101 × 135 bits a scan: at 20 ms a patch a plan needs 68 % of 1 Mbit/s."""
+
+
+def demo_hand(patches: int, seed: int) -> HandConfig:
+    """Return a hand of reference patches on one virtual bus that no other program uses.
+
+    Args:
+        patches: Number of patches, 1 to 127.
+        seed: Seed of the scene and of the converter noise.
+    """
+    names = [_NAMES[i] if i < len(_NAMES) else f"patch{i + 1}" for i in range(patches)]
+    return parse_hand(
+        {
+            "name": "demo",
+            "buses": [{"name": "can0", "interface": "virtual", "channel": f"demo-{uuid.uuid4().hex[:8]}"}],
+            "patches": [
+                {"name": name, "node_id": i + 1, "layout": {"preset": "staggered"}}
+                for i, name in enumerate(names)
+            ],
+            "sync": {"period_ms": _SYNC_MS_PER_PATCH * patches},
+            "simulation": {"seed": seed, "depth": 0.3},
+        }
+    )

@@ -18,15 +18,9 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState, PatchNode
 from skinnode.node.clock import THRIFTY, Pacing
 from skinnode.node.patch.source import ResistanceSource
-from skinnode.protocol.codec import (
-    SummaryFlag,
-    chunk_indexer,
-    pack_checked_summary,
-    pack_summary,
-    unpack_scan_with_check,
-    unpack_summary,
-)
+from skinnode.protocol.chunk import chunk_indexer, unpack_scan_with_check
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, unpack_summary
 from vcan_sim.faults import LOST_IN, LOST_OUT, NO_FAULTS, OF_CHUNKS, OF_SCANS, OF_WIRES, Faults, Injected
 from vcan_sim.tally import Kind, Tally, kind_of
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.protocol.codec import TIME_STEP_US
+from skinnode.protocol.device_time import TIME_STEP_US
 from vcan_sim.scene import Scene
 
 REMEMBERED_READINGS: Final = 4096

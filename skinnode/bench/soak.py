@@ -36,7 +36,7 @@ from skinnode.host import Condition, Host, HostStats
 from skinnode.host.accounting import discrepancies
 from skinnode.host.patch_stream import check_solvable
 from skinnode.model.frames import FieldFrame
-from skinnode.protocol.codec import TIME_STEP_US
+from skinnode.protocol.device_time import TIME_STEP_US
 from skinnode.text.words import counted
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.protocol.codec import CodeScale, decode, encode
+from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9

@@ -58,7 +58,7 @@ def eds(
     """
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable, write_text
-    from skinnode.protocol.profile import dcf_text, eds_text
+    from skinnode.protocol.eds_files import dcf_text, eds_text
 
     sizes = {
         "--upper-wires": upper_wires,

@@ -15,7 +15,8 @@ from skinnode.conformance.eds_reader import Eds, parse_eds
 from skinnode.conformance.sdo import SdoClient
 from skinnode.conformance.tester import Failed, Tester
 from skinnode.errors import BusError, ConfigError, NodeTimeout
-from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
+from skinnode.protocol.eds_files import eds_name, eds_text
+from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3

@@ -26,7 +26,7 @@ from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 from skinnode.process.garbage_collection import responsive_threads, without_long_collections
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.codes import CodeScale
 from skinnode.text.json_values import plain
 from vcan_sim.fleet import Fleet
 

@@ -26,7 +26,7 @@ from skinnode.diagnose.node_info import read_info
 from skinnode.diagnose.scan_capture import ScanCapture
 from skinnode.errors import BusError, NodeError, ProfileError
 from skinnode.host.hand_files import check_eds
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50

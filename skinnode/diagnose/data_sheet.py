@@ -9,7 +9,8 @@ from skinnode.canopen import indices as od
 from skinnode.conformance.eds_reader import Eds, parse_eds, parse_eds_file
 from skinnode.errors import ConfigError, NodeError, ProfileError, Shown
 from skinnode.host.sdo_client import RemoteOd
-from skinnode.protocol.profile import BusType, PatchProfile, eds_name, eds_text
+from skinnode.protocol.eds_files import eds_name, eds_text
+from skinnode.protocol.profile import BusType, PatchProfile
 
 
 class DataSheet(NamedTuple):

@@ -15,7 +15,7 @@ from skinnode.diagnose.bus_listener import Emergency
 from skinnode.diagnose.discovery import FoundNode
 from skinnode.diagnose.node_info import NodeInfo
 from skinnode.model.layout import Float
-from skinnode.protocol.assembler import AssemblerStats
+from skinnode.protocol.scan import AssemblerStats
 
 Counts = NDArray[np.int64]
 

@@ -17,8 +17,9 @@ from skinnode.diagnose.pdo_parameters import Pdo, pdo_text, read_pdos
 from skinnode.errors import NodeError, SdoAbort
 from skinnode.host.sdo_client import RemoteOd
 from skinnode.model.layout import PRESET_IDS, Float
-from skinnode.protocol.codec import SelfTestFault, SelfTestStatus
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.self_test import SelfTestFault, SelfTestStatus
 from skinnode.text.printable import printable
 from skinnode.text.words import counted
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from skinnode.canopen import indices as od
 from skinnode.diagnose.facts import ScanFacts
-from skinnode.protocol.assembler import Scan, ScanAssembler
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.assembler import ScanAssembler
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan import Scan
 from skinnode.transport import Frame
 
 _MOST_SCANS: Final = 1000

@@ -6,7 +6,7 @@ from __future__ import annotations
 from skinnode.host.dispatcher import BusStats
 from skinnode.host.host import HostStats
 from skinnode.host.patch_stream import StreamStats
-from skinnode.protocol.assembler import AssemblerStats
+from skinnode.protocol.scan import AssemblerStats
 from skinnode.text.words import counted
 
 

@@ -30,8 +30,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinnode.protocol.assembler import Scan
-from skinnode.protocol.codec import Codes, CodeScale, SummaryFlag
+from skinnode.protocol.codes import Codes, CodeScale
+from skinnode.protocol.scan import Scan
+from skinnode.protocol.summary import SummaryFlag
 
 _CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 

@@ -23,7 +23,7 @@ from skinnode.host import nmt_master
 from skinnode.host.hand_files import load_baseline
 from skinnode.host.sdo_client import Abandoned, RemoteOd
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.coordinates import unpack_coordinates
 from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted

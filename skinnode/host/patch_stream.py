@@ -27,8 +27,10 @@ from skinnode.host.sync import Tick
 from skinnode.host.workers import Inline, Workers
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
-from skinnode.protocol.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.protocol.codec import Decoder, SummaryFlag, as_baseline
+from skinnode.protocol.assembler import ScanAssembler
+from skinnode.protocol.codes import Decoder, as_baseline
+from skinnode.protocol.scan import AssemblerStats, Scan
+from skinnode.protocol.summary import SummaryFlag
 from skinnode.solve.inputs import CodeMap
 from skinnode.solve.tracker import Tracker
 
@@ -175,7 +177,7 @@ class PatchStream:
         self._patch, self._passes_partial = patch, partial == "pass"
         self._solver: Solver | None = None  # None: withhold
         self._assembler, self._workers, self._publisher = assembler, workers, publisher
-        assembler.on_thrown = self._doubt
+        assembler.on_discarded = self._doubt
         self._tick, self._on_scan = tick, on_scan
         self._watch, self._under_way, self._defects = watch, under_way, defects
         self._unwatched: deque[tuple[int, Scan]] = deque()

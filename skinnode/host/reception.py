@@ -19,9 +19,10 @@ from skinnode.host.patch_stream import PatchStream
 from skinnode.host.publish import Publisher
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline, Workers
-from skinnode.protocol.assembler import Scan, ScanAssembler
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.assembler import ScanAssembler
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
 """How long a summary is waited for at least, when all chunks are there; half a period where that is longer.

@@ -18,7 +18,7 @@ from skinnode.host.link import BusLink
 from skinnode.host.lss_master import LssMaster
 from skinnode.host.patch_stream import Solver
 from skinnode.host.reception import PatchReception
-from skinnode.protocol.codec import pack_command
+from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0

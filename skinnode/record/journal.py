@@ -33,7 +33,7 @@ from skinnode.config import BusConfig, HandConfig, PatchConfig, parse_hand
 from skinnode.errors import ConfigError
 from skinnode.host.configurator import NodeFacts
 from skinnode.model.layout import PatchLayout
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
 
 FORMAT: Final = "skinnode recording 1"

@@ -20,7 +20,8 @@ from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode
-from skinnode.protocol.profile import REFERENCE_PROFILES, PatchProfile, dcf_text, eds_name, eds_text
+from skinnode.protocol.eds_files import REFERENCE_PROFILES, dcf_text, eds_name, eds_text
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 
 NODE_ID = 77

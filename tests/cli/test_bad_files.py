@@ -17,7 +17,8 @@ import pytest
 from skinnode.cli.main import main
 from skinnode.errors import ConfigError
 from skinnode.files.input_file import read_input
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 from skinnode.record.journal import read_journal
 from vcan_sim.cli import main as simulate
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from skinnode.cli.main import main
-from skinnode.protocol.profile import PatchProfile, dcf_text, eds_text
+from skinnode.protocol.eds_files import dcf_text, eds_text
+from skinnode.protocol.profile import PatchProfile
 
 
 def run(*arguments: str) -> int:

@@ -87,7 +87,8 @@ class Place:
         return self.file("broken.toml", f'name = "{_toml(WORSE[:-1])}"\n"{_toml(WORSE[:-1])}" = 1\n')
 
     def eds(self) -> str:
-        from skinnode.protocol.profile import PatchProfile, eds_text
+        from skinnode.protocol.eds_files import eds_text
+        from skinnode.protocol.profile import PatchProfile
 
         text = eds_text(PatchProfile.from_layout(PatchLayout.preset("staggered", **LAYOUT)))
         name = EVIL.replace("\r", " ").replace("\n", " ")

@@ -13,7 +13,8 @@ import pytest
 
 from skinnode.cli.main import main
 from skinnode.conformance import CASES
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 
 from .conftest import NODE_ID, patch_on
 

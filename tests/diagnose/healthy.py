@@ -10,8 +10,9 @@ import numpy as np
 from skinnode.canopen import indices as od
 from skinnode.diagnose.discovery import FoundNode
 from skinnode.diagnose.facts import BusFacts, PatchFacts, ScanFacts
-from skinnode.protocol.assembler import AssemblerStats, ScanAssembler
+from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan import AssemblerStats
 
 NO_LOSS = ScanAssembler(PatchProfile(4, 12, 4, 4)).stats
 STEP = 1.0 / ((1 << 16) - 4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skinnode.diagnose.scan_capture import ScanCapture
-from skinnode.protocol.codec import CodeScale
+from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import Frame
 

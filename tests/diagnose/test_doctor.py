@@ -16,7 +16,8 @@ from skinnode.config import BusConfig, load_hand
 from skinnode.diagnose import collect_facts, discovery
 from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.host import Host
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 from vcan_sim.faults import Faults
 from vcan_sim.fleet import Fleet

@@ -13,7 +13,8 @@ from skinnode.canopen import indices as od
 from skinnode.config import BusConfig
 from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.node import PatchNode
-from skinnode.protocol.profile import PatchProfile, dcf_text, eds_text
+from skinnode.protocol.eds_files import dcf_text, eds_text
+from skinnode.protocol.profile import PatchProfile
 
 from .conftest import LAYOUT, run
 

@@ -14,7 +14,7 @@ import pytest
 
 import skinnode
 from skinnode.config import HandConfig
-from skinnode.protocol.profile import REFERENCE_PROFILES
+from skinnode.protocol.eds_files import REFERENCE_PROFILES
 
 from .blocks import PAGES, REPOSITORY
 

@@ -10,7 +10,7 @@ import pytest
 from skinnode.host.patch_stream import Solver
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
-from skinnode.protocol.assembler import Scan
+from skinnode.protocol.scan import Scan
 from vcan_sim.sensor import SimulatedPatch
 
 STEP = 1.0 / 65532

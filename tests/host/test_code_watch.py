@@ -8,8 +8,9 @@ import pytest
 from skinnode.config import SimulationConfig
 from skinnode.host.code_watch import CodeWatch, WireFault, WireState
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.protocol.assembler import Scan
-from skinnode.protocol.codec import CodeScale, SummaryFlag, encode
+from skinnode.protocol.codes import CodeScale, encode
+from skinnode.protocol.scan import Scan
+from skinnode.protocol.summary import SummaryFlag
 from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 

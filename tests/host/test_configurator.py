@@ -21,7 +21,8 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node.patch.patch_node import PatchNode
 from skinnode.node.runner import NodeRunner
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 from vcan_sim.fleet import Fleet
 

@@ -12,7 +12,7 @@ import pytest
 from skinnode.config import BusConfig, HandConfig
 from skinnode.host import Condition, Host
 from skinnode.host.accounting import discrepancies
-from skinnode.protocol.assembler import AssemblerStats
+from skinnode.protocol.scan import AssemblerStats
 from vcan_sim.faults import NO_FAULTS, Faults, Injected
 from vcan_sim.fleet import Fleet
 

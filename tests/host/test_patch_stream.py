@@ -23,17 +23,13 @@ from skinnode.model.forward import resistance_ohm
 from skinnode.model.frames import FieldFrame, ScanStamp, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
-from skinnode.protocol.assembler import Scan, ScanAssembler
-from skinnode.protocol.codec import (
-    CodeScale,
-    SummaryFlag,
-    check_of_codes,
-    encode,
-    pack_checked_summary,
-    pack_scan,
-    pack_summary,
-)
+from skinnode.protocol.assembler import ScanAssembler
+from skinnode.protocol.chunk import pack_scan
+from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan import Scan
+from skinnode.protocol.scan_check import check_of_codes
+from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary
 from skinnode.solve.tracker import Tracker
 
 from .conftest import SMALL, eventually

@@ -13,7 +13,8 @@ from canopen.objectdictionary import ODVariable, datatypes, eds
 
 from skinnode.model.layout import PatchLayout
 from skinnode.protocol.coordinates import pack_coordinates
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 
 COMPUTED = {0x1010, 0x1011}  # says 0, cannot store, whatever the EDS of the finished device promises
 

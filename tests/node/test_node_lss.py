@@ -20,7 +20,7 @@ from skinnode.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NOT_CONFIGURED, FileMemory, NmtState, NodeRunner, PatchNode, VolatileMemory
 from skinnode.node.memory import Kept
-from skinnode.protocol.profile import eds_text
+from skinnode.protocol.eds_files import eds_text
 from skinnode.transport import CanPort
 
 MS = 1_000_000

@@ -16,7 +16,8 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node import VolatileMemory
 from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import PdoRecords
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 
 REGISTER, COUNTER, TIME, CODE = 0x1001_0008, 0x2011_0108, 0x2011_0420, 0x2100_0110
 MODE, TARE = 0x2020_0108, 0x2021_0420

@@ -11,7 +11,7 @@ import pytest
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import PatchLayout
 from skinnode.node import THRIFTY, Pacing
-from skinnode.protocol.codec import CodeScale, encode
+from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 from ..scan_crc import check_of_scan

@@ -20,7 +20,8 @@ from skinnode.config import BusConfig
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NodeRunner, PatchNode
 from skinnode.protocol.coordinates import pack_coordinates
-from skinnode.protocol.profile import PatchProfile, eds_text
+from skinnode.protocol.eds_files import eds_text
+from skinnode.protocol.profile import PatchProfile
 from skinnode.transport import CanPort
 
 WAIT_S = 5.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skinnode.node import VolatileMemory
-from skinnode.protocol.codec import SummaryFlag
+from skinnode.protocol.summary import SummaryFlag
 
 SYNC, PDO = 0x080, 0x384
 PRODUCE = 0x4000_0080

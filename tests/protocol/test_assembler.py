@@ -20,9 +20,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skinnode.errors import CodecError, ConfigError
-from skinnode.protocol.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.protocol.codec import MISSING, SummaryFlag, pack_chunk, pack_summary
+from skinnode.protocol.assembler import ScanAssembler
+from skinnode.protocol.chunk import pack_chunk
+from skinnode.protocol.codes import MISSING
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan import AssemblerStats, Scan
+from skinnode.protocol.summary import SummaryFlag, pack_summary
 
 from ..scan_crc import check_of_scan
 

@@ -8,7 +8,7 @@ import pytest
 
 from skinnode.errors import CodecError
 from skinnode.protocol.assembler import ScanAssembler
-from skinnode.protocol.codec import SummaryFlag, pack_checked_summary, pack_summary
+from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary
 
 from ..scan_crc import check_of_scan
 from .test_assembler import (
@@ -60,7 +60,7 @@ def test_a_scan_with_a_wrong_code_is_thrown_away_and_nothing_of_it_is_inherited(
 ) -> None:
     """Nobody can tell which chunk is wrong: all is unknown until it is sent again."""
     doubts: list[None] = []
-    assembler.on_thrown = lambda: doubts.append(None)
+    assembler.on_discarded = lambda: doubts.append(None)
     n = node.profile.n_chunks
     receive(assembler, node.scan(7))
     assert receive(assembler, wrong_code(node, node.scan(8))) == []
@@ -181,7 +181,7 @@ def test_a_new_baseline_told_by_a_scan_that_nobody_sees_is_doubted(
     """Of a scan under way when the stream was taken up."""
     assembler = ScanAssembler(node.profile, counter_overflow=240, period_ns=PERIOD, under_way=True)
     doubts: list[None] = []
-    assembler.on_thrown = lambda: doubts.append(None)
+    assembler.on_discarded = lambda: doubts.append(None)
     *chunks, last = node.scan(7)
     if flags is not None:
         summary = node.summary(7, flags, node.profile.n_chunks)

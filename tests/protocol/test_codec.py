@@ -11,25 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinnode.errors import CodecError, ConfigError
-from skinnode.protocol.codec import (
-    MISSING,
-    CodeScale,
-    SendMode,
-    SummaryFlag,
+from skinnode.protocol.chunk import (
     chunk_indexer,
     chunk_of_code,
-    decode,
-    encode,
     pack_chunk,
-    pack_command,
     pack_scan,
-    pack_summary,
     unpack_chunk,
-    unpack_command,
     unpack_scan,
-    unpack_summary,
 )
+from skinnode.protocol.codes import MISSING, CodeScale, decode, encode
+from skinnode.protocol.command import SendMode, pack_command, unpack_command
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.summary import SummaryFlag, pack_summary, unpack_summary
 
 BITS = st.sampled_from([16, 24])
 HALF = 0.5 + 1e-6  # a millionth of a code for double precision

@@ -21,15 +21,11 @@ from skinnode.canopen.dictionary import DataType, Entry, ObjectType
 from skinnode.cli.eds import eds
 from skinnode.errors import ConfigError
 from skinnode.model.layout import PatchLayout
-from skinnode.protocol.codec import pack_checked_summary, pack_command, pack_scan, pack_summary
-from skinnode.protocol.profile import (
-    DEFAULT_PERIOD_MS,
-    REFERENCE_PROFILES,
-    PatchProfile,
-    dcf_text,
-    eds_name,
-    eds_text,
-)
+from skinnode.protocol.chunk import pack_scan
+from skinnode.protocol.command import pack_command
+from skinnode.protocol.eds_files import REFERENCE_PROFILES, dcf_text, eds_name, eds_text
+from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
+from skinnode.protocol.summary import pack_checked_summary, pack_summary
 
 EDS = Path(__file__).parents[2] / "eds"
 NODE_ID = 5

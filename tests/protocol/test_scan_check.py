@@ -9,19 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinnode.protocol.codec import (
+from skinnode.protocol.chunk import pack_scan, unpack_scan_with_check
+from skinnode.protocol.device_time import restore_time_us
+from skinnode.protocol.eds_files import REFERENCE_PROFILES, eds_name
+from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan_check import check_of_codes, scan_check
+from skinnode.protocol.summary import (
     SummaryFlag,
-    check_of_codes,
     pack_checked_summary,
-    pack_scan,
     pack_summary,
     pack_summary_record,
-    restore_time_us,
-    scan_check,
-    unpack_scan_with_check,
     unpack_summary,
 )
-from skinnode.protocol.profile import REFERENCE_PROFILES, PatchProfile, eds_name
 
 from ..scan_crc import check_of_scan, crc16
 

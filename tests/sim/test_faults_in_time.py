@@ -17,9 +17,10 @@ from skinnode.host.accounting import frames_counted
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import Pacing
-from skinnode.protocol.assembler import AssemblerStats, Scan, ScanAssembler
-from skinnode.protocol.codec import Codes
+from skinnode.protocol.assembler import ScanAssembler
+from skinnode.protocol.codes import Codes
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan import AssemblerStats, Scan
 from vcan_sim.faults import NO_FAULTS, Faults
 from vcan_sim.faulty_node import FaultyNode
 

@@ -14,7 +14,10 @@ from skinnode.config import BusConfig, HandConfig, parse_hand
 from skinnode.errors import BusError, ConfigError
 from skinnode.model.forward import resistance_ohm
 from skinnode.node import NmtState
-from skinnode.protocol.codec import CodeScale, encode, restore_time_us, unpack_chunk, unpack_summary
+from skinnode.protocol.chunk import unpack_chunk
+from skinnode.protocol.codes import CodeScale, encode
+from skinnode.protocol.device_time import restore_time_us
+from skinnode.protocol.summary import unpack_summary
 from skinnode.transport import CanPort, Frame
 from vcan_sim.fleet import Fleet
 

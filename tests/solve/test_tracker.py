@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import skinnode as sk
 from skinnode.model.elastic import Rubber
-from skinnode.protocol.codec import MISSING, CodeScale, as_baseline, decode, encode
+from skinnode.protocol.codes import MISSING, CodeScale, as_baseline, decode, encode
 from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
 

@@ -16,16 +16,13 @@ from skinnode.canopen.abort import AbortCode
 from skinnode.canopen.dictionary import Entry, Object, highest
 from skinnode.canopen.emergency import EmcyCode, error_text
 from skinnode.node.rejected import Rejected
-from skinnode.protocol.codec import (
-    CodeScale,
-    SummaryFlag,
-    check_of_codes,
-    encode,
-    pack_checked_summary,
-    pack_command,
-    pack_scan,
-)
-from skinnode.protocol.profile import REFERENCE_PROFILES, PatchProfile, eds_name
+from skinnode.protocol.chunk import pack_scan
+from skinnode.protocol.codes import CodeScale, encode
+from skinnode.protocol.command import pack_command
+from skinnode.protocol.eds_files import REFERENCE_PROFILES, eds_name
+from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan_check import check_of_codes
+from skinnode.protocol.summary import SummaryFlag, pack_checked_summary
 
 PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4

@@ -13,7 +13,7 @@ import numpy as np
 from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, ScanFacts, Sure
 from skinnode.diagnose.noise import LEAST_SCANS, Mask, NoiseAnalysis, analyse_noise
 from skinnode.model.layout import Float
-from skinnode.protocol.codec import TIME_WRAP_US
+from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0

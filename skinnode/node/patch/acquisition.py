@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float, require_array
 from skinnode.node.patch.source import ResistanceSource, read_source
-from skinnode.protocol.codec import Codes, CodeScale, chunk_of_code, encode
+from skinnode.protocol.chunk import chunk_of_code
+from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16

@@ -26,17 +26,14 @@ from skinnode.node.patch.acquisition import Acquisition, Mask, WireFaults
 from skinnode.node.patch.scan_stream import OutgoingScan, ScanStream
 from skinnode.node.patch.self_test import self_test
 from skinnode.node.patch.source import SourceFailed, SourceFault
-from skinnode.protocol.codec import (
-    SELF_TEST_NEVER_RUN,
-    Codes,
-    SendMode,
-    SummaryFlag,
-    check_of_codes,
-    pack_scan,
-    pack_self_test,
-)
+from skinnode.protocol.chunk import pack_scan
+from skinnode.protocol.codes import Codes
+from skinnode.protocol.command import SendMode
 from skinnode.protocol.coordinates import pack_coordinates
 from skinnode.protocol.profile import PatchProfile
+from skinnode.protocol.scan_check import check_of_codes
+from skinnode.protocol.self_test import SELF_TEST_NEVER_RUN, pack_self_test
+from skinnode.protocol.summary import SummaryFlag
 
 
 class PatchApplication:

@@ -13,8 +13,9 @@ from skinnode.node.patch.acquisition import Acquisition
 from skinnode.node.patch.application import PatchApplication
 from skinnode.node.patch.source import ResistanceSource
 from skinnode.node.rejected import Rejected
-from skinnode.protocol.codec import CodeScale
-from skinnode.protocol.profile import PatchProfile, eds_name
+from skinnode.protocol.codes import CodeScale
+from skinnode.protocol.eds_files import eds_name
+from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):

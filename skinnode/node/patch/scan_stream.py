@@ -33,7 +33,7 @@ from skinnode.canopen import indices as od
 from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
-from skinnode.protocol.codec import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
+from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
 """Share of the sending time that may be lost before chunks count as held up; thread jitter stays below it."""

@@ -14,7 +14,8 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.node.patch.acquisition import find_faults
 from skinnode.node.patch.source import SourceFailed
-from skinnode.protocol.codec import CodeScale, SelfTest, SelfTestFault, encode
+from skinnode.protocol.codes import CodeScale, encode
+from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
 """As many as a tare takes. The standard deviation of a crossing is then known to 18 % (1/√30), that of the

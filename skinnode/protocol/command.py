@@ -1,0 +1,61 @@
+"""Commands of the host: RPDO1."""
+
+from __future__ import annotations
+
+import enum
+import struct
+from typing import Final, NamedTuple
+
+from skinnode.canopen import indices as od
+from skinnode.errors import CodecError
+
+_COB_ID: Final = od.command_cob_id(0)
+
+
+class SendMode(enum.IntEnum):
+    """Which chunks of a scan are sent, 0x2020:1."""
+
+    FULL = 0
+    CHANGED = 1
+
+
+class Command(NamedTuple):
+    """A command as it is sent."""
+
+    tare: int
+    """:data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number does nothing."""
+    single_scan: int
+    """1 to take one scan now."""
+    send_mode: int
+    """A number of :class:`SendMode`."""
+
+
+_COMMAND: Final = struct.Struct("<IBB")
+
+
+def pack_command(
+    *, tare: bool = False, single_scan: bool = False, send_mode: SendMode = SendMode.FULL
+) -> bytes:
+    """Pack the payload of RPDO1.
+
+    Args:
+        tare: make the present resistances the baseline.
+        single_scan: take one scan now.
+        send_mode: always carried, and kept by the node until the next command.
+    """
+    return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
+
+
+def unpack_command(data: bytes, *, cob_id: int = _COB_ID) -> Command:
+    """Unpack the payload of RPDO1. Bytes beyond the six that are mapped are ignored (CiA 301).
+
+    Args:
+        data: the payload.
+        cob_id: named in the error.
+
+    Raises:
+        CodecError: if the payload is shorter than six bytes.
+    """
+    if len(data) < _COMMAND.size:
+        raise CodecError(cob_id, data, f"at least {_COMMAND.size} bytes (command)")
+    return Command(*_COMMAND.unpack_from(data))

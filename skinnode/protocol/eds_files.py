@@ -1,0 +1,78 @@
+"""EDS and DCF files (CiA 306) of patches, and the reference files in ``eds/``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from skinnode.canopen import indices as od
+from skinnode.canopen.eds import Commissioning, DeviceInfo, render_eds
+from skinnode.errors import ConfigError
+from skinnode.protocol.profile import PatchProfile
+
+
+def eds_name(profile: PatchProfile) -> str:
+    """Return the file name of the reference EDS of this wire format."""
+    variant = "-fd" if profile.bus == "fd" else ""
+    return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}{variant}.eds"
+
+
+def eds_text(profile: PatchProfile) -> str:
+    """Return the electronic data sheet (CiA 306) of a patch. The same profile gives the same bytes."""
+    return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
+
+
+def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
+    """Return the device configuration file (CiA 306) of a patch. The same arguments give the same bytes.
+
+    Args:
+        profile: sizes of the patch.
+        node_id: 1 to 127.
+        bitrate_bps: bit rate of the bus, bit/s.
+
+    Raises:
+        ConfigError: if the node-ID is not 1 to 127, or a patch does not have the bit rate.
+    """
+    if not 1 <= node_id <= od.MAX_NODE_ID:
+        raise ConfigError("node_id", node_id, "1 to 127")
+    if bitrate_bps not in od.BIT_RATES_BPS:
+        raise ConfigError("bitrate_bps", bitrate_bps, f"one of {', '.join(map(str, od.BIT_RATES_BPS))}")
+    name = eds_name(profile)
+    file_name = f"{name.removesuffix('.eds')}-node{node_id}.dcf"
+    device = Commissioning(node_id, bitrate_bps // 1000, f"patch {node_id}", name)
+    return render_eds(_device_info(profile, file_name), profile.objects(), device)
+
+
+def _device_info(profile: PatchProfile, file_name: str) -> DeviceInfo:
+    variant = ", PDO over CAN FD" if profile.bus == "fd" else ""
+    return DeviceInfo(
+        file_name=file_name,
+        description=f"{profile.rows} x {profile.columns} wires, {profile.code_bits}-bit codes{variant}",
+        vendor_name="skinnode",
+        vendor_number=od.VENDOR_ID,
+        product_name=od.DEVICE_NAME,
+        product_number=od.PRODUCT_CODE,
+        revision_number=profile.revision_number,
+        bit_rates_bps=od.BIT_RATES_BPS,
+        rpdos=profile.rpdos,
+        tpdos=profile.tpdos,
+    )
+
+
+REFERENCE_PROFILES: Final = (
+    PatchProfile(10, 30, 10, 10, 16),
+    PatchProfile(10, 30, 10, 10, 24),
+    PatchProfile(10, 30, 10, 10, 16, bus="fd"),
+    PatchProfile(10, 30, 10, 10, 24, bus="fd"),
+)
+"""One profile for each wire format; their EDS files are kept in ``eds/``."""
+
+
+def write_reference_files(folder: Path) -> None:
+    """Write the EDS file of every reference profile.
+
+    Args:
+        folder: an existing folder.
+    """
+    for profile in REFERENCE_PROFILES:
+        (folder / eds_name(profile)).write_text(eds_text(profile), encoding="ascii", newline="\n")

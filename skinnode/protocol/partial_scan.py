@@ -1,0 +1,64 @@
+"""Scans that carry only some chunks: the codes held for the others, and the decoding of both together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.protocol.chunk import chunk_of_code, unpack_scan, unpack_scan_with_check
+from skinnode.protocol.codes import MISSING, Codes
+from skinnode.protocol.profile import PatchProfile
+
+
+class HeldChunks:
+    """The payloads known of every chunk of a patch after its last scan.
+
+    Args:
+        profile: sizes of the patch.
+    """
+
+    def __init__(self, profile: PatchProfile) -> None:
+        self._profile = profile
+        self._steps = (1 << profile.code_bits) - 4
+        self._payloads: Sequence[bytes | None] = []
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all payloads: a scan may have changed them unseen."""
+        self._payloads = [None] * self._profile.n_chunks
+
+    def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
+        """Take the payloads of the scan that ends.
+
+        Args:
+            received: payload of each chunk, None where none arrived.
+            carry: keep the payloads of chunks that did not arrive, because the scan did not change them.
+        """
+        if carry and None in received:
+            held = self._payloads
+            received = [old if new is None else new for new, old in zip(received, held, strict=True)]
+        self._payloads = received
+
+    def decode(self) -> tuple[Codes, NDArray[np.bool_], int | None]:
+        """Decode the payloads.
+
+        Returns:
+            (U, K) codes, a mask of the measurements among them, and the CRC over the codes
+            (:func:`~skinnode.protocol.scan_check.check_of_codes`), None if not all codes are known.
+        """
+        profile = self._profile
+        known = [payload for payload in self._payloads if payload is not None]
+        blank = bytes(profile.chunk_bytes)
+        check: int | None = None
+        if len(known) == len(self._payloads):
+            codes, check = unpack_scan_with_check(b"".join(known), profile)
+        else:
+            codes = unpack_scan(b"".join([payload or blank for payload in self._payloads]), profile)
+            unknown = np.array([payload is None for payload in self._payloads])
+            codes[unknown[chunk_of_code(profile)]] = MISSING
+        valid = codes <= self._steps
+        codes.setflags(write=False)
+        valid.setflags(write=False)
+        return codes, valid, check

@@ -1,0 +1,128 @@
+"""The scan summary: TPDO2, which ends each scan."""
+
+from __future__ import annotations
+
+import enum
+import struct
+from typing import Final, NamedTuple
+
+from skinnode.canopen import indices as od
+from skinnode.protocol.device_time import TIME_SHIFT
+from skinnode.protocol.payload import PDO_BYTES, require_length
+from skinnode.protocol.scan_check import scan_check
+
+_COB_ID: Final = od.summary_cob_id(0)
+_SUMMARY: Final = struct.Struct("<BBHI")
+_HEAD: Final = struct.Struct("<BBHH")
+
+HEAD_BYTES: Final = _HEAD.size
+"""Bytes of a summary that its check covers."""
+
+
+class SummaryFlag(enum.IntFlag):
+    """Flags of a scan summary. Bits without a name are sent as 0 and ignored."""
+
+    CHANGED_ONLY = 0x01
+    """Only chunks that changed were sent: the others are as in the previous scan."""
+    OVERRUN = 0x02
+    """The next SYNC came first: chunks were left out, and their codes are unknown."""
+    WIRE_FAULT = 0x04
+    """A wire is open or shorted: see 0x2030 and 0x2031."""
+    BASELINE_CHANGED = 0x08
+    """The codes of this scan are the first of a new baseline: read 0x2200 … again."""
+    SOURCE_FAILED = 0x10
+    """The converter gave no reading: no chunk was sent, and the codes of this scan are unknown."""
+    CHECKED = 0x20
+    """Bytes 4 to 7 are u16 device time in steps of 64 µs and u16 scan check. Without this flag, as in patches
+    of revision 1.0, they are u32 device time in µs."""
+
+
+class Summary(NamedTuple):
+    """A scan summary as it is sent."""
+
+    scan: int
+    """Scan counter, u8."""
+    flags: int
+    """Bits of :class:`SummaryFlag`."""
+    chunks: int
+    """Chunks sent in this scan."""
+    device_time_us: int
+    """Device time, µs, 0 to 2³² − 1; with a ``check``, a multiple of 64 from 0 to 2²² − 64: see
+    :mod:`skinnode.protocol.device_time`."""
+    check: int | None = None
+    """Check of the scan, see :mod:`skinnode.protocol.scan_check`; None in a summary without
+    :attr:`SummaryFlag.CHECKED`."""
+
+
+_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time of a flag
+
+
+def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
+    """Pack the payload of TPDO2 of a patch of revision 1.0, whose summaries carry no check.
+
+    Args:
+        scan: scan counter, 0 to 255.
+        flags: bits of :class:`SummaryFlag` without ``CHECKED``.
+        chunks: chunks sent in this scan.
+        device_time_us: clock of the node, µs; wraps at 2³².
+
+    Raises:
+        ValueError: if a number other than the time does not fit its field.
+    """
+    try:
+        return _SUMMARY.pack(scan, flags, chunks, device_time_us & 0xFFFF_FFFF)
+    except struct.error as error:
+        raise ValueError(f"summary: got scan {scan}, flags {flags}, chunks {chunks}: {error}") from None
+
+
+def pack_checked_summary(
+    scan: int, flags: int, chunks: int, device_time_us: int, check_of_codes: int
+) -> bytes:
+    """Pack the payload of TPDO2 with a check, and set :attr:`SummaryFlag.CHECKED`.
+
+    Args:
+        scan: scan counter, 0 to 255.
+        flags: bits of :class:`SummaryFlag`.
+        chunks: chunks sent in this scan.
+        device_time_us: clock of the node, µs; wraps at 2³².
+        check_of_codes: :func:`~skinnode.protocol.scan_check.check_of_codes` of the codes that the receiver
+            must hold.
+
+    Raises:
+        ValueError: if a number other than the time does not fit its field.
+    """
+    steps = device_time_us >> TIME_SHIFT & 0xFFFF
+    try:
+        head = _HEAD.pack(scan, flags | _CHECKED, chunks, steps)
+    except struct.error as error:
+        raise ValueError(f"summary: got scan {scan}, flags {flags}, chunks {chunks}: {error}") from None
+    return head + scan_check(check_of_codes, head).to_bytes(2, "little")
+
+
+def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
+    """Return the record 0x2011 that belongs to a summary, its sub-objects concatenated.
+
+    Args:
+        payload: the payload of TPDO2.
+        device_time_us: clock of the node, µs; wraps at 2³².
+    """
+    if not payload[1] & _CHECKED:
+        return payload
+    return payload[:4] + (device_time_us & 0xFFFF_FFFF).to_bytes(4, "little") + payload[4:]
+
+
+def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
+    """Unpack a summary, with or without a check, from the payload of TPDO2.
+
+    Args:
+        data: the payload.
+        cob_id: named in the error.
+
+    Raises:
+        CodecError: if the payload is not 8 bytes long.
+    """
+    require_length(data, PDO_BYTES, cob_id, "scan summary")
+    scan, flags, chunks, rest = _SUMMARY.unpack(data)
+    if not flags & _CHECKED:
+        return Summary(scan, flags, chunks, rest)
+    return Summary(scan, flags, chunks, (rest & 0xFFFF) << TIME_SHIFT, rest >> 16)

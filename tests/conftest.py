@@ -7,11 +7,8 @@ import os
 import random
 import signal
 import socket
-import subprocess
-import sys
 import uuid
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import can
@@ -21,22 +18,17 @@ from skinnode.config import BusConfig
 from skinnode.errors import BusError
 from skinnode.transport import CanPort
 
-from . import stalls, warm_up
+from . import stalls, workers
 
 REQUIRE_VCAN = "SKINNODE_REQUIRE_VCAN"
 
 
 FUZZ_FRAMES = 20_000
 
-WORKERS = 5
-"""Processes for the whole suite: on two processors most tests wait for others rather than compute."""
-
-WHOLE = "skinnode_whole"
-"""Key under which a worker learns that the whole suite runs."""
-
 
 def pytest_addoption(parser: pytest.Parser, pluginmanager: pytest.PytestPluginManager) -> None:
     pluginmanager.register(stalls, "stalls")
+    pluginmanager.register(workers, "workers")
     parser.addoption("--frames", type=int, default=FUZZ_FRAMES, help="frames that a node is fuzzed with")
     parser.addoption(
         "--all-injections", action="store_true", help="an exception at every call of a thread of the host"
@@ -65,70 +57,7 @@ def has_vcan() -> bool:
     return any(name == "vcan0" for _, name in socket.if_nameindex())
 
 
-def is_whole(config: pytest.Config) -> bool:
-    """Whether all tests were asked for: no file, no folder, no name."""
-    if hasattr(config, "workerinput"):
-        return bool(config.workerinput[WHOLE])
-    return config.args_source is pytest.Config.ArgsSource.TESTPATHS
-
-
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Use workers for the whole suite, and this process alone for chosen files."""
-    return WORKERS if is_whole(config) else 0
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_configure_node(node: Any) -> None:
-    node.workerinput[WHOLE] = is_whole(node.config)
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    for name in ("COLUMNS", "LINES"):  # workers get a width of 80, and what is printed would be wrapped
-        os.environ.pop(name, None)
-    if not is_whole(config):
-        return
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads that spin while others work slow all down
-    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-        # Hundreds of processes would each compile all modules; this keeps the files out of the sources.
-        os.environ["PYTHONPYCACHEPREFIX"] = str(Path(sys.prefix) / "bytecode")
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels before the workers start."""
-    if session.config.option.numprocesses and not session.config.option.collectonly and warm_up.is_needed():
-        subprocess.run([sys.executable, warm_up.__file__], check=True)
-
-
-@pytest.hookimpl(tryfirst=True)  # before workers look at the groups
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    skip_or_require_vcan(items)
-    for item in items:
-        if (group := group_of(item)) is not None:
-            item.add_marker(pytest.mark.xdist_group(group))
-    items.sort(key=lambda item: group_of(item) != REAL_TIME)  # the longest group first
-    if is_whole(config) and not config.option.markexpr:
-        long = [item for item in items if item.get_closest_marker("long")]
-        config.hook.pytest_deselected(items=long)
-        items[:] = [item for item in items if not item.get_closest_marker("long")]
-
-
-REAL_TIME = "real_time"
-
-
-def group_of(item: pytest.Item) -> str | None:
-    """Return the group of a test, whose tests run one after the other in one worker; None if it has none.
-
-    Tests that count frames in real time would disturb each other. Tests that share a fixture of their module
-    would make it again in each worker."""
-    if item.get_closest_marker(REAL_TIME):
-        return REAL_TIME
-    fixtures = item._fixtureinfo.name2fixturedefs.values()
-    if any(definitions[-1].scope == "module" for definitions in fixtures):
-        return item.path.stem
-    return None
-
-
-def skip_or_require_vcan(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests marked ``vcan`` run where the kernel has vcan0, and are skipped elsewhere: `tools/vcan/vcan-run`
     boots a kernel that has it."""
     if has_vcan():

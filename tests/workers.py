@@ -1,0 +1,111 @@
+"""pytest plugin: run the whole suite in several processes, and leave its long tests to a lane of their own.
+
+A run without a file or folder is a run of the whole suite: it uses :data:`WORKERS` processes, and leaves out
+the tests marked ``long`` unless ``-m`` chooses. A run of chosen files stays in one process and has all tests.
+
+Each test goes to the next worker that is free. Tests of one group run one after the other in one worker.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from xdist.scheduler import LoadScopeScheduling
+
+from . import warm_up
+
+WORKERS = 5
+"""Processes for the whole suite: on two processors, because many tests wait rather than compute."""
+
+REAL_TIME = "real_time"
+"""Marker and group of the tests that count frames in real time and would disturb each other."""
+
+WHOLE, GROUPS = "skinnode_whole", "skinnode_groups"
+"""Keys under which a worker learns whether the whole suite runs, and where to write the groups."""
+
+
+def is_whole(config: pytest.Config) -> bool:
+    """Return whether all tests were asked for: no file, no folder, no name."""
+    if hasattr(config, "workerinput"):
+        return bool(config.workerinput[WHOLE])
+    return config.args_source is pytest.Config.ArgsSource.TESTPATHS
+
+
+def group_of(item: pytest.Item) -> str | None:
+    """Return the group of a test; None if it has none.
+
+    Tests that share a fixture of their module are a group, as each worker would make that fixture again."""
+    if item.get_closest_marker(REAL_TIME):
+        return REAL_TIME
+    fixtures = item._fixtureinfo.name2fixturedefs.values()
+    return item.path.stem if any(found[-1].scope == "module" for found in fixtures) else None
+
+
+class Scheduler(LoadScopeScheduling):
+    """Deal groups first, the largest before the others, then single tests.
+
+    xdist's own ``--dist loadgroup`` tells groups by a suffix of the node ID, which pytest 9.2 does not let it
+    add."""
+
+    _groups: dict[str, str] | None = None
+
+    def _split_scope(self, nodeid: str) -> str:
+        if self._groups is None:  # all workers have collected, and wrote the same
+            self._groups = json.loads((self.config.stash[FOLDER] / "gw0").read_text())
+        return self._groups.get(nodeid, nodeid)
+
+
+FOLDER = pytest.StashKey[Path]()
+"""Where each worker writes the groups of the tests for the scheduler: only workers collect tests."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for name in ("COLUMNS", "LINES"):  # workers get a width of 80, and what is printed would be wrapped
+        os.environ.pop(name, None)
+    if not is_whole(config):
+        return
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads that spin while others work slow all down
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+        # Hundreds of processes would each compile all modules; this keeps the files out of the sources.
+        os.environ["PYTHONPYCACHEPREFIX"] = str(Path(sys.prefix) / "bytecode")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels before the workers start."""
+    if session.config.option.numprocesses and not session.config.option.collectonly and warm_up.is_needed():
+        subprocess.run([sys.executable, warm_up.__file__], check=True)
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    return WORKERS if is_whole(config) else 0
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduler:
+    return Scheduler(config, log)
+
+
+def pytest_configure_node(node: Any) -> None:
+    config = node.config
+    if FOLDER not in config.stash:
+        folder = tempfile.TemporaryDirectory(prefix="skinnode-tests-")
+        config.add_cleanup(folder.cleanup)
+        config.stash[FOLDER] = Path(folder.name)
+    node.workerinput[WHOLE] = is_whole(config)
+    node.workerinput[GROUPS] = str(config.stash[FOLDER] / node.gateway.id)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if is_whole(config) and not config.option.markexpr:
+        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("long")])
+        items[:] = [item for item in items if not item.get_closest_marker("long")]
+    if hasattr(config, "workerinput"):
+        groups = {item.nodeid: group for item in items if (group := group_of(item)) is not None}
+        Path(config.workerinput[GROUPS]).write_text(json.dumps(groups))

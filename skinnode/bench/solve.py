@@ -20,7 +20,7 @@ from skinnode.model.kernels import potential, potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.operators.steps import OPERATORS
 from skinnode.solve.operators.system import solve_system
-from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
@@ -84,7 +84,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
             todo[case.wire] = wires.SOLVE
             frame[case.wire] = case.a
             solver.x[case.wire] = case.start
-            solver.solve(todo, frame, weight, 0, tolerance, tolerance, 50, operator=code)
+            solver.solve(todo, frame, weight, wires.solve_options(code, 0, tolerance, tolerance, 50))
             return np.asarray(solver.x[case.wire])
 
         return solve

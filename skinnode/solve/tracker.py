@@ -19,7 +19,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.compiled.array_table import Bundle
 from skinnode.model.elastic import Rubber
 from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
@@ -30,8 +29,8 @@ from skinnode.solve.exact.tracker import ExactTracker
 from skinnode.solve.inputs import CodeMap
 from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.smoothness import Smoothness
-from skinnode.solve.wires import frame
 from skinnode.solve.wires.problem import PatchProblem
+from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 METHODS: Final = ("auto", "exact", "posterior")
 EXACT_STD: Final = 0.0025
@@ -118,9 +117,7 @@ class Tracker:
             codes=codes,
         )
         problem = PatchProblem.of(layout, baseline_ohm)
-        self._rough_limit = roots.ROUGH_IN_STREAM / problem.step_limit
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
-        self._far_m, self._jump_m = roots.LARGE * clearance_m, roots.JUMP * clearance_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
         self._pause = 0  # frames until the posterior is asked again
@@ -132,12 +129,21 @@ class Tracker:
         self._folded = roots.folded_wires(layout, normal_only) | rough_noise
         its = self._exact.arrays
         whitening = np.array(Smoothness(problem).whitening, order="C")
-        self._judgement = Bundle(
-            [
-                its.outcome_m[0], self._last_m, its.status, its.held, self._folded.copy(), whitening,
-                self._lost, self._unsure, self._rough,
-            ]
-        )  # fmt: skip
+        self._root_check = RootCheck(
+            moved_m=its.outcome_m[0],
+            last_m=self._last_m,
+            status=its.status,
+            held=its.held,
+            folded=self._folded.copy(),
+            whitening=whitening,
+            lost=self._lost,
+            unsure=self._unsure,
+            rough=self._rough,
+            jump_m=roots.JUMP * clearance_m,
+            far_m=roots.LARGE * clearance_m,
+            pitch_m=layout.pitch_m,
+            rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
+        )
         self._doubtful()  # compiles it
         self.reset()
 
@@ -214,14 +220,12 @@ class Tracker:
         (``_unsure``): where the layout has folds all that were solved, elsewhere those that jumped and the
         rough ones."""
         assert self._exact is not None
-        found = frame.judge(
-            self._judgement.table, self._jump_m, self._far_m, self.layout.pitch_m, self._rough_limit
-        )
-        if found & frame.SOME_ROUGH:
+        found = check_roots(self._root_check.table)
+        if found & SOME_ROUGH:
             if self._confirmed is not None:  # what was confirmed a moment ago is not asked again
                 self._rough &= ~roots.still_confirmed(self._exact.arrays.outcome_m[0], self._confirmed)
             self._unsure |= self._rough
-        return found & frame.SOME_DOUBT != 0 or bool(found & frame.SOME_ROUGH and self._rough.any())
+        return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: NDArray[np.bool_]) -> FieldFrame:
         """A wire that is held is no better known than when the posterior confirmed it."""

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import skinnode as sk
-from skinnode.solve.exact import patch_stream
+from skinnode.solve.exact import stream as patch_stream
 from skinnode.solve.exact import tracker as exact
 from skinnode.solve.exact.tracker import ExactTracker
-from skinnode.solve.wires import driver as wires
-from skinnode.solve.wires.patch_solver import TAKE, PatchSolver
+from skinnode.solve.wires import arrays as wires
+from skinnode.solve.wires.patch_solver import SCALE, PatchSolver
 
 from .press import dent, frame_ohm, hertz_press
 
@@ -30,7 +30,7 @@ class Clock:
         for module in (exact, patch_stream):
             monkeypatch.setattr(module, "perf_counter", self._read)
         monkeypatch.setattr(PatchSolver, "solve", self._timed(PatchSolver.solve))
-        monkeypatch.setattr(PatchSolver, "advance", self._timed(PatchSolver.advance, clears=TAKE))
+        monkeypatch.setattr(PatchSolver, "advance", self._timed(PatchSolver.advance, clears=SCALE))
 
     def _read(self) -> float:
         self._readings += 1

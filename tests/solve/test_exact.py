@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skinnode as sk
-from skinnode.solve.exact import patch_stream
+from skinnode.solve.exact import stream
 from skinnode.solve.exact.tracker import ExactTracker
 
 from .press import HI, LO, STEPS, frame_ohm, hertz_press, noisy, quantised
@@ -344,7 +344,7 @@ def test_corrupt_frames_leave_no_trace(small, options, corruptions):
             field, expected = tracker.update(frame), witness.update(frame)
             assert field.trusted
             scale = np.abs(moved).max()
-            atol = max(1e-6 * scale, patch_stream.TOLERANCE * small.pitch_m)  # a solve is no more exact
+            atol = max(1e-6 * scale, stream.TOLERANCE * small.pitch_m)  # a solve is no more exact
             np.testing.assert_allclose(field.displacement_m, expected.displacement_m, atol=atol)
             np.testing.assert_allclose(field.displacement_m, moved, atol=atol)
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2, norm
 
 import skinnode as sk
 from skinnode.solve.exact.tracker import ExactTracker
-from skinnode.solve.wires.follow import chi2_quantile
+from skinnode.solve.wires.hold import chi2_quantile
 
 from .press import frame_ohm, hertz_press, noisy, quantised, relative_slopes
 

@@ -4,10 +4,10 @@ rest       a wire whose resistances have not changed beyond their noise keeps it
 predict    x + (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which its covariance needed anyway
 follow     simplified Newton steps with the same J⁻¹, while it is still nearly that of the position
 correct    the operator, where it is not, to a tolerance far below any noise
-widen      an electrode left out that is seen to move joins the unknowns (see ``leaving_out``)
-recover    a wire that fails is bridged, or given up (see ``recovery``)
+widen      an electrode left out that is seen to move joins the unknowns (see ``leave_out``)
+recover    a wire that fails is bridged, or given up (see ``recover``)
 
-Which roots count is told in ``patch_stream``.
+Which roots count is told in ``stream``.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import as_statuses
-from skinnode.solve.exact.leaving_out import LeftOut
-from skinnode.solve.exact.patch_stream import FRAME_STEPS, TASKS, TOLERANCE, Frame, PatchStream
-from skinnode.solve.exact.recovery import recover_lost
+from skinnode.solve.exact.leave_out import LeftOut
+from skinnode.solve.exact.recover import recover_lost
+from skinnode.solve.exact.stream import FRAME_STEPS, Frame, StreamState
 from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask, checked_noise
 from skinnode.solve.operators import steps as op
 from skinnode.solve.operators.system import operator_code
-from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires import patch_solver as stage
-from skinnode.solve.wires.frame import DEADLINE
 from skinnode.solve.wires.problem import PatchProblem
+from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
+from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
 """An evaluation of F and J and the step from there take no longer. As many wires as fit for sure into what is
 left of a deadline are solved in one call: ten calls in place of one cost as much as the ten wires."""
-WIRE_UNITS: Final = FRAME_STEPS + 1 + wires.COVARIANCE_UNITS
+WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 """Most evaluations a wire may take for a frame."""
 
 
@@ -89,14 +90,14 @@ class ExactTracker:
         self.stiffness_n_per_m = stiffness_n_per_m
         self._noise = checked_noise(relative_noise, layout)
         self._sigma = float(self._noise.min())
-        self._first = wires.HOLD if hold else wires.PREDICT  # where a wire can be predicted
         self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
         self._active_only = active_only
         self._leaves_out = active_only or normal_only
         self._in_order = np.arange(layout.shape[0])
-        self._todo = np.empty(layout.shape[0], np.uint8)
         self._all_converged = as_statuses([op.CONVERGED] * layout.shape[0])
-        self._stream = PatchStream(problem, operator_code(operator), normal_only)
+        self._stream = StreamState(
+            problem, operator_code(operator), normal_only, wires.HOLD if hold else wires.PREDICT
+        )
         self._left_out = LeftOut(self._stream, active_only)
         self.arrays = self._stream.arrays
         """Of the stream and the frame at hand."""
@@ -112,7 +113,7 @@ class ExactTracker:
         """Forget the stream: the next frame is solved from the rest position."""
         self._stream.reset()
         self._left_out.reset()
-        self._order = self._in_order  # whose turn it is, where there is a deadline
+        self.arrays.order[:], self._waiting = self._in_order, False
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
@@ -131,12 +132,14 @@ class ExactTracker:
         there, and inf where the deadline left no time to. Raises ValueError for wrong shapes.
         """
         start = perf_counter()
-        its = self.arrays
+        arrays = self.arrays
         # copies, for the kernel has the addresses of these
-        its.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        its.noise[:] = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
-        its.valid[:] = True if valid is None else checked_mask(valid, self.layout)
-        return self._advance(stage.TAKE, start)
+        arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        arrays.noise[:] = (
+            self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
+        )
+        arrays.valid[:] = True if valid is None else checked_mask(valid, self.layout)
+        return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
         """The field of a scan of (U, K) codes, as :meth:`update` makes it of the resistances and the noise
@@ -144,11 +147,11 @@ class ExactTracker:
         none. Raises ValueError for another shape, or numbers that are no uint32."""
         start = perf_counter()
         self.arrays.codes[:] = checked_codes(codes, self.layout)
-        return self._advance(stage.DECODE | stage.TAKE, start)
+        return self._advance(stage.DECODE | stage.SCALE, start)
 
     def _advance(self, stages: int, start: float) -> FieldFrame:
         """The field of the frame that :attr:`arrays` has, after the ``stages`` that come before its solve."""
-        solver, its = self._stream.solver, self.arrays
+        solver, arrays = self._stream.solver, self.arrays
         solver.turn += 1
         sigma, until, units = self._sigma, start + self._seconds, math.inf
         if self._leaves_out:
@@ -159,47 +162,39 @@ class ExactTracker:
             units = max(WIRE_UNITS, (until - perf_counter()) / UNIT_S)
         stages |= stage.CHOOSE
         if not self._active_only:  # all wires have as many unknowns
-            stages |= stage.SOLVE | stage.REACH | stage.FINISH
+            stages |= stage.SOLVE | stage.ACCEPT | stage.STORE
         sigma, found = self._call_stages(stages, sigma, units)
         easy = found & stage.ALL_GOOD != 0
         if easy:
-            self._order = self._in_order
+            if self._waiting:
+                arrays.order[:], self._waiting = self._in_order, False
             residual = solver.measure[:, wires.RESIDUAL].copy()
         else:
-            frame = Frame(sigma, self._order, until)
+            frame = Frame(sigma, arrays.order, until)
             if self._active_only:
                 self._solve(frame)
             elif until < math.inf:
                 self._solve_remaining(frame)
             residual = self._rescue(frame)
-            _, found = self._call_stages(stage.FINISH, sigma, math.inf)
+            _, found = self._call_stages(stage.STORE, sigma, math.inf)
         if found & stage.INCOMPLETE:
             self._complete()
-        displacement, std = its.outcome_m.copy()
+        displacement, std = arrays.outcome_m.copy()
         evaluations, jacobians, steps = solver.tally.tolist()
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=std,
-            status=self._all_converged if easy else as_statuses(its.status.tolist()),
+            status=self._all_converged if easy else as_statuses(arrays.status.tolist()),
             residual=residual,
             stats=SolveStats(evaluations, jacobians, steps, perf_counter() - start),
             force_n=None if self.stiffness_n_per_m is None else self.stiffness_n_per_m * displacement,
-            held=its.held.copy(),
+            held=arrays.held.copy(),
         )
 
     def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:
         """As :meth:`PatchSolver.advance` does them for a frame: σ, and what came of it."""
         sigma, invalid, found = self._stream.solver.advance(
-            stages,
-            self.arrays,
-            self._first,
-            self._todo,
-            TASKS,
-            TOLERANCE,
-            FRAME_STEPS,
-            sigma,
-            self._order,
-            units,
+            stages, self.arrays, self._stream.options, sigma, units
         )
         if stages & stage.DECODE:
             self.invalid_codes = invalid
@@ -208,46 +203,46 @@ class ExactTracker:
     def _rescue(self, frame: Frame) -> Float:
         """Try what is left to try on wires that were not brought to a root: their status and whether they are
         good, and (U,) residuals."""
-        solver, its = self._stream.solver, self.arrays
+        solver, arrays = self._stream.solver, self.arrays
         turns = solver.report[:, wires.TURN] == 1
         exhausted = np.zeros_like(turns)  # whatever could be tried has been
         if self._active_only:
             exhausted = self._left_out.widen(frame, turns)
         recover_lost(self._stream, frame, turns, exhausted)
         residual = solver.measure[:, wires.RESIDUAL].copy()
-        for u in np.flatnonzero(~its.good).tolist():
-            known = its.status[u] != DEADLINE and not frame.expired
+        for u in np.flatnonzero(~arrays.good).tolist():
+            known = arrays.status[u] != DEADLINE and not frame.expired
             residual[u] = self._held_residual(u) if known else math.inf
         # who waits comes first, in the order of waiting
-        self._order = (
-            self._in_order if turns.all() else self._order[np.argsort(turns[self._order], kind="stable")]
-        )
+        self._waiting = not turns.all()
+        order = arrays.order
+        order[:] = order[np.argsort(turns[order], kind="stable")] if self._waiting else self._in_order
         return residual
 
     def _complete(self) -> None:
         """The ``a`` of equations that solved wires did not have: what they would have been."""
-        stream, its = self._stream, self.arrays
-        solved = its.good & (stream.solver.report[:, wires.HELD] == 0)
-        for u in np.flatnonzero(solved & (its.used == 0).any(axis=1)).tolist():
-            missing = its.used[u] == 0
-            its.a_solved[u, missing] = stream.a_at(its.x[u])[missing]
+        stream, arrays = self._stream, self.arrays
+        solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
+        for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
+            missing = arrays.used[u] == 0
+            arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
         """Go on from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
-        stream, its = self._stream, self.arrays
-        moved = (displacement_m / self.layout.pitch_m).reshape(its.x.shape)
+        stream, arrays = self._stream, self.arrays
+        moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # with every electrode an unknown again, as the displacement has them all
             self._left_out.take_in(wires_)
         for u in np.flatnonzero(wires_).tolist():
-            its.x[u] = stream.problem.rest[u] + moved[u]
-            its.a_solved[u] = stream.a_at(its.x[u])
-            its.predictable[u] = False
+            arrays.x[u] = stream.problem.rest[u] + moved[u]
+            arrays.a_solved[u] = stream.a_at(arrays.x[u])
+            arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
         """Solve these wires (U,) from rest in the next frame, whatever they came to in this one."""
-        problem, its = self._stream.problem, self.arrays
-        its.x[wires_], its.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
-        its.predictable[wires_] = False
+        problem, arrays = self._stream.problem, self.arrays
+        arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
+        arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
         """Solve the wires to be solved for the frame, in turn where there is a deadline: one at least, lest
@@ -255,13 +250,13 @@ class ExactTracker:
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
-        self._stream.solve(self._todo, frame, units=units)
+        self._stream.solve(self.arrays.todo, frame, units=units)
         if units < math.inf:
             self._solve_remaining(frame)
 
     def _solve_remaining(self, frame: Frame) -> None:
         """The wires to be solved that had no turn, while there is time."""
-        todo, report = self._todo, self._stream.solver.report
+        todo, report = self.arrays.todo, self._stream.solver.report
         while True:
             todo[report[:, wires.TURN] == 1] = wires.LEAVE
             if not todo.any() or frame.expired:
@@ -271,8 +266,8 @@ class ExactTracker:
 
     def _held_residual(self, u: int) -> float:
         """RMS of F/b − 1 of wire u at its held position over the usable resistances; inf if there is none."""
-        its = self.arrays
-        used = its.used[u] > 0
+        arrays = self.arrays
+        used = arrays.used[u] > 0
         if not used.any():
             return math.inf
-        return float(np.sqrt(np.mean(self._stream.relative_residual(its.x[u], its.a[u])[used] ** 2)))
+        return float(np.sqrt(np.mean(self._stream.relative_residual(arrays.x[u], arrays.a[u])[used] ** 2)))

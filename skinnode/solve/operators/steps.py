@@ -27,7 +27,7 @@ nonlinear problems, 2004 (simplified correction as the error estimate); Xu et al
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
@@ -89,50 +89,50 @@ FACTORED, SINGULAR, SIGN, REDUCED, STALLED, FLAGS = range(6)
 
 
 class Work(NamedTuple):
-    """Everything a solve of m equations in n unknowns writes to."""
+    """Everything that solving m equations in n unknowns writes to."""
 
-    x: Float
-    trial: Float
-    step: Float
-    newton: Float
-    gradient: Float
-    scale: Float
-    """(n,) D."""
-    diagonal: Float
-    """(n,) of R."""
-    beta: Float
-    """(n,) of the reflectors."""
-    v: Float
-    bd: Float
-    """(n,) diagonal of the bidiagonal form of J D⁻¹; ``bu`` (n,) is above it."""
-    bu: Float
-    across: Float
-    down: Float
-    """(n,) β of its reflectors."""
-    inverse: Float
-    ru: Float
-    """(n,) 1 / diagonal, and above it, of the damped form."""
-    r: Float
-    r_trial: Float
-    js: Float
-    """(m,) J·step."""
-    e: Float
-    """(m,) scratch."""
-    jt: Float
-    """(n, m) Jᵀ at x."""
-    lu: Float
-    """(n + 3, whole lanes of n) of Jᵀ where the system is square."""
-    qr: Float
-    """(m, n) of J."""
-    right: Float
-    """(n + 3, whole lanes of m) reflectors of the bidiagonal form from the right."""
-    left: Float
-    """(n, whole lanes of n + 3) those from the left."""
-    wide: Float
+    x: Annotated[Float, "n"]
+    trial: Annotated[Float, "n"]
+    step: Annotated[Float, "n"]
+    newton: Annotated[Float, "n"]
+    gradient: Annotated[Float, "n"]
+    scale: Annotated[Float, "n"]
+    """D."""
+    diagonal: Annotated[Float, "n"]
+    """Diagonal of R."""
+    beta: Annotated[Float, "n"]
+    """β of the reflectors of Q."""
+    v: Annotated[Float, "n"]
+    bd: Annotated[Float, "n"]
+    """Diagonal of the bidiagonal form of J D⁻¹; ``bu`` is above it."""
+    bu: Annotated[Float, "n"]
+    across: Annotated[Float, "n"]
+    down: Annotated[Float, "n"]
+    """β of its reflectors."""
+    inverse: Annotated[Float, "n"]
+    """1 / diagonal of the damped form; ``ru`` is above it."""
+    ru: Annotated[Float, "n"]
+    r: Annotated[Float, "m"]
+    r_trial: Annotated[Float, "m"]
+    js: Annotated[Float, "m"]
+    """J·step."""
+    e: Annotated[Float, "m"]
+    """Scratch."""
+    jt: Annotated[Float, "n m"]
+    """Jᵀ at x."""
+    lu: Annotated[Float, "n+3 lanes_n"]
+    """LU factors of Jᵀ if the system is square; rows are whole lanes."""
+    qr: Annotated[Float, "m n"]
+    """QR factors of J if it is tall."""
+    right: Annotated[Float, "n+3 lanes_m"]
+    """Reflectors of the bidiagonal form from the right."""
+    left: Annotated[Float, "n lanes_n+3"]
+    """Reflectors of the bidiagonal form from the left."""
+    wide: Annotated[Float, "lanes_m"]
     """Scratch as long as a row of ``right``."""
-    pivot: Index
-    s: Float
-    flag: Index
+    pivot: Annotated[Index, "n"]
+    s: Annotated[Float, "scalars"]
+    flag: Annotated[Index, "flags"]
 
 
 def workspace(n: int, m: int) -> Work:

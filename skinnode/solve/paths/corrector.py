@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
@@ -113,7 +113,7 @@ class Corrector:
         """Solve wires from where they are, into ``solver``, and log the cost.
 
         Args:
-            todo: (U,) LEAVE, SOLVE or PREDICT for each wire (:mod:`skinnode.solve.wires.driver`).
+            todo: (U,) LEAVE, SOLVE or PREDICT for each wire (:mod:`skinnode.solve.wires.arrays`).
             position: (U,) position of each wire, or one sample for all.
             accuracy: When a wire is done.
             tasks: Tasks of the driver, or-ed together.
@@ -124,11 +124,13 @@ class Corrector:
             todo,
             self.a_at(position),
             self._weight.copy(),
-            tasks,
-            accuracy.tolerance,
-            accuracy.tolerance,
-            accuracy.max_steps,
-            operator=operator,
+            wires.solve_options(
+                solver.operator if operator is None else operator,
+                tasks,
+                accuracy.tolerance,
+                accuracy.tolerance,
+                accuracy.max_steps,
+            ),
         )
         asked = todo != wires.LEAVE
         self._rows.append(

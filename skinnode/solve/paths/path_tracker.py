@@ -22,7 +22,7 @@ from skinnode.solve.paths.corrector import Accuracy, Corrector
 from skinnode.solve.paths.predictor import euler, secant
 from skinnode.solve.roots import Mask
 from skinnode.solve.smoothness import Smoothness
-from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.problem import PatchProblem
 
 

@@ -20,7 +20,7 @@ from skinnode.solve.paths.corrector import Accuracy
 from skinnode.solve.paths.path_tracker import PathTracker
 from skinnode.solve.roots import Mask
 from skinnode.solve.starts import guided_start, near_twin
-from skinnode.solve.wires import driver as wires
+from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
 """Maximum steps from a guided start: it is next to its root, 1 to 20 steps, or next to none."""

@@ -26,7 +26,7 @@ from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, chec
 from skinnode.solve.posterior.contacts import ContactFinder
 from skinnode.solve.posterior.estimate import Data, Estimator, Index
 from skinnode.solve.posterior.prior import ElasticPrior
-from skinnode.solve.wires.driver import A_MAX, A_MIN
+from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 DRIFTS: Final = ("none", "patch", "wire")

@@ -19,8 +19,8 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.factorisations import Index
 from skinnode.solve.operators import steps as op
 from skinnode.solve.roots import on_rest_branch
-from skinnode.solve.wires import driver as wires
-from skinnode.solve.wires.frame import FrameArrays
+from skinnode.solve.wires import arrays as wires
+from skinnode.solve.wires.arrays import FrameArrays, SolveOptions, solve_options
 from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
@@ -48,28 +48,29 @@ class Frame:
         return self.until < math.inf and perf_counter() >= self.until
 
 
-class PatchStream:
+class StreamState:
     """A patch and where its stream is: the solver and the arrays that tracker, recovery and leaving out read
     and write in place. One owner."""
 
-    def __init__(self, problem: PatchProblem, operator: int, normal_only: bool) -> None:
+    def __init__(self, problem: PatchProblem, operator: int, normal_only: bool, first: int) -> None:
         self.problem = problem
         self.solver = PatchSolver(problem, operator, normal_only)
         self._rest_branch = self.solver.solve_rest()
         self._rest_known = self.solver.report[:, wires.STATUS] == op.CONVERGED
         self._rest_inverse = self.solver.inverse.copy()
-        self.arrays = FrameArrays(problem, self._rest_branch, self.unknowns)
+        self.arrays = FrameArrays(problem, self._rest_branch, self.unknowns, first)
+        self.options = solve_options(operator, TASKS, TOLERANCE, TOLERANCE, FRAME_STEPS)
 
     def reset(self) -> None:
         """Back to the rest position."""
-        solver, its = self.solver, self.arrays
-        its.x[:], its.a_solved[:] = self.problem.rest, self.problem.a_rest
+        solver, arrays = self.solver, self.arrays
+        arrays.x[:], arrays.a_solved[:] = self.problem.rest, self.problem.a_rest
         solver.inverse[:] = self._rest_inverse
-        solver.turn = 0
+        solver.turn[:] = 0
         solver.a_solved[:] = self.problem.a_rest
         solver.noise[:] = 0.0
-        its.weight_solved[:] = 1.0
-        its.predictable[:] = self._rest_known
+        arrays.weight_solved[:] = 1.0
+        arrays.predictable[:] = self._rest_known
 
     @property
     def unknowns(self) -> NDArray[np.int64]:
@@ -77,25 +78,31 @@ class PatchStream:
         return np.asarray(self.solver.each * self.solver.free)
 
     def solve(
-        self, todo: NDArray[np.uint8], frame: Frame, *, a: Float | None = None, tasks: int = TASKS,
-        tolerance: float = TOLERANCE, most: int = FRAME_STEPS, method: int | None = None,
+        self,
+        todo: NDArray[np.uint8],
+        frame: Frame,
+        *,
+        a: Float | None = None,
+        options: SolveOptions | None = None,
         units: float = math.inf,
-    ) -> None:  # fmt: skip
-        """One call of the solver for the wires in ``todo`` (U,), of at most ``most`` steps a wire. ``a``
-        (U, K) and ``method`` in place of those of the frame and of the solver; ``units`` as in
-        :func:`skinnode.solve.wires.driver.solve_wires`."""
+    ) -> None:
+        """Solve the wires in ``todo`` (U,) in one call.
+
+        Args:
+            todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
+            frame: σ and order of the wires.
+            a: (U, K) resistances in place of the frame's.
+            options: in place of those of the stream.
+            units: as in :meth:`PatchSolver.solve`.
+        """
         self.solver.solve(
             todo,
             self.arrays.a if a is None else a,
             self.arrays.weight,
-            tasks,
-            tolerance,
-            tolerance,
-            most,
-            frame.sigma,
-            method,
-            frame.order,
-            units,
+            self.options if options is None else options,
+            sigma=frame.sigma,
+            order=frame.order,
+            units=units,
         )
 
     def only(self, u: int) -> NDArray[np.uint8]:

@@ -24,14 +24,14 @@ from numpy.typing import NDArray
 
 from skinnode.model.forward import jacobian
 from skinnode.model.layout import Float
-from skinnode.solve.exact.patch_stream import TOLERANCE, Frame, PatchStream
-from skinnode.solve.exact.recovery import recover
+from skinnode.solve.exact.recover import recover
+from skinnode.solve.exact.stream import TOLERANCE, Frame, StreamState
 from skinnode.solve.linalg.factorisations import Index
 from skinnode.solve.operators import steps as op
 from skinnode.solve.roots import Z_REFUSE
-from skinnode.solve.wires import driver as wires
-from skinnode.solve.wires.follow import Z_HOLD, chi2_quantile
-from skinnode.solve.wires.frame import DEADLINE, STALE
+from skinnode.solve.wires import arrays as wires
+from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
+from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
 """Normal deviate of the quantile, 1 − 1e-4, of χ² at which electrodes join: a long press at 100 frames/s
@@ -43,7 +43,7 @@ TINY: Final = 1e-200
 class LeftOut:
     """What is no unknown on the wires of a stream, and how far it may move unnoticed."""
 
-    def __init__(self, stream: PatchStream, active_only: bool) -> None:
+    def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
         self._layout = layout = problem.layout
         self._stream = stream
@@ -74,21 +74,21 @@ class LeftOut:
 
     def leave_out(self, sigma: float) -> None:
         """Put wires to rest where that explains the frame; what χ² may miss of all that is no unknown."""
-        solver, its = self._stream.solver, self._stream.arrays
+        solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
-            usable = np.where(its.used > 0, its.a, 1.0)
-            square = (its.used * (usable / a_rest - 1.0)) ** 2
+            usable = np.where(arrays.used > 0, arrays.a, 1.0)
+            square = (arrays.used * (usable / a_rest - 1.0)) ** 2
             chi2 = square.sum(axis=1) / (sigma**2 + TOLERANCE**2)
-            count = np.count_nonzero(its.used, axis=1)
+            count = np.count_nonzero(arrays.used, axis=1)
             known = (chi2 <= self._chi2_hold[count]) & (count >= solver.each * self._layout.unknowns // 3)
             for u in np.flatnonzero(known & (solver.free > 0)).tolist():
                 self._set_electrodes(u, np.arange(0))
                 self._unnoticed_weight[u] = 0.0  # to be measured below
-        its.unknowns[:] = self._stream.unknowns
+        arrays.unknowns[:] = self._stream.unknowns
         if solver.each * solver.free.min() < self._layout.unknowns:
-            for u in np.flatnonzero(_changed(its.used, self._unnoticed_weight)).tolist():
-                self._measure_unnoticed(u, its.used[u])
+            for u in np.flatnonzero(_changed(arrays.used, self._unnoticed_weight)).tolist():
+                self._measure_unnoticed(u, arrays.used[u])
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -102,12 +102,12 @@ class LeftOut:
 
     def _set_electrodes(self, u: int, electrodes: Index) -> None:
         """Give unknowns to these electrodes of wire u only."""
-        solver, its, problem = self._stream.solver, self._stream.arrays, self._stream.problem
+        solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
-        its.predictable[u] = len(electrodes) == 0
-        if its.predictable[u]:  # then rest is known to be the solution, without noise
-            its.x[u], its.a_solved[u] = problem.rest[u], problem.a_rest[u]
-            solver.a_solved[u], solver.noise[u] = its.a_solved[u], 0.0
+        arrays.predictable[u] = len(electrodes) == 0
+        if arrays.predictable[u]:  # then rest is known to be the solution, without noise
+            arrays.x[u], arrays.a_solved[u] = problem.rest[u], problem.a_rest[u]
+            solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
         """How far each coordinate that is no unknown moves before χ² notices, pitches a unit of σ."""
@@ -168,14 +168,14 @@ class LeftOut:
 
     def _suspects(self, u: int) -> Index:
         """The electrode at rest that explains most of the residual of wire u, and its neighbours."""
-        solver, its = self._stream.solver, self._stream.arrays
+        solver, arrays = self._stream.solver, self._stream.arrays
         each, (_, lower), most = solver.each, self._layout.shape, self._layout.unknowns // 3
-        slopes = (self._slopes[u] * its.used[u]).reshape(most, 3, lower)[:, 3 - each :]
+        slopes = (self._slopes[u] * arrays.used[u]).reshape(most, 3, lower)[:, 3 - each :]
         moving = solver.electrodes(u)
         rest = np.setdiff1d(np.arange(most), moving)
         outside = _outside(slopes[rest].reshape(-1, lower), slopes[moving].reshape(each * len(moving), lower))
         directions = np.linalg.qr(outside.reshape(-1, each, lower).transpose(0, 2, 1))[0]
-        residual = its.used[u] * self._stream.relative_residual(solver.x[u], its.a[u])
+        residual = arrays.used[u] * self._stream.relative_residual(solver.x[u], arrays.a[u])
         explained = ((directions * residual[:, None]).sum(axis=1) ** 2).sum(axis=1)
         best = int(rest[np.argmax(explained)])
         return np.arange(max(best - 1, 0), min(best + 2, most))

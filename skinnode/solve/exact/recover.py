@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
-from skinnode.solve.exact.patch_stream import Frame, PatchStream
+from skinnode.solve.exact.stream import TASKS, TOLERANCE, Frame, StreamState
 from skinnode.solve.operators import steps as op
-from skinnode.solve.wires import driver as wires
-from skinnode.solve.wires.frame import DEADLINE
+from skinnode.solve.wires import arrays as wires
+from skinnode.solve.wires.arrays import solve_options
+from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
 """Substeps of the bridges tried in turn. On staggered, h = 0.5, from rest: 3 bring every wire through
@@ -29,16 +30,19 @@ BRIDGE_STEPS: Final = 20
 RECOVERY_STEPS: Final = 300
 """Most steps all bridges of a frame may take together, about 15 ms: a broken frame must
 not stop the stream."""
+# Levenberg-Marquardt is the sturdiest across a gap, whatever operator the stream has.
+_ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
+_LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 
 
 def recover_lost(
-    stream: PatchStream, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
+    stream: StreamState, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
 ) -> None:
     """Recover the wires that are not at a root, into ``good`` and ``status`` of the stream's arrays; give up
     those that fail, and the ``exhausted`` (U,), of which nothing is left to try. Who would need time that
     is over has had no turn: False in ``turns`` (U,)."""
-    solver, its = stream.solver, stream.arrays
-    good, status = its.good, its.status
+    solver, arrays = stream.solver, stream.arrays
+    good, status = arrays.good, arrays.status
     good[:], status[:] = stream.roots(), solver.report[:, wires.STATUS]
     if good.all():
         return
@@ -52,13 +56,13 @@ def recover_lost(
         ended = int(solver.report[u, wires.STATUS])
         status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
     solver.std[~good] = np.inf
-    its.predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
+    arrays.predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
 
 
-def recover(stream: PatchStream, u: int, frame: Frame) -> bool:
+def recover(stream: StreamState, u: int, frame: Frame) -> bool:
     """Bridge wire u from its last trusted position, then from rest; whether that brought it to a root."""
-    solver, its, problem = stream.solver, stream.arrays, stream.problem
-    starts = [(its.x[u].copy(), its.a_solved[u].copy())]
+    solver, arrays, problem = stream.solver, stream.arrays, stream.problem
+    starts = [(arrays.x[u].copy(), arrays.a_solved[u].copy())]
     rest = problem.rest[u], problem.a_rest[u]
     if not np.array_equal(starts[0][0], rest[0]):
         starts.append(rest)
@@ -74,7 +78,7 @@ def recover(stream: PatchStream, u: int, frame: Frame) -> bool:
     return False
 
 
-def _bridge(stream: PatchStream, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int) -> bool:
+def _bridge(stream: StreamState, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int) -> bool:
     """Solve wire u along the straight line of its resistances from ``a_from`` (K,) to those of the frame.
 
     Only the last point counts: the line is no deformation of rubber, so the points between may lie on any
@@ -83,15 +87,12 @@ def _bridge(stream: PatchStream, u: int, x_from: Float, a_from: Float, frame: Fr
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()
     stream.solver.x[u] = x_from
-    method = op.LEVENBERG_MARQUARDT  # the sturdiest across a gap, whatever follows the stream
     for part in range(1, substeps):
         if frame.expired:
             return False
         between[u] = a_from + part / substeps * (a_to - a_from)
-        stream.solve(
-            todo, frame, a=between, tasks=0, tolerance=BRIDGE_TOLERANCE, most=BRIDGE_STEPS, method=method
-        )
+        stream.solve(todo, frame, a=between, options=_ACROSS)
     if frame.expired:
         return False
-    stream.solve(todo, frame, most=BRIDGE_STEPS, method=method)
+    stream.solve(todo, frame, options=_LAST)
     return True

@@ -1,0 +1,218 @@
+"""The arrays of a patch that kernels read and write, declared once: name, element type and axes.
+
+U upper wires, N electrodes an upper wire, K lower wires, M electrodes a lower wire; n unknowns a wire, E
+electrodes with unknowns. Lengths are in pitches (see ``problem``).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.array_table import READONLY, ArrayTable, reader
+from skinnode.model.layout import Float
+from skinnode.solve.inputs import CodeMap
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.operators.steps import Work
+from skinnode.solve.wires.problem import PatchProblem
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+# Columns of a wire's integer report
+STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
+# Columns of a wire's real report. RESIDUAL is the weighted RMS over the equations in use; CHI2 is the χ² of
+# the residual at the end of a solve, with SPARE (equations less unknowns) degrees of freedom.
+RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
+
+# What to do with a wire
+LEAVE: Final = 0
+SOLVE: Final = 1
+PREDICT: Final = 2
+"""Solve, starting at x + (∂x/∂a) (a − a of the last solve)."""
+HOLD: Final = 3
+"""As PREDICT, but keep x if the residual there is within noise."""
+
+# What a solve may do besides solving, or-ed together
+COVARIANCE: Final = 1
+"""Compute J⁻¹, and from it the standard deviation of x and what rounding leaves open."""
+SKIP: Final = 2
+"""Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
+REUSE: Final = 4
+"""Follow a wire that moved a little with the inverse at hand, and keep that inverse."""
+
+
+class SolveOptions(ArrayTable):
+    """How to solve wires.
+
+    Args:
+        operator: number of the operator, see :data:`skinnode.solve.operators.steps.OPERATORS`.
+        tasks: COVARIANCE, SKIP and REUSE, or-ed together.
+        tol_f: largest |r| at a root.
+        tol_x: largest remaining correction, relative to max(1, max|x|).
+        max_steps: maximum trial steps of a wire.
+
+    Raises TypeError if a value has the wrong type, ValueError if a tolerance or ``max_steps`` is not
+    positive.
+    """
+
+    operator: int
+    tasks: int
+    tol_f: float
+    tol_x: float
+    max_steps: int
+
+    def __init__(self, operator: int, tasks: int, tol_f: float, tol_x: float, max_steps: int) -> None:
+        for name, value in (("tol_f", tol_f), ("tol_x", tol_x), ("max_steps", max_steps)):
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name}: got {value}, must be positive and finite")
+        super().__init__(operator=operator, tasks=tasks, tol_f=tol_f, tol_x=tol_x, max_steps=max_steps)
+
+
+@functools.lru_cache(maxsize=256)
+def solve_options(
+    operator: int, tasks: int = 0, tol_f: float = 1e-9, tol_x: float = 1e-9, max_steps: int = 12
+) -> SolveOptions:
+    """Return :class:`SolveOptions` with these values; equal ones are made once."""
+    return SolveOptions(int(operator), int(tasks), float(tol_f), float(tol_x), int(max_steps))
+
+
+class SolverArrays(ArrayTable):
+    """State, results and workspace of the solver of one patch, for wires with E electrodes with unknowns."""
+
+    x: Annotated[Float, "U 3N"]
+    """Start, then solution."""
+    inverse: Annotated[Float, "U 3N K"]
+    """∂x/∂r of the last converged solve of each wire."""
+    a_solved: Annotated[Float, "U K"]
+    """1/F there; 1 where there was no equation."""
+    noise: Annotated[Float, "U K"]
+    """Variance of a there; inf where there was no equation."""
+    std: Annotated[Float, "U 3N"]
+    """Standard deviation of x; inf where not known."""
+    report: Annotated[Index, "U report"]
+    measure: Annotated[Float, "U measures"]
+    tally: Annotated[Index, "3"]
+    """Evaluations of F, evaluations of J, and steps, summed over calls."""
+    lower: Annotated[Float, "3 M K", READONLY]
+    electrodes: Annotated[Index, "U N"]
+    """In each row, first the electrodes with unknowns."""
+    still: Annotated[Float, "U K"]
+    """Potential of the electrodes without unknowns."""
+    still_std: Annotated[Float, "U 3N"]
+    """Standard deviation of the coordinates that are not unknowns."""
+    turn: Annotated[Index, "1"]
+    """Number of the frame; says which wire gets a new inverse where inverses are reused."""
+    step_limit: float
+    """First trust radius, pitches a coordinate."""
+    point: Annotated[Float, "3E"]
+    """Coordinates of the electrodes with unknowns."""
+    raw: Annotated[Float, "3E K"]
+    """Jacobian of F at ``point``, transposed."""
+    work: Work
+
+
+class FrameArrays(ArrayTable):
+    """The stream of a patch and the frame at hand."""
+
+    codes: Annotated[NDArray[np.uint32], "U K"]
+    baseline_ohm: Annotated[Float, "U K"]
+    code_gain: Annotated[Float, "U K"]
+    rounding_ohm: Annotated[Float, "U K"]
+    code_map: Annotated[Float, "4"]
+    """R/R0 of code 0, that of a step, the highest code, and the converter's relative noise."""
+    ohm: Annotated[Float, "U K"]
+    noise: Annotated[Float, "U K"]
+    """Standard deviation of the resistance, relative to it."""
+    valid: Annotated[Mask, "U K"]
+    gain: Annotated[Float, "U K"]
+    """a / R."""
+    a: Annotated[Float, "U K"]
+    """Resistance in the units of the problem."""
+    weight: Annotated[Float, "U K"]
+    """σ over the standard deviation; 0 where that is not known or the resistance is not valid."""
+    used: Annotated[Float, "U K"]
+    """``weight``, but 0 also where a is out of range."""
+    todo: Annotated[Bytes, "U"]
+    """LEAVE, SOLVE, PREDICT or HOLD."""
+    order: Annotated[Index, "U"]
+    """The wires in the order in which they have their turn."""
+    first: int
+    """HOLD or PREDICT: what to do with a wire that can be predicted."""
+    pitch_m: float
+    x: Annotated[Float, "U 3N"]
+    """Last trusted position."""
+    a_solved: Annotated[Float, "U K"]
+    """The a of that position."""
+    weight_solved: Annotated[Float, "U K"]
+    """Weights for which the inverse of each wire was made."""
+    predictable: Annotated[Mask, "U"]
+    """Wires whose inverse in the solver belongs to their x."""
+    unknowns: Annotated[Index, "U"]
+    """Unknowns of each wire."""
+    rest: Annotated[Float, "U 3N"]
+    rest_branch: Annotated[Index, "U"]
+    """Sign of det J at rest."""
+    clearance: Annotated[Float, "U N"]
+    good: Annotated[Mask, "U"]
+    """Wires that the solver brought to an acceptable root."""
+    status: Annotated[Index, "U"]
+    moved_m: Annotated[Float, "U 3N"]
+    """Displacement."""
+    std_m: Annotated[Float, "U 3N"]
+    """Its standard deviation."""
+    held: Annotated[Mask, "U"]
+
+    def __init__(self, problem: PatchProblem, rest_branch: Index, unknowns: Index, first: int) -> None:
+        shape, rest = problem.layout.shape, problem.rest
+        upper = shape[0]
+        self.outcome_m = np.empty((2, *problem.layout.upper_m.shape))
+        """(2, U, N, 3) displacement and its standard deviation."""
+        moved_m, std_m = self.outcome_m.reshape(2, *rest.shape)
+        baseline_ohm, code_gain, rounding_ohm = np.ones((3, *shape))
+        ohm, noise, a, weight, used = np.empty((5, *shape))
+        super().__init__(
+            codes=np.zeros(shape, np.uint32),
+            baseline_ohm=baseline_ohm,
+            code_gain=code_gain,
+            rounding_ohm=rounding_ohm,
+            code_map=np.zeros(4),
+            ohm=ohm,
+            noise=noise,
+            valid=np.empty(shape, np.bool_),
+            gain=problem.gain.copy(),
+            a=a,
+            weight=weight,
+            used=used,
+            todo=np.empty(upper, np.uint8),
+            order=np.arange(upper),
+            first=first,
+            pitch_m=problem.layout.pitch_m,
+            x=rest.copy(),
+            a_solved=problem.a_rest.copy(),
+            weight_solved=np.ones(shape),
+            predictable=np.zeros(upper, np.bool_),
+            unknowns=unknowns,
+            rest=rest.copy(),
+            rest_branch=rest_branch,
+            clearance=problem.clearance.copy(),
+            good=np.empty(upper, np.bool_),
+            status=np.zeros(upper, np.int64),
+            moved_m=moved_m,
+            std_m=std_m,
+            held=np.empty(upper, np.bool_),
+        )
+
+    def set_codes(self, codes: CodeMap) -> None:
+        """Set what codes mean from now on."""
+        self.baseline_ohm[:], self.rounding_ohm[:] = codes.baseline_ohm, codes.rounding_ohm
+        self.code_gain[:] = 1.0 if codes.gain is None else codes.gain
+        self.code_map[:] = codes.lo, codes.step, codes.steps, codes.relative_noise
+
+
+read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
+"""In kernels: the fields of a table."""

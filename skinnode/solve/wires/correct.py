@@ -1,0 +1,218 @@
+"""The corrector: bring one wire to a root of r = w (a F − 1) with an operator, compiled.
+
+A wire is solved for all coordinates of its electrodes, or for fewer: some electrodes only, the others at
+rest, and z only (``normal_only``). Fewer unknowns than equations make a tall system, whose χ² = Σ (ρ_k/σ_k)²
+at the minimum is a test: above its 1 − 1e-9 quantile no position explains the frame, and the wire is
+ILL_CONDITIONED; from the 95 % quantile on the standard deviations grow by √(χ²/dof) (Birge, Phys. Rev. 40,
+207, 1932). This replaces the sign of det J, which only a square system has.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from skinnode.compiled.jit import njit_part
+from skinnode.model.kernels import potential_jacobian
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index, dot, largest
+from skinnode.solve.operators.steps import (
+    ACCEPTED,
+    CONVERGED,
+    EPS,
+    ERROR,
+    ILL_CONDITIONED,
+    LIMIT,
+    MAX_STEPS,
+    NORM,
+    OUTSIDE,
+    ROOT_SHARE,
+    SIGN,
+    TRY,
+    begin,
+    certify,
+    judge,
+    propose,
+    shorten,
+)
+from skinnode.solve.roots import Z_REFUSE
+from skinnode.solve.wires.arrays import (
+    BRANCH,
+    CHI2,
+    COVARIANCE,
+    ERROR_ESTIMATE,
+    OPTIMALITY,
+    RESIDUAL,
+    SKIP,
+    SolveOptions,
+    SolverArrays,
+)
+from skinnode.solve.wires.hold import chi2_quantile_part
+
+DATA_ROUNDING: Final = 2.0
+"""Relative error of an a F, in eps: R, the gain, their product and F are rounded to half an eps each."""
+
+Z_95_ONE_SIDED: Final = 1.645
+"""Normal deviate below which 95 % of a normal distribution lie."""
+
+
+@njit_part
+def _data_rounding(inverse: Float, weight: Float) -> float:
+    """What rounding of the resistances leaves open of the largest coordinate: ``inverse`` (n, K) ∂x/∂r."""
+    top = 0.0
+    for j in range(inverse.shape[0]):
+        row, total = inverse[j], 0.0
+        for k in range(row.size):
+            total += abs(row[k]) * weight[k]
+        top = max(top, total)
+    return DATA_ROUNDING * EPS * top
+
+
+@njit_part
+def _evaluate(
+    x: Float, point: Float, still: Float, lower: Float, a: Float, weight: Float, r: Float, raw: Float
+) -> None:
+    """Evaluate r = w (a F − 1) and the Jacobian of F at the unknowns ``x``, put into ``point``.
+
+    ``still`` (K,) is the potential of the electrodes that are not in ``point``.
+    """
+    if x.size == point.size:
+        for j in range(x.size):
+            point[j] = x[j]
+    else:
+        for j in range(x.size):
+            point[3 * j + 2] = x[j]
+    potential_jacobian(point, lower, r, raw)
+    for k in range(r.size):
+        r[k] = weight[k] * (a[k] * (r[k] + still[k]) - 1.0)
+
+
+@njit_part
+def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
+    """Write ∂r/∂x of the unknowns into ``jt`` from ∂F/∂x of all coordinates."""
+    normal_only = jt.shape[0] != raw.shape[0]
+    for j in range(jt.shape[0]):
+        target, source = jt[j], raw[3 * j + 2 if normal_only else j]
+        for k in range(a.size):
+            target[k] = source[k] * (weight[k] * a[k])
+
+
+@njit_part
+def coordinate(electrodes: Index, j: int, each: int) -> int:
+    """Return where unknown ``j`` is in a wire's 3N coordinates, with three or one (z) unknowns an
+    electrode."""
+    if each == 3:
+        return int(3 * electrodes[j // 3] + j % 3)
+    return int(3 * electrodes[j] + 2)
+
+
+@njit_part
+def _optimality(jt: Float, r: Float) -> float:
+    top = 0.0
+    for j in range(jt.shape[0]):
+        top = max(top, abs(dot(jt[j], r)))
+    return top
+
+
+@njit_part
+def correct(
+    u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, steps: int,
+) -> tuple[int, int, int, int, bool]:  # fmt: skip
+    """Iterate from the x of the workspace until wire ``u`` converges or fails.
+
+    ``steps`` is the number of steps taken before. Returns status, evaluations of F, evaluations of J, steps
+    in all, and whether the wire was skipped (see SKIP).
+    """
+    w: Any = solver.work
+    operator, tasks, tol_f, tol_x = options.operator, options.tasks, options.tol_f, options.tol_x
+    lower, point, raw, still_u = solver.lower, solver.point, solver.raw, solver.still[u]
+    tall = w.r.size > w.x.size
+    _evaluate(w.x, point, still_u, lower, a_u, w_u, w.r, raw)
+    _take_jacobian(raw, a_u, w_u, w.jt)
+    evaluations, jacobians = 1, 1
+    w.s[LIMIT] = solver.step_limit
+    status = begin(w)
+    if tasks & SKIP and status == TRY and _optimality(w.jt, w.r) <= tol_f:
+        w.s[ERROR] = 0.0
+        return CONVERGED, evaluations, jacobians, steps, True
+    while status < 0:
+        # with the noise known, a minimum is near when less than tol_f is left in the range of J
+        tol_r = tol_f
+        if tall and sigma > 0.0:
+            tol_r = min(0.1, tol_f / max(tol_f, w.s[NORM]))
+        status = propose(operator, w, tol_r, tol_x)
+        if status == OUTSIDE:
+            status = shorten(operator, w)
+        if status != TRY:
+            break
+        if steps == options.max_steps:
+            status = MAX_STEPS
+            break
+        steps += 1
+        evaluations += 1
+        jacobians += 1
+        _evaluate(w.trial, point, still_u, lower, a_u, w_u, w.r_trial, raw)
+        status = judge(operator, w, tol_r, tol_x)
+        if status == ACCEPTED:
+            _take_jacobian(raw, a_u, w_u, w.jt)
+    return status, evaluations, jacobians, steps, False
+
+
+@njit_part
+def report_correction(
+    u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
+    status: int, skipped: bool,
+) -> int:  # fmt: skip
+    """Write x, report and measures of wire ``u``, which :func:`correct` left with ``status``.
+
+    ``count`` is its number of equations. Also writes the inverse and what belongs to it if COVARIANCE is
+    among the tasks. Returns the status, ILL_CONDITIONED if the root is too badly determined.
+    """
+    w: Any = solver.work
+    unknowns, tol_f = w.x.size, options.tol_f
+    tall = w.r.size > unknowns
+    each = 1 if unknowns < solver.point.size else 3
+    x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
+    for j in range(unknowns):
+        value = w.x[j]
+        if status == CONVERGED and not skipped:  # the correction that proved convergence, for nothing
+            value += w.newton[j]
+        x_u[coordinate(electrodes, j, each)] = value
+    measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)
+    measure[OPTIMALITY] = _optimality(w.jt, w.r)
+    if status != CONVERGED:
+        return status
+    solver.report[u, BRANCH] = w.flag[SIGN]
+    measure[ERROR_ESTIMATE] = w.s[ERROR]
+    square = dot(w.r, w.r) / (sigma * sigma + tol_f * tol_f)
+    measure[CHI2] = square if tall else 0.0
+    if not options.tasks & COVARIANCE:
+        return status
+    inverse_u = solver.inverse[u]
+    share = certify(w, inverse_u)
+    measure[ERROR_ESTIMATE] = share * max(1.0, largest(w.x)) + _data_rounding(inverse_u, w_u)
+    if not share <= ROOT_SHARE:
+        return ILL_CONDITIONED
+    a_solved, noise = solver.a_solved[u], solver.noise[u]
+    for k in range(w.r.size):
+        a_solved[k] = 1.0
+        noise[k] = math.inf
+        if w_u[k] > 0.0:
+            a_solved[k] = a_u[k] / (1.0 + w.r[k] / w_u[k]) if tall else a_u[k]
+            noise[k] = (sigma / w_u[k]) ** 2
+    spare = count - unknowns
+    scale = sigma
+    if spare > 0 and sigma > 0.0:
+        if square > chi2_quantile_part(spare, Z_95_ONE_SIDED):  # Birge's ratio
+            scale *= math.sqrt(square / spare)
+        if not square <= chi2_quantile_part(spare, Z_REFUSE):
+            status = ILL_CONDITIONED
+    std, still_std = solver.std[u], solver.still_std[u]
+    for j in range(x_u.size):
+        std[j] = still_std[j]
+    for j in range(unknowns):
+        row = inverse_u[j]
+        std[coordinate(electrodes, j, each)] = scale * math.sqrt(dot(row, row))
+        for k in range(row.size):
+            row[k] *= w_u[k]
+    return status

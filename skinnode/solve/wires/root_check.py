@@ -1,0 +1,96 @@
+"""Which of the roots just found may be wrong, compiled: for the tracker, which decides what to do about
+them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.array_table import ArrayTable, reader
+from skinnode.compiled.jit import njit_brief, njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.operators.steps import CONVERGED
+from skinnode.solve.wires.stages import DEADLINE
+
+Mask = NDArray[np.bool_]
+
+# What the check may find, or-ed together
+SOME_SUSPECT: Final = 1
+SOME_ROUGH: Final = 2
+
+
+class RootCheck(ArrayTable):
+    """The field just solved, the limits it is checked against, and what the check finds."""
+
+    moved_m: Annotated[Float, "U N 3"]
+    """Displacement."""
+    last_m: Annotated[Float, "U N 3"]
+    """Displacement of the frame before."""
+    status: Annotated[Index, "U"]
+    held: Annotated[Mask, "U"]
+    folded: Annotated[Mask, "U"]
+    """Wires on which presses run into folds of F."""
+    whitening: Annotated[Float, "U N N"]
+    """Inverse of the Cholesky factor of C of one coordinate (see ``Smoothness``)."""
+    lost: Annotated[Mask, "U"]
+    """Found: wires without a root."""
+    unsure: Annotated[Mask, "U"]
+    """Found: solved wires that are folded or moved by more than ``jump_m``."""
+    rough: Annotated[Mask, "U"]
+    """Found: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
+    jump_m: float
+    far_m: float
+    pitch_m: float
+    rough_limit: float
+    """Roughness over the length of the displacement."""
+
+
+_read = reader(RootCheck)
+
+
+@njit_part
+def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> bool:
+    """Whether √(uᵀ C⁻¹ u) of a displacement (N, 3) is above ``limit`` times its length."""
+    rough, size = 0.0, 0.0
+    for j in range(3):
+        for i in range(moved_m.shape[0]):
+            size += (moved_m[i, j] / pitch_m) ** 2
+            white = 0.0
+            for k in range(i + 1):
+                white += whitening[i, k] * moved_m[k, j]
+            rough += (white / pitch_m) ** 2
+    return rough > limit * limit * size
+
+
+@njit_brief
+def check_roots(table: Index) -> int:
+    """Write ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck` from its other fields.
+
+    Returns SOME_SUSPECT if any wire is lost or unsure and SOME_ROUGH if any is rough, or-ed together.
+    """
+    check = _read(table)
+    moved_m, last_m, status = check.moved_m, check.last_m, check.status
+    held, folded, whitening = check.held, check.folded, check.whitening
+    lost, unsure, rough = check.lost, check.unsure, check.rough
+    jump_m, far_m, pitch_m, limit = check.jump_m, check.far_m, check.pitch_m, check.rough_limit
+    found = 0
+    for u in range(status.size):
+        solved = status[u] == CONVERGED
+        lost[u] = not solved and status[u] != DEADLINE
+        solved = solved and not held[u]
+        jumped = 0.0
+        size = 0.0
+        for i in range(moved_m.shape[1]):
+            for j in range(3):
+                jumped = max(jumped, abs(moved_m[u, i, j] - last_m[u, i, j]))
+                size = max(size, abs(moved_m[u, i, j]))
+        unsure[u] = solved and (folded[u] != 0 or jumped > jump_m)
+        rough[u] = solved and size > far_m and _rougher(moved_m[u], pitch_m, whitening[u], limit)
+        if lost[u] or unsure[u]:
+            found |= SOME_SUSPECT
+        if rough[u]:
+            found |= SOME_ROUGH
+    return found

@@ -1,0 +1,212 @@
+"""All upper wires of a patch in one compiled call that holds no GIL and allocates nothing.
+
+Each wire is held where it is (``hold``), followed with the inverse at hand (``follow``), or corrected with an
+operator (``correct``), in that order, until one of the three ends at a root.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit_body, njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index, dot, largest
+from skinnode.solve.operators.steps import CONVERGED, ILL_CONDITIONED, NON_FINITE, TRY
+from skinnode.solve.wires import arrays as wires
+from skinnode.solve.wires.arrays import SolveOptions, SolverArrays
+from skinnode.solve.wires.correct import coordinate, correct, report_correction
+from skinnode.solve.wires.decode import A_MAX, A_MIN
+from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_deviations
+from skinnode.solve.wires.hold import within_noise
+
+REFRESH: Final = 8
+"""Maximum number of frames in a row for which a followed wire keeps its inverse; wires take turns to renew
+it."""
+COVARIANCE_UNITS: Final = 3.0
+"""Cost of a covariance, in evaluations of F and J with their step, of a square system of 30 unknowns."""
+HELD_UNITS: Final = 0.25
+"""Cost of finding that a wire can be held."""
+
+
+@njit_part
+def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
+    """Set a to 1 and weight to 0 where either is unusable; return the numbers of equations kept and lost."""
+    count, lost = 0, 0
+    for k in range(a.size):
+        if weight[k] > 0.0:
+            if A_MIN < a[k] < A_MAX:
+                count += 1
+                continue
+            lost += 1
+        a[k] = 1.0
+        weight[k] = 0.0
+    return count, lost
+
+
+@njit_part
+def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, tol_f: float) -> bool:
+    """Hold wire ``u`` if its residual is within noise; write its RESIDUAL and standard deviations."""
+    w: Any = solver.work
+    held = within_noise(
+        a, weight, sigma, tol_f, solver.a_solved[u], solver.noise[u], solver.inverse[u], w.x.size,
+        w.e, w.r, w.r_trial, w.newton,
+    )  # fmt: skip
+    if held < 0.0:
+        return False
+    solver.measure[u, wires.RESIDUAL] = held
+    each = 1 if w.x.size < solver.point.size else 3
+    std, still_std, electrodes = solver.std[u], solver.still_std[u], solver.electrodes[u]
+    for j in range(std.size):
+        std[j] = still_std[j]
+    for j in range(w.x.size):
+        std[coordinate(electrodes, j, each)] = w.newton[j]
+    return True
+
+
+@njit_part
+def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
+    """Move the x of the workspace by (∂x/∂a) (a − a of the last solve); return the largest move."""
+    w: Any = solver.work
+    a_solved = solver.a_solved[u]
+    for k in range(a.size):
+        w.e[k] = a[k] / a_solved[k] - 1.0 if weight[k] > 0.0 else 0.0
+    moved = newton_step(solver.inverse[u], w.e, w.newton)
+    for j in range(w.x.size):
+        w.x[j] += w.newton[j]
+    return moved
+
+
+@njit_part
+def _follow(
+    u: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, moved: float
+) -> tuple[int, int, bool]:
+    """Follow wire ``u`` after a prediction by ``moved``; evaluations, steps, and whether its inverse still
+    holds."""
+    w: Any = solver.work
+    evaluations, steps, first = follow(
+        w.x, solver.lower, a, solver.inverse[u], moved, options.tol_f, options.tol_x, w.e, w.newton
+    )
+    followed = evaluations > 0 and first <= FRESH and (solver.turn[0] + u) % REFRESH != 0
+    if evaluations > 0 and not followed:
+        for j in range(w.x.size):
+            w.x[j] += w.newton[j]
+        steps += 1
+    return abs(evaluations), steps, followed
+
+
+@njit_part
+def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, count: int) -> None:
+    """Write x, measures and standard deviations of wire ``u``, which was followed to a root."""
+    w: Any = solver.work
+    x_u, measure, a_solved, noise = solver.x[u], solver.measure[u], solver.a_solved[u], solver.noise[u]
+    for j in range(w.x.size):
+        x_u[j] = w.x[j] + w.newton[j]
+    measure[wires.ERROR_ESTIMATE] = largest(w.newton)
+    measure[wires.CHI2] = 0.0
+    for k in range(a.size):
+        w.r[k] = weight[k] * w.e[k]
+        a_solved[k] = a[k]
+        noise[k] = (sigma / weight[k]) ** 2
+    measure[wires.RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)
+    standard_deviations(solver.inverse[u], noise, solver.std[u])
+
+
+@njit_part
+def _solve_wire(
+    u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
+) -> float:
+    """Solve wire ``u``; return what that cost, in evaluations of F and J with their step."""
+    w: Any = solver.work
+    point, x_u, electrodes = solver.point, solver.x[u], solver.electrodes[u]
+    report, measure, std = solver.report[u], solver.measure[u], solver.std[u]
+    unknowns = w.x.size
+    tall = a.size > unknowns
+    each = 1 if unknowns < point.size else 3
+    report[wires.TURN] = 1
+    count, lost = _drop_unusable(a, weight)
+    status = TRY
+    if count < unknowns or count == 0:
+        status = ILL_CONDITIONED if lost == 0 else NON_FINITE
+    evaluations, jacobians, steps, held, followed = 0, 0, 0, False, False
+    report[wires.BRANCH] = 0
+    report[wires.SPARE] = count - unknowns
+    measure[wires.CHI2] = math.inf
+    measure[wires.RESIDUAL] = math.inf
+    measure[wires.OPTIMALITY] = math.inf
+    measure[wires.ERROR_ESTIMATE] = math.inf
+    for j in range(x_u.size):
+        std[j] = math.inf
+    if status == TRY and todo == wires.HOLD:
+        held = _hold(u, solver, a, weight, sigma, options.tol_f)
+        if held:
+            status = CONVERGED
+    report[wires.HELD] = 1 if held else 0
+    if status == TRY:
+        for i in range(point.size):
+            point[i] = x_u[coordinate(electrodes, i, 3)]
+        for j in range(unknowns):
+            w.x[j] = x_u[coordinate(electrodes, j, each)]
+        if todo != wires.SOLVE:
+            moved = _predict(u, solver, a, weight)
+            if options.tasks & wires.REUSE and not tall and unknowns == point.size == x_u.size:
+                evaluations, steps, followed = _follow(u, solver, options, a, weight, moved)
+        if followed:
+            status = CONVERGED
+            _report_followed(u, solver, a, weight, sigma, count)
+        else:
+            status, more, jacobians, steps, skipped = correct(u, solver, options, a, weight, sigma, steps)
+            evaluations += more
+            status = report_correction(u, solver, options, a, weight, sigma, count, status, skipped)
+    report[wires.STATUS] = status
+    report[wires.EVALUATIONS] = evaluations
+    report[wires.STEPS] = steps
+    tally = solver.tally
+    tally[0] += evaluations
+    tally[1] += jacobians
+    tally[2] += steps
+    if held:
+        return HELD_UNITS
+    if evaluations > 0:
+        return evaluations + (0.0 if followed else COVARIANCE_UNITS)
+    return 0.0
+
+
+@njit_body
+def solve_wires(
+    solver: SolverArrays,
+    options: SolveOptions,
+    todo: NDArray[np.uint8],
+    a: Float,
+    weight: Float,
+    order: Index,
+    sigma: float,
+    units: float,
+) -> float:
+    """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, each from its x in ``solver``.
+
+    Args:
+        solver: start and results; ``x`` and ``inverse`` are those of the last converged solve.
+        options: operator, tasks and tolerances.
+        todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
+        a: (U, K); an a out of range is overwritten by 1 and its weight by 0.
+        weight: (U, K); 0 drops an equation.
+        order: (U,) wires in the order in which they have their turn.
+        sigma: standard deviation of a residual of weight 1, 0 if not known.
+        units: time allowed, in evaluations of F and J with their step. A wire that may need more than what is
+            left ends the call.
+
+    Returns the estimated time spent, in the same units. A wire with fewer equations than unknowns keeps its x
+    and is ILL_CONDITIONED, or NON_FINITE if an ``a`` lost its weight.
+    """
+    spent, worst = 0.0, options.max_steps + 1 + COVARIANCE_UNITS
+    for u in order:
+        if todo[u] == wires.LEAVE:
+            continue
+        if spent + worst > units:
+            break
+        spent += _solve_wire(u, todo[u], solver, options, a[u], weight[u], sigma)
+    return spent

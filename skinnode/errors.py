@@ -12,8 +12,8 @@
      │     └ SdoAbort              code and text of CiA 301
      └ CodecError(ValueError)      a payload that is not what its COB-ID promises
 
-A lost chunk, a stale patch or a solve that did not converge are normal life: they are statuses and
-counters, never exceptions. Arguments of the wrong shape are plain ``ValueError``.
+A lost chunk, a stale patch or a solve that did not converge is normal operation: a status and a counter,
+never an exception. An argument of the wrong shape is a plain ``ValueError``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from skinnode.text.words import counted
 
 
 class SkinError(Exception):
-    """Root of all errors of this project. ``str(error)`` is one line fit for a technician."""
+    """Root of all errors of this project. ``str(error)`` is one line that a technician can act on."""
 
 
 class Shown(str):
@@ -37,7 +37,7 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""What was got where a key is missing."""
+"""Value that a message shows where a key is missing."""
 
 _MOST_SHOWN: Final = 240
 
@@ -45,8 +45,11 @@ _MOST_SHOWN: Final = 240
 class ConfigError(SkinError, ValueError):
     """A configuration value that cannot be used.
 
-    ``key`` is the dotted path of the value (``patches[1].node_id``), ``got`` the value found there
-    (None: nothing) and ``allowed`` a phrase that says what is accepted.
+    Args:
+        key: Dotted path of the value, such as ``patches[1].node_id``, or name of the option.
+        got: Value found there; None if there is none.
+        allowed: Phrase that says what is accepted.
+        where: File, line and column of the value, if known.
     """
 
     def __init__(self, key: str, got: object, allowed: str, *, where: str = "") -> None:
@@ -63,7 +66,7 @@ class ProfileError(ConfigError):
 
 
 class BusLoadError(ConfigError):
-    """A plan that needs more of a bus than it may use: ``needed`` and ``available``, shares of the bus."""
+    """A plan that needs more of a bus than it may use. ``needed`` and ``available`` are shares of the bus."""
 
     def __init__(  # noqa: PLR0913 - one argument for each part of the message
         self, key: str, got: object, allowed: str, *, needed: float, available: float, where: str = ""
@@ -97,7 +100,7 @@ class SdoAbort(NodeError):
 
 
 class CodecError(SkinError, ValueError):
-    """A payload that cannot be decoded. Carries ``cob_id`` and the bytes."""
+    """A payload that cannot be decoded. ``cob_id`` and ``data`` are those of the frame."""
 
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed

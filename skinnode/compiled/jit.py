@@ -1,13 +1,13 @@
-"""The one way kernels are compiled here: ``@njit`` with a cache that cannot go stale.
+"""Compiles kernels: ``@njit`` with a cache that cannot go stale.
 
-A file cache notices an edit to the file of a function, not to the functions it calls in other files. So the
-cache (:mod:`skinnode.compiled.kernel_cache`) is in a folder named after a digest of every file that holds
+A file cache notices an edit to the file of a function, but not to the functions it calls in other files. So
+the cache (:mod:`skinnode.compiled.kernel_cache`) is in a folder named after a digest of every file that holds
 kernels: an edit to any of them recompiles all of them. The folder is below ``$SKINNODE_CACHE_DIR``, the
 user's cache folder or the system's temporary folder, the first that is writable; if none is, nothing is
 cached.
 
 ``error_model="numpy"`` because a division by zero must become inf (a status), not an exception; ``nogil``
-because patches are solved side by side on a thread pool. ``fastmath`` stays off: results must not depend on
+because a thread pool solves several patches at a time. ``fastmath`` stays off: results must not depend on
 how a compiler reorders sums.
 """
 
@@ -51,7 +51,7 @@ def _writable(folder: Path) -> bool:
 
 @functools.cache
 def cache_dir() -> Path | None:
-    """Folder of the compiled kernels, or None where no folder can be written."""
+    """Return the folder of the compiled kernels, or None if no folder can be written."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for pattern in _KERNEL_FILES:
@@ -68,7 +68,10 @@ def cache_dir() -> Path | None:
 
 
 def is_cold(kernel: str = "solve_patch") -> bool:
-    """True when ``kernel`` still has to be compiled, so that a command can say why it takes its time."""
+    """Return whether ``kernel`` still has to be compiled.
+
+    Commands ask so that they can say why they take longer.
+    """
     folder = cache_dir()
     return folder is None or not any(folder.glob(f"*.{kernel}-*{SUFFIX}"))
 
@@ -77,7 +80,7 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def njit_part(function: _F) -> _F:
-    """Compile ``function`` for other kernels only: Python cannot call it, and its code is kept with theirs.
+    """Compile ``function`` for other kernels only: Python cannot call it, and its code is cached with theirs.
 
     Building no entry for Python saves a fifth of the compile time.
     """
@@ -86,20 +89,25 @@ def njit_part(function: _F) -> _F:
 
 
 def njit_body(function: _F) -> _F:
-    """Copy ``function`` into the one kernel that calls it, before anything is compiled: to compile both, one
-    linked into the other, takes half as long again."""
+    """Copy ``function`` into the one kernel that calls it, before anything is compiled.
+
+    Compiling both and linking one into the other takes half as long again.
+    """
     compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
     return compiled
 
 
 def njit(function: _F) -> _F:
-    """Compile ``function`` on its first call; the compiled code is kept in :func:`cache_dir`."""
+    """Compile ``function`` on its first call, and cache the compiled code in :func:`cache_dir`."""
     return _kept(function, nogil=True)
 
 
 def njit_brief(function: _F) -> _F:
-    """The same for what takes a microsecond: it keeps the interpreter's lock. To let go of it would let
-    another thread in, and that may have it for longer than the whole rest of a field takes."""
+    """Compile ``function`` as :func:`njit` does, but keep the interpreter lock while it runs.
+
+    It is for kernels that take a microsecond: releasing the lock would let another thread take it for longer
+    than the rest of the field needs.
+    """
     return _kept(function, nogil=False)
 
 

@@ -1,6 +1,6 @@
 """Compiled kernels in files that are checked before they are used.
 
-Numba's own file cache unpickles whatever it finds: a truncated file raises in the first call of a kernel, on
+Numba's own file cache unpickles any file it finds: a truncated file raises in the first call of a kernel, on
 every run, and machine code with a flipped bit is executed. All signatures of a function share one index, so
 two processes that compile different signatures at once can file the code of one under the name of the other.
 
@@ -42,8 +42,14 @@ _reported: set[str] = set()
 
 
 class KernelCache:
-    """Cache of the compiled signatures of ``function``, in ``folder``; replaces
-    ``numba.core.caching.FunctionCache`` as the ``_cache`` of a dispatcher."""
+    """Cache of the compiled signatures of a function.
+
+    It replaces ``numba.core.caching.FunctionCache`` as the ``_cache`` of a dispatcher.
+
+    Args:
+        function: The Python function.
+        folder: Folder of the cache files.
+    """
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
         code = function.__code__
@@ -58,7 +64,7 @@ class KernelCache:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Load the compiled ``signature``. Returns None if there is no usable file."""
+        """Load the compiled ``signature``. Return None if there is no usable file."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
@@ -130,8 +136,10 @@ def _write(path: Path, payload: bytes) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Remove all damaged files of ``folder`` together, so that one line reports them. If several processes
-    find the damage, the first removes the files and reports them."""
+    """Remove all damaged files of ``folder`` together, so that one line reports them.
+
+    If several processes find the damage, the first removes the files and reports them.
+    """
     with _locked(folder):
         files = list(folder.glob(f"*{SUFFIX}"))
         damaged = [file for file in files if _is_damaged(file)]

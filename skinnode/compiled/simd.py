@@ -1,11 +1,11 @@
 """Vectors of doubles for kernels, written out where the compiler's own vectors are not good enough.
 
-LLVM prefers 256-bit vectors where 512-bit ones are twice as fast, gives up where it cannot prove that rows
-do not overlap, and may keep sums in memory. A kernel that says ``load``, ``fma``, ``store`` gets exactly
-those instructions, and each lane holds its own sum, in the order written: the result is one for any number
-of threads and any split of the columns. Processors with narrower vectors run the same code in pieces.
+LLVM prefers 256-bit vectors where 512-bit vectors are twice as fast, gives up if it cannot prove that rows do
+not overlap, and may keep sums in memory. A kernel that says ``load``, ``fma``, ``store`` gets exactly those
+instructions, and each lane holds its own sum, in the order written: the result is the same for any number of
+threads and any split of the columns. Processors with narrower vectors run the same code in pieces.
 
-Lanes behave like numbers under + − *; a double beside them stands for a vector of it.
+Lanes behave like numbers under + − *; a double in such an expression stands for a vector of it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ signature: Any = templates.signature
 
 
 def _lanes() -> int:
-    """8 doubles where the processor, or what numba is told to compile for, has 512-bit vectors, else 4."""
+    """Return 8 if numba compiles for 512-bit vectors, else 4."""
     chosen = numba.config.CPU_FEATURES
     if chosen is not None or numba.config.CPU_NAME is not None:
         return 8 if "+avx512f" in (chosen or "") else 4
@@ -42,13 +42,12 @@ def _lanes() -> int:
 
 LANES: Final = _lanes()
 Lanes = Any
-"""LANES doubles; known to compiled code only."""
+"""Type of LANES doubles; it exists in compiled code only."""
 
 _DOUBLE = ir.DoubleType()
 _INT = ir.IntType(64)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)
 _BITS = ir.VectorType(_INT, LANES)
-_MASK = ir.VectorType(ir.IntType(1), LANES)
 
 
 class _LanesType(types.Type):  # type: ignore[misc]  # numba has no types for its types
@@ -70,7 +69,7 @@ def _constant(vector: Any, value: Any) -> Any:
 
 
 def _splat(builder: Any, value: Any) -> Any:
-    """``value`` as a vector: a double in every lane, a vector as it is."""
+    """Return ``value`` as a vector: a double in every lane, a vector unchanged."""
     if value.type == _VECTOR:
         return value
     seed = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -128,8 +127,15 @@ _binary(operator.mul, operator.imul, "fmul")
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
-    """LANES elements of ``row`` (doubles, side by side) from ``start`` on; zeros in place of all but the
-    first ``count``, which are not touched."""
+    """Load LANES elements of a row from ``start`` on.
+
+    Only the first ``count`` elements are read; the other lanes are 0.
+
+    Args:
+        row: Contiguous row of float64.
+        start: Index of the first element.
+        count: Number of elements to read.
+    """
     _require_row(row)
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -143,7 +149,14 @@ def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def store(_typing: Any, row: Any, start: Any, count: Any, value: Any) -> Any:
-    """The first ``count`` lanes of ``value`` into ``row`` from ``start`` on."""
+    """Store the first ``count`` lanes of ``value`` into a row from ``start`` on.
+
+    Args:
+        row: Contiguous row of float64.
+        start: Index of the first element.
+        count: Number of lanes to store.
+        value: The lanes.
+    """
     _require_row(row)
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -158,7 +171,7 @@ def store(_typing: Any, row: Any, start: Any, count: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def splat(_typing: Any, value: Any) -> Any:
-    """``value`` in every lane."""
+    """Return a vector with ``value`` in every lane."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         return _splat(builder, arguments[0])
@@ -168,7 +181,7 @@ def splat(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """a·b + c, rounded once where the processor can."""
+    """Return a·b + c, rounded once where the processor can."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         inputs = [_splat(builder, argument) for argument in arguments]
@@ -179,7 +192,7 @@ def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def drop(_typing: Any, value: Any, count: Any) -> Any:
-    """``value`` with zeros in its first ``count`` lanes."""
+    """Return ``value`` with zeros in its first ``count`` lanes."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         return builder.select(_first(builder, arguments[1]), ir.Constant(_VECTOR, None), arguments[0])
@@ -189,7 +202,7 @@ def drop(_typing: Any, value: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
-    """Sum of the lanes, halves first."""
+    """Return the sum of the lanes, halves first."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         value, width = arguments[0], LANES
@@ -205,8 +218,10 @@ def total(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def rough_inverse_root(_typing: Any, value: Any) -> Any:
-    """1 / √value to 3.5 % from the bits of value (Lomont, Fast inverse square root, 2003, for doubles);
-    inf below the smallest normal number."""
+    """Return 1 / √value to 3.5 %, from the bits of ``value``; inf below the smallest normal number.
+
+    Source: Lomont, Fast inverse square root, 2003, for doubles.
+    """
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         bits = builder.bitcast(arguments[0], _BITS)

@@ -1,10 +1,15 @@
-"""The options of a hand, read from ``hand.toml``: one module for each room of the file.
+"""The options of a hand, read from ``hand.toml``: one module for each table of the file.
 
-:func:`load_hand` reads a file, :func:`parse_hand` a table that is already in memory. Both raise
-:class:`~skinnode.errors.ConfigError` with one line: file, line and column, the dotted key, what was found
-there and what is allowed. Types are strict, as TOML is typed: ``node_id = "3"`` is an error, not a 3.
+::
 
-Units are the suffixes of the keys; everything without one is a count, a ratio or a name.
+    file -> toml_text (values, positions) -> hand, buses, patches, running, simulation (pydantic models)
+         -> HandConfig, or explain (one-line errors)
+
+:func:`load_hand` reads a file, :func:`parse_hand` validates a table in memory. Both raise
+:class:`~skinnode.errors.ConfigError` with one line: file, line and column, the dotted key, the value found
+and the values allowed. Types are strict, as TOML is typed: ``node_id = "3"`` is an error, not a 3.
+
+The suffix of a key is its unit; a key without a unit is a count, a ratio or a name.
 """
 
 from skinnode.config.buses import (

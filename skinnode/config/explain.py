@@ -1,4 +1,8 @@
-"""Errors of pydantic in the words of this project: the key, what it got, what is allowed, and where."""
+"""Explains validation errors of pydantic in one line: key, value found, values allowed, position.
+
+Positions are the reason that these lines are written here: pydantic knows the key but not the line of the
+file, and its own text names Python types ("Input should be a valid integer"), not the range allowed in TOML.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,13 @@ _LONGEST_SHOWN: Final = 60
 def first_error(
     error: ValidationError, table: type[BaseModel], where: Callable[[KeyPath], str]
 ) -> ConfigError:
-    """The first of pydantic's errors about a ``table``; ``where`` names the place of a key in its file."""
+    """Return the error to report among pydantic's errors about a table.
+
+    Args:
+        error: The errors.
+        table: Model of the table.
+        where: Function that returns the position of a key in its file.
+    """
     found = error.errors()
     # A misspelt key that is required is missing as well; its misspelling says more.
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
@@ -45,26 +55,25 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """``value`` as an error shows it in a line."""
+    """Return ``value``, or the first 60 characters of its text if it is longer, for one line."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 
 
 def dotted(path: KeyPath) -> str:
-    """``("patches", 1, "node_id")`` as ``patches[1].node_id``."""
+    """Return a path as text: ``("patches", 1, "node_id")`` is ``patches[1].node_id``."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
     return "".join(parts).removeprefix(".")
 
 
 def key_path(key: str) -> KeyPath:
-    """The inverse of :func:`dotted`."""
+    """Return the path of a dotted key; the inverse of :func:`dotted`."""
     parts = re.findall(r"\[(\d+)\]|([^.\[\]]+)", key)
     return tuple(int(index) if index else name for index, name in parts)
 
 
 def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | None]:
-    """The keys of the table in ``table`` that holds ``location``, and what is allowed at ``location``
-    itself."""
+    """Return the keys of the table that holds ``location``, and the values allowed at ``location``."""
     allowed: str | None = None
     for depth, part in enumerate(location):
         if isinstance(part, int):
@@ -81,19 +90,19 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
 
 
 def allowed_in(field: FieldInfo) -> str | None:
-    """What may be written at a key; None where its type says it all."""
+    """Return the values allowed at a key, in words; None if its type says enough."""
     marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
     return next(iter([*marks, *_marks_in(field.annotation)]), None)
 
 
 def tables_in(annotation: Any) -> list[type[BaseModel]]:
-    """The tables that a key may hold, alone or in a list."""
+    """Return the models of the tables that a key may hold, alone or in a list."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [table for part in get_args(annotation) for table in tables_in(part)]
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Marks below a union, as in ``Stiffness | None``."""
+    """Return the marks below a union, as in ``Stiffness | None``."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]

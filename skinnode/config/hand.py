@@ -1,4 +1,4 @@
-"""The hand as its integrator writes it down: ``hand.toml`` to frozen, validated options."""
+"""The whole hand: ``hand.toml`` as frozen, validated options."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ MOST_BUSES: Final = 64
 class HandConfig(Table):
     """A hand: its buses, its patches and what the host does with them.
 
-    Raises (as part of pydantic's ValidationError; :func:`parse_hand` unwraps it) ConfigError for names,
-    node-IDs or serial numbers used twice, a bus that is not there, an impossible geometry, or a role that a
-    bus cannot have. Whether the plan fits its buses is asked of :func:`skinnode.bus_load.plan.check_plan`.
+    A name, node-ID or serial number used twice, an unknown bus, an impossible geometry or a role that a bus
+    cannot have is a ConfigError, which pydantic wraps in its ValidationError; :func:`parse_hand` unwraps it.
+    Whether the plan fits its buses is checked by :func:`skinnode.bus_load.plan.check_plan`.
     """
 
     name: Name = "hand"
-    """What programs and reports call the hand."""
+    """Name of the hand in programs and reports."""
     buses: Annotated[
         tuple[BusConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[buses]]")
     ]
-    """Its CAN buses."""
+    """CAN buses of the hand."""
     patches: Annotated[
         tuple[PatchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[patches]]")
     ]
-    """Its patches of skin."""
+    """Patches of skin of the hand."""
     sync: SyncConfig = SyncConfig()
     bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
@@ -49,25 +49,38 @@ class HandConfig(Table):
     _read_of: Document = PrivateAttr(Document("", {}, {}))
 
     def bus(self, name: str) -> BusConfig:
-        """The bus of that name. Raises KeyError."""
+        """Return the bus of that name.
+
+        Raises:
+            KeyError: The hand has no such bus.
+        """
         return {bus.name: bus for bus in self.buses}[name]
 
     def patch(self, name: str) -> PatchConfig:
-        """The patch of that name. Raises KeyError."""
+        """Return the patch of that name.
+
+        Raises:
+            KeyError: The hand has no such patch.
+        """
         return {patch.name: patch for patch in self.patches}[name]
 
     def patches_on(self, bus: str) -> tuple[PatchConfig, ...]:
-        """The patches on the bus of that name, in the order of the file."""
+        """Return the patches on the bus of that name, in the order of the file."""
         return tuple(patch for patch in self.patches if patch.bus == bus)
 
     def where(self, key: str) -> str:
-        """``file:line:column`` of a dotted key, for errors; nothing for a hand that is of no file."""
+        """Return ``file:line:column`` of a dotted key, for errors; empty if there is no file."""
         return self._read_of.where(key_path(key))
 
     def on(self, interface: str | None = None, channel: str | None = None) -> HandConfig:
-        """The same hand on another interface or channel, as ``--interface`` and ``--channel`` ask for.
+        """Return the same hand on another interface or channel.
 
-        Raises ConfigError where a channel is given for a hand of several buses.
+        Args:
+            interface: python-can interface in place of the file's, for all buses.
+            channel: Channel in place of the file's.
+
+        Raises:
+            ConfigError: A channel is given for a hand of several buses, or a name is empty.
         """
         if channel is not None and len(self.buses) > 1:
             raise ConfigError(
@@ -83,8 +96,10 @@ class HandConfig(Table):
     @model_validator(mode="before")
     @classmethod
     def _counts(cls, table: Any) -> Any:
-        """Check the number of buses and patches before building them: ten thousand patches would take
-        minutes."""
+        """Check the number of buses and patches before building them.
+
+        Building ten thousand patches would take minutes.
+        """
         if isinstance(table, Mapping):
             buses, patches = table.get("buses"), table.get("patches")
             if isinstance(buses, list) and len(buses) > MOST_BUSES:
@@ -114,7 +129,7 @@ class HandConfig(Table):
         return self
 
     def _check_roles(self) -> None:
-        """What a bus cannot give its host, or its patches, in the role it has."""
+        """Check what a bus in its role cannot give its host or its patches."""
         overflow, guest = self.sync.counter_overflow, all(bus.role == "guest" for bus in self.buses)
         if overflow == 1 or (overflow == 0 and not guest):
             allowed = "an integer from 2 to 240; 0 where all buses are a guest's"
@@ -135,6 +150,10 @@ class HandConfig(Table):
             if bus.heartbeat_node_id in node_ids:
                 allowed = "an integer from 1 to 127 that no node has"
                 raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, allowed)
+        self._check_guests()
+
+    def _check_guests(self) -> None:
+        """Check that the file holds what a host that is a guest cannot ask of the nodes."""
         for i, patch in enumerate(self.patches):
             bus = self.bus(patch.bus)
             if bus.role == "master" or bus.guest_sends == "sdo":
@@ -154,16 +173,27 @@ class HandConfig(Table):
 def load_hand(path: Path | str) -> HandConfig:
     """Read a hand file. Paths in it are relative to its folder.
 
-    Raises ConfigError, in one line: file that cannot be read, TOML syntax, unknown or missing key, wrong
-    type, value out of range, and everything HandConfig checks; with line and column.
+    Args:
+        path: The file.
+
+    Raises:
+        ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, a wrong type,
+            a value out of range, or fails a check of :class:`HandConfig`. One line, with line and column.
     """
     path = Path(path)
     return _parse(read_toml(path, "hand file"), path.parent)
 
 
 def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: str = "") -> HandConfig:
-    """Validate a table with the keys of a hand file. ``folder`` is where relative paths start (default: the
-    working directory), ``where`` the file to name in errors. Raises ConfigError as :func:`load_hand`.
+    """Validate a table with the keys of a hand file.
+
+    Args:
+        table: The table, as tomllib reads it.
+        folder: Folder where relative paths start. Default: the working directory.
+        where: File to name in errors.
+
+    Raises:
+        ConfigError: As :func:`load_hand`.
     """
     return _parse(Document(where, dict(table), {}), folder or Path())
 
@@ -178,7 +208,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raises ConfigError for electrodes that cannot be, or measurements that are not of as many wires."""
+    """Raise ConfigError for an impossible geometry, or if the wires do not have one gain each."""
     try:
         layout = patch.layout.build()
     except ValueError as error:
@@ -196,5 +226,7 @@ def _require_unique(table: str, key: str, values: Iterable[object]) -> None:
     for i, value in enumerate(values):
         if value in seen:
             shown = value[-1] if isinstance(value, tuple) else value
-            raise ConfigError(f"{table}[{i}].{key}", shown, f"one that {table}[{seen[value]}] does not use")
+            raise ConfigError(
+                f"{table}[{i}].{key}", shown, f"a value that {table}[{seen[value]}] does not use"
+            )
         seen[value] = i

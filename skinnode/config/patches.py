@@ -1,4 +1,4 @@
-"""``[[patches]]``: who a patch is on its bus, what it looks like, where it sits, what was measured of it."""
+"""``[[patches]]``: node-ID, layout, pose, calibration and baseline of each patch."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class LayoutConfig(Table):
 
     file: Annotated[Path | None, Field(strict=False), Allowed("the path of a layout file")] = None
     """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML with the other keys of
-    this table, which then may not stand here. Relative to the hand file."""
+    this table, which are then not allowed here. Relative to the hand file."""
     preset: Annotated[Preset, one_of(Preset)] = "staggered"
     """Named arrangement of the electrodes."""
     pitch_m: Length = 4e-3
-    """Distance of neighbours on an upper wire, metres."""
+    """Distance between neighbouring electrodes of an upper wire, metres."""
     height_m: Length = 2e-3
     """Height of the upper electrodes above the lower ones, metres."""
     upper_wires: Count = 10
@@ -66,8 +66,8 @@ class LayoutConfig(Table):
     resistivity_ohm_per_m: _Resistivity = 1e7
     """Resistance of the rubber for each metre between two electrodes."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
-    """``node``: the patch itself says where its electrodes are (0x2300); preset or file stand for it in plans
-    and simulations, and their numbers of wires and electrodes must be right."""
+    """``node``: the host reads the positions of the electrodes from the patch (0x2300). Plans and simulations
+    use preset or file, whose numbers of wires and electrodes must be right."""
 
     @field_validator("file")
     @classmethod
@@ -82,8 +82,12 @@ class LayoutConfig(Table):
         return self
 
     def build(self) -> PatchLayout:
-        """The layout. Raises ValueError where the geometry is impossible, ConfigError for a file that is
-        none."""
+        """Return the layout.
+
+        Raises:
+            ValueError: The geometry is impossible.
+            ConfigError: The file cannot be used.
+        """
         if self.file is not None:
             return load_layout(self.file)
         return _preset(
@@ -100,13 +104,15 @@ class LayoutConfig(Table):
 
 @functools.lru_cache(maxsize=256)
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
-    """Return a cached layout: patches of a hand are mostly alike and built at every check, and layouts are
-    immutable."""
+    """Return a cached layout.
+
+    The patches of a hand are mostly alike and are built at every check; layouts are immutable.
+    """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
 
 class PoseConfig(Table):
-    """Where the patch sits: its frame (x along the upper wires, z out of the skin) in that of the hand."""
+    """Pose of the patch's frame (x along the upper wires, z out of the skin) in the frame of the hand."""
 
     position_m: Annotated[
         tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
@@ -123,10 +129,10 @@ class PoseConfig(Table):
         Field(strict=False),
         Allowed("three numbers [roll, pitch, yaw], radians"),
     ] = None
-    """Orientation as roll, pitch, yaw about the fixed axes x, y, z, radians, as URDF has it."""
+    """Orientation as roll, pitch, yaw about the fixed axes x, y, z, radians, as in URDF."""
 
     @model_validator(mode="after")
-    def _is_one(self) -> PoseConfig:
+    def _one_unit_orientation(self) -> PoseConfig:
         if self.quaternion_xyzw is not None and self.rpy_rad is not None:
             raise ConfigError("rpy_rad", list(self.rpy_rad), "only without quaternion_xyzw")
         try:
@@ -137,47 +143,48 @@ class PoseConfig(Table):
         return self
 
     def build(self) -> Pose:
-        """The pose, for :func:`skinnode.model.pose.positions_in_hand_m`."""
+        """Return the pose, for :func:`skinnode.model.pose.positions_in_hand_m`."""
         if self.rpy_rad is not None:
             return Pose.from_rpy(self.position_m, self.rpy_rad)
         return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))
 
 
 class CalibrationConfig(Table):
-    """What was measured of this patch. Its resistances at rest are ``baseline``, its resistivity is in the
-    layout."""
+    """Measured properties of this patch.
+
+    Its resistances at rest are in ``baseline``, its resistivity is in the layout.
+    """
 
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode, in place of ``solver.stiffness_n_per_m``."""
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
     ] = _RUBBER.young_pa
-    """Young's modulus of the rubber, from which the posterior has its forces."""
+    """Young's modulus of the rubber, from which the posterior computes forces."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
         _RUBBER.poisson
     )
     """Poisson's ratio of the rubber."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """One factor for each upper wire that brings its resistances back to what they were when the baseline was
-    taken."""
+    """One factor for each upper wire that restores its resistances to those at the time of the baseline."""
 
     @property
     def rubber(self) -> Rubber:
-        """The material, for the posterior."""
+        """The rubber, for the posterior."""
         return Rubber(self.young_pa, self.poisson)
 
 
 class PatchConfig(Table):
-    """One patch of skin: who it is on the bus and what it looks like."""
+    """One patch of skin: its identity on the bus, its geometry and its calibration."""
 
     name: Name
-    """What programs and reports call it."""
+    """Name of the patch in programs and reports."""
     node_id: NodeId
-    """CANopen node-ID, 1 to 127, once on a bus."""
+    """CANopen node-ID, 1 to 127, unique on its bus."""
     bus: Name = "can0"
     """Name of its bus."""
     link: Name | None = None
-    """Name of the robot's link that it sits on, for programs that know one."""
+    """Name of the robot link that carries the patch, for programs with a robot model."""
     pose: PoseConfig = PoseConfig()
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
     """Electronic data sheet to compare with the wire format of this file; relative to the hand file."""
@@ -187,14 +194,15 @@ class PatchConfig(Table):
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
-    """Serial number the node must have (0x1018:4); None takes any. With it a node that does not answer at its
-    node-ID is searched for by LSS and given it."""
+    """Serial number that the node must have (0x1018:4); None accepts any. If the node does not answer at its
+    node-ID, the host finds it by this number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
     """Standard deviation of the analogue noise of a resistance, relative, without quantisation."""
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
-    """Resistances at rest as text, a line an upper wire and a number a lower wire; None: the node says."""
+    """File of the resistances at rest, ohm: one line for each upper wire, one number for each lower wire.
+    None: the host reads them from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
 
     @field_validator("eds", "baseline")
@@ -205,8 +213,15 @@ class PatchConfig(Table):
 
 
 def load_layout(path: Path | str) -> PatchLayout:
-    """Read a layout file: NPZ or TOML with the arrays ``upper_m`` and ``lower_m``, or TOML with the keys of
-    ``[patches.layout]``. Raises ConfigError, in one line, for whatever is wrong with it."""
+    """Read a layout file.
+
+    Args:
+        path: NPZ or TOML with the arrays ``upper_m`` and ``lower_m``, or TOML with the keys of
+            ``[patches.layout]``.
+
+    Raises:
+        ConfigError: The file cannot be read or does not hold a possible layout. One line.
+    """
     path = Path(path)
     if path.suffix == ".npz":
         return read_npz(path)

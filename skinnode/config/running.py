@@ -1,4 +1,4 @@
-"""``[solver]`` and ``[stream]``: from resistances to fields, and to those who read them."""
+"""``[solver]`` and ``[stream]``: how the host solves scans and hands fields to programs."""
 
 from __future__ import annotations
 
@@ -18,33 +18,34 @@ class SolverConfig(Table):
     """How resistances become displacements."""
 
     method: Annotated[Method, one_of(Method)] = "auto"
-    """The exact inverse of each wire, the posterior of the patch, or what suits layout and noise."""
+    """``exact`` inverse of each wire, ``posterior`` of the patch, or the one of both that suits layout and
+    noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
-    """Of the exact inverse."""
+    """Operator of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None
     """Stiffness of the rubber under one electrode; with it a field of the exact inverse carries forces. A
     patch may have its own in its calibration."""
     deadline_us: Annotated[
         int | None, Field(ge=100, le=10_000_000), Allowed("an integer from 100 to 10000000")
     ] = None
-    """Microseconds after which a frame is given up with what is known by then; None takes what it takes."""
+    """Maximum microseconds for a frame, which then ends with the estimate so far; None: no limit."""
     estimate_noise: bool = False
-    """Estimate the noise of the resistances from the stream; asks for the posterior."""
+    """Estimate the noise of the resistances from the stream; requires the posterior."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
     """Estimate a common gain of the resistances of the ``patch``, or of each upper ``wire``, along with the
-    displacement; asks for the posterior."""
+    displacement; requires the posterior."""
     normal_only: bool = False
     """Solve for the height of the electrodes alone: no shear."""
     workers: Annotated[int | None, Field(ge=1, le=64), Allowed("an integer from 1 to 64")] = None
-    """Threads that solve patches side by side; None is one a processor core, at most one a patch."""
+    """Threads that solve patches in parallel; None: one a processor core, at most one a patch."""
 
 
 class StreamConfig(Table):
-    """What becomes of scans and fields on their way to a program."""
+    """How scans and fields reach a program."""
 
     partial: Annotated[Partial, one_of(Partial)] = "pass"
-    """A scan that is not complete, because chunks or the summary with its check were lost: ``pass`` it on,
-    unchecked, with a mask of what is valid, or ``withhold`` it. Either way it is counted."""
+    """What to do with an incomplete scan, which lost chunks or the summary with its check: ``pass`` it on,
+    unchecked, with a mask of the valid resistances, or ``withhold`` it. It is counted either way."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
-    """Fields that a subscriber may lag behind before it loses the oldest: more than a second of four patches
-    at 12.5 scans a second."""
+    """Maximum fields that a subscriber may lag behind before it loses the oldest. 64 is more than a second
+    of four patches at 12.5 scans a second."""

@@ -1,4 +1,4 @@
-"""The JSON Schema of a hand file. ``python -m skinnode.config.schema`` writes the shipped one again."""
+"""The JSON Schema of a hand file. ``python -m skinnode.config.schema`` writes the shipped file again."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Final
 from skinnode.config.hand import HandConfig
 
 SCHEMA_FILE: Final = Path(__file__).with_name("hand.schema.json")
-"""As shipped; CI compares it with the code."""
+"""File of the shipped schema; a test compares it with the code."""
 
 
 def schema_text() -> str:
-    """The schema as JSON, the same bytes for the same code."""
+    """Return the schema as JSON, the same bytes for the same code."""
     schema = HandConfig.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"

@@ -1,4 +1,4 @@
-"""``[simulation]``: what ``vcan-sim`` plays."""
+"""``[simulation]``: the scene that ``vcan-sim`` plays."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _Cycle = Annotated[
 
 
 class SimulationConfig(Table):
-    """The scene ``vcan-sim`` plays on simulated patches: press, slide, lift, again. The host ignores it."""
+    """The scene that ``vcan-sim`` plays on each patch: press, slide, lift, repeat. The host ignores it."""
 
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
-    """Of the noise and of where each indenter presses."""
+    """Seed of the converter noise and of the places where the indenters press."""
     indenter_radius_m: Length = 0.04
     """Radius of the sphere that presses."""
     depth: Ratio = 0.1
-    """Deepest indentation as a share of the height of the upper layer; 0: nothing touches the hand."""
+    """Maximum indentation as a share of the height of the upper layer; 0: nothing touches the hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3
     )
-    """Tangential over normal load while sliding, the coefficient of friction."""
+    """Coefficient of friction: tangential over normal load while sliding."""
     slide_speed_m_per_s: _Speed = 0.008
-    """How fast it slides."""
+    """Speed of the slide."""
     cycle_s: _Cycle = 4.0
     """Time of one press, slide and lift."""
     converter_noise: Ratio = 3e-6

@@ -1,4 +1,4 @@
-"""What every table of a hand file is: frozen, strict as TOML is typed, and able to say what is allowed."""
+"""Base class and value types of the tables of a hand file: frozen, strict, with allowed values in words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.canopen.indices import MAX_NODE_ID
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Rides along in the type of a field: what a technician may write there."""
+    """Mark in the type of a field: the values that a technician may write there, in words."""
 
     text: str
 
@@ -25,12 +25,16 @@ class Table(BaseModel):
 
 
 def one_of(names: Any) -> Allowed:
-    """The values of a Literal, as a technician reads them."""
+    """Return the mark for the values of a Literal."""
     return Allowed(" or ".join(map(str, get_args(names))))
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """``value`` below the folder of the hand file, where that is a file. Raises ValueError."""
+    """Return ``value`` below the folder of the hand file.
+
+    Raises:
+        ValueError: There is no such file.
+    """
     if value is None:
         return None
     path = Path((info.context or {}).get("folder", Path()), value)

@@ -1,7 +1,8 @@
-"""TOML with its places: what a key says, and on which line and in which column it stands.
+"""TOML with positions: the value of each key, and the line and column where it stands.
 
-tomllib reads the file and judges its syntax; it keeps no places. So a file that it has accepted is walked
-through once more, for the keys alone.
+tomllib reads the file and checks its syntax, but keeps no positions. So a file that tomllib has accepted is
+scanned once more, for its keys alone. This stays hand-written because no TOML reader with positions is both
+maintained and as strict as tomllib.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Document:
     """Line and column of each key, of each item of an array and of each table, from 1."""
 
     def where(self, key: KeyPath) -> str:
-        """``file:line:column`` of ``key``; of the table around it where it is not there itself."""
+        """Return ``file:line:column`` of ``key``, or of the table around it if the key is missing."""
         for length in range(len(key), 0, -1):
             if key[:length] in self.places:
                 line, column = self.places[key[:length]]
@@ -60,8 +61,16 @@ class Document:
 
 
 def read_toml(path: Path, what: str) -> Document:
-    """Read a TOML file; ``what`` names it in errors. Raises ConfigError, in one line, for a file that cannot
-    be read, is not TOML, nests deeper than anything of ours, or has integers that TOML does not promise."""
+    """Read a TOML file.
+
+    Args:
+        path: The file.
+        what: Name of the file in errors.
+
+    Raises:
+        ConfigError: The file cannot be read, is not TOML, nests deeper than any hand file, or has integers
+            outside the range that TOML guarantees. One line.
+    """
     try:
         text = read_input(what, path).decode()
     except UnicodeDecodeError as error:
@@ -89,7 +98,7 @@ def read_toml(path: Path, what: str) -> Document:
 
 
 def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
-    """Whatever holds nothing else, with its key; that of what is nested too deeply ends where it is."""
+    """Yield each value that holds no others, with its key; too deep a value is yielded whole."""
     todo: list[tuple[KeyPath, Any]] = [((), table)]
     while todo:
         key, value = todo.pop()
@@ -105,7 +114,10 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
-    """tomllib ends its message with the place: ``(at line 3, column 5)`` or ``(at end of document)``."""
+    """Return the error for a message of tomllib.
+
+    tomllib ends its message with the position: ``(at line 3, column 5)`` or ``(at end of document)``.
+    """
     match = re.fullmatch(r"(?P<what>.*) \(at (?P<place>.*)\)", message, flags=re.DOTALL)
     what, place = (match["what"], match["place"]) if match else (message, "somewhere")
     line = re.match(r"line (\d+)", place)
@@ -116,8 +128,8 @@ def _syntax_error(where: str, text: str, message: str) -> ConfigError:
 
 
 def places(text: str) -> dict[KeyPath, tuple[int, int]]:
-    """Line and column of everything in a TOML document that tomllib accepts."""
-    offsets = _Walk(text.replace("\r\n", " \n")).offsets
+    """Return line and column of every key, item and table of a document that tomllib accepts."""
+    offsets = _Scanner(text.replace("\r\n", " \n")).offsets
     found, line, start = {}, 1, 0
     for path, offset in sorted(offsets.items(), key=lambda item: item[1]):
         line += text.count("\n", start, offset)
@@ -126,8 +138,8 @@ def places(text: str) -> dict[KeyPath, tuple[int, int]]:
     return found
 
 
-class _Walk:
-    """Goes through a document and notes where the first mention of each path begins."""
+class _Scanner:
+    """Scans a document and notes where the first mention of each path begins."""
 
     def __init__(self, text: str) -> None:
         self._text, self._at = text, 0
@@ -155,7 +167,7 @@ class _Walk:
         self.offsets.setdefault(path, offset)
 
     def _names(self) -> list[str]:
-        """``a . "b"``"""
+        """Read the parts of a dotted key such as ``a . "b"``."""
         names = []
         while True:
             self._skip(_SPACE)
@@ -201,7 +213,7 @@ class _Walk:
             self._skip(_VALUE)
 
     def _items(self, path: KeyPath, end: str) -> None:
-        """Those of an array or an inline table."""
+        """Scan the items of an array or an inline table."""
         self._at += 1
         index = 0
         self._skip(_GAP)

@@ -1,1 +1,1 @@
-"""Files that a crash or bad input cannot spoil: locked, written whole or not at all, with one-line errors."""
+"""Reads and writes files safely: locked, written whole or not at all, with one-line errors."""

@@ -16,7 +16,7 @@ _TRIES: Final = 100
 
 
 class FileInUse(BlockingIOError):
-    """The lock has an owner; ``process`` is its process ID, or None if unknown."""
+    """The lock has an owner: ``process`` is its process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -25,7 +25,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """``path`` is a symbolic link, a folder, a pipe or a device; such files are not locked."""
+    """The path is a symbolic link, a folder, a pipe or a device; such files are not locked."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -49,8 +49,16 @@ class FileLock:
 
 
 def lock_file(path: Path) -> FileLock:
-    """Create and lock ``path``. Raises FileInUse if this or another process owns the lock, NotARegularFile if
-    it is anything but a regular file, and OSError if the file cannot be created."""
+    """Create and lock the file ``path``, and write the ID of this process into it.
+
+    Returns:
+        The lock, to be released.
+
+    Raises:
+        FileInUse: This or another process owns the lock.
+        NotARegularFile: ``path`` exists and is not a regular file.
+        OSError: The file cannot be created.
+    """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     for _ in range(_TRIES):
         try:

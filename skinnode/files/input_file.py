@@ -10,14 +10,21 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 MOST_BYTES: Final = 1 << 20
-"""Maximum size of a text file: ten times the largest known hand file, layout or baseline. Parsers take some
-hundred times the memory of the text."""
+"""Maximum size of a text file: ten times the largest known hand file, layout or baseline. Parsers need
+about a hundred times the memory of the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read all of ``path``, which the user gave as ``key``. A pipe is read if it has a writer, as in
-    ``<(command)``. Raises ConfigError if ``path`` is not a file, cannot be read, or is larger than
-    ``most_bytes``."""
+    """Read all of a file that the user named. A pipe is read if it has a writer, as in ``<(command)``.
+
+    Args:
+        key: Option or key that named the file, for errors.
+        path: The file.
+        most_bytes: Maximum size.
+
+    Raises:
+        ConfigError: ``path`` is not a file, cannot be read, or is larger than ``most_bytes``.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
         with open(descriptor, "rb") as file:

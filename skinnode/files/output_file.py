@@ -1,4 +1,4 @@
-"""Files that commands write: known to be writable before any work is done."""
+"""Writes the output files of commands, and checks beforehand that they can be written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Raises ConfigError where ``file``, the value of ``option``, could not be written."""
+    """Check that a file can be written, before any work is done for it.
+
+    Args:
+        option: Option that named the file, for errors.
+        file: The file.
+
+    Raises:
+        ConfigError: ``file`` is a folder, or cannot be written.
+    """
     try:
         if file.is_dir():
             raise ConfigError(option, str(file), "the name of a file, not a folder")
@@ -23,14 +31,23 @@ def require_writable(option: str, file: Path) -> None:
 
 
 def write_text(option: str, file: Path, text: str) -> None:
-    """Write ``text`` to ``file``, the value of ``option``. Raises ConfigError if not all of it can be
-    written; the file then keeps its old content."""
+    """Write ``text`` in UTF-8 to ``file``, the value of ``option``.
+
+    Raises:
+        ConfigError: Not all of it could be written; the file then keeps its old content.
+    """
     write_bytes(option, file, text.encode())
 
 
 def write_bytes(option: str, file: Path, data: bytes) -> None:
-    """Write ``data`` like :func:`write_text`. A regular file is replaced once all data is written, and keeps
-    its permissions; anything else, such as a pipe, is written in place."""
+    """Write ``data`` to ``file``, the value of ``option``.
+
+    A regular file is replaced once all data is written, and keeps its permissions; anything else, such as a
+    pipe, is written in place.
+
+    Raises:
+        ConfigError: Not all of it could be written; a regular file then keeps its old content.
+    """
     try:
         target = Path(os.path.realpath(file))  # for /dev/stdout, a name that does not exist
         if file.exists() and not (file.is_file() and os.access(target.parent, os.W_OK)):

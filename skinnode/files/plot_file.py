@@ -1,4 +1,4 @@
-"""Files of plots. matplotlib is an extra; a command that needs it says so before it does any work."""
+"""Writes plots with matplotlib, an extra; a command that needs it says so before it does any work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from skinnode.files.output_file import write_bytes
 
 
 def require_matplotlib(file: Path) -> None:
-    """Raises ConfigError where matplotlib is missing or does not write files of this kind."""
+    """Check that matplotlib is installed and can write the format that the suffix of ``file`` names.
+
+    Raises:
+        ConfigError: matplotlib is missing, or does not write such files.
+    """
     if find_spec("matplotlib") is None:
         raise ConfigError("--plot", str(file), "only with matplotlib: sh install.sh plot")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -23,8 +27,17 @@ def require_matplotlib(file: Path) -> None:
 
 
 def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
-    """Draw a matplotlib ``figure`` to ``file``, whole or not at all, in the format of its suffix. Raises
-    ConfigError if the file cannot be written."""
+    """Write a matplotlib figure to a file, whole or not at all, in the format of its suffix.
+
+    Args:
+        option: Option that named the file, for errors.
+        file: The file.
+        figure: A ``matplotlib.figure.Figure``.
+        dpi: Resolution in dots per inch.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=dpi, format=file.suffix[1:].lower() or None)
     write_bytes(option, file, drawn.getvalue())

@@ -1,6 +1,6 @@
-"""Atomic writing of files.
+"""Writes files atomically.
 
-The new content is written to a file with a random name beside the old one, created exclusively and never
+The new content is written to a file with a random name in the same folder, created exclusively and never
 through a symbolic link, and renamed once complete. A reader always finds either the old content or the new;
 an error leaves the old content.
 """
@@ -18,9 +18,17 @@ SUFFIX: Final = ".new"
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
-    """Replace the content of ``path`` by ``data``, with permissions ``mode`` less the umask. A symbolic link
-    is replaced, not followed. ``durable``: return once file and name are on the medium. Raises OSError if the
-    file cannot be written."""
+    """Replace the content of ``path`` by ``data``. A symbolic link is replaced, not followed.
+
+    Args:
+        path: The file; it need not exist.
+        data: New content.
+        mode: Permissions, reduced by the umask.
+        durable: Return only when file and name are on the storage medium.
+
+    Raises:
+        OSError: The file cannot be written; it keeps its old content.
+    """
     beside = create_beside(path, data, mode=mode, durable=durable)
     try:
         os.replace(beside, path)
@@ -32,8 +40,20 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
 
 
 def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> Path:
-    """Write ``data`` to a new file in the folder of ``path``, to be renamed or discarded. Raises OSError if
-    it cannot be written, and then leaves no file behind."""
+    """Write ``data`` to a new file in the folder of ``path``, to be renamed or discarded.
+
+    Args:
+        path: The file that the new one is to replace.
+        data: Content of the new file.
+        mode: Permissions, reduced by the umask.
+        durable: Return only when the data is on the storage medium.
+
+    Returns:
+        Path of the new file.
+
+    Raises:
+        OSError: It cannot be written; no file is left behind.
+    """
     beside = path.with_name(f".{path.name[:200]}.{secrets.token_hex(8)}{SUFFIX}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(beside, flags, mode)
@@ -56,8 +76,10 @@ def discard(path: Path) -> None:
 
 
 def discard_leftovers(path: Path) -> None:
-    """Remove the files left by processes that were killed while writing ``path``. Call only as its sole
-    writer."""
+    """Remove the files of processes that were killed while writing ``path``.
+
+    Only the sole writer of ``path`` may call this.
+    """
     start = f".{path.name[:200]}."
     with contextlib.suppress(OSError), os.scandir(path.parent) as entries:
         for entry in entries:
@@ -67,7 +89,7 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the names in ``folder`` to the medium; a rename is durable once its folder is flushed."""
+    """Flush the names in ``folder`` to the storage medium; a rename is durable once its folder is flushed."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

@@ -1,1 +1,1 @@
-"""Signals, child processes and pauses of garbage collection."""
+"""Signals, child processes and garbage collector settings of a running program."""

@@ -1,7 +1,7 @@
-"""Child processes of a command, and the signals of its terminal.
+"""Starts child processes that survive the signals of the command's terminal.
 
 A terminal sends Ctrl-C (SIGINT) and SIGHUP to the children of a command as well. Python would print a
-traceback in a child that still imports, and SIGHUP would end the resource tracker of ``multiprocessing``
+traceback in a child that is still importing, and SIGHUP would end the resource tracker of ``multiprocessing``
 before it has cleaned up. So children start with both signals blocked and keep them blocked; the command ends
 them.
 """
@@ -16,18 +16,21 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Final
 
-_OF_A_TERMINAL: Final = (signal.SIGINT, signal.SIGHUP)
+_TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 
 
 @contextmanager
 def starting_children() -> Iterator[None]:
-    """Start child processes in this ``with`` block. A signal that arrives in it is handled at its end: a
-    child that is left half started prints a traceback."""
+    """Block the terminal's signals for child processes started in this ``with`` block.
+
+    A signal that arrives in the block is handled at its end: a child that is left half started prints a
+    traceback.
+    """
     with _signals_deferred():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_A_TERMINAL)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         try:
             resource_tracker.ensure_running()  # unblocks SIGINT in this thread if it starts the tracker
-            signal.pthread_sigmask(signal.SIG_BLOCK, _OF_A_TERMINAL)
+            signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
             yield
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -35,8 +38,11 @@ def starting_children() -> Iterator[None]:
 
 @contextmanager
 def _signals_deferred() -> Iterator[None]:
-    """Handle signals at the end of the ``with`` block. A mask is not enough: another thread can take the
-    signal, and Python calls the handler on the main thread then too. Other threads are never interrupted."""
+    """Handle signals at the end of the ``with`` block.
+
+    A signal mask is not enough: another thread can take the signal, and Python still calls the handler on the
+    main thread. Threads other than the main thread are never interrupted.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -45,7 +51,7 @@ def _signals_deferred() -> Iterator[None]:
     def note(number: int, _frame: FrameType | None) -> None:
         arrived.append(number)
 
-    numbers = (*_OF_A_TERMINAL, signal.SIGTERM)
+    numbers = (*_TERMINAL_SIGNALS, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
     handled = {number: handler for number, handler in before.items() if callable(handler)}
     for number in handled:

@@ -1,4 +1,4 @@
-"""Keeps Python's garbage collector, and threads each other, from holding up a program with deadlines."""
+"""Keeps garbage collection and busy threads from delaying a program with deadlines."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_long_collections() -> Iterator[None]:
-    """Within the block, collections do not walk through the objects that exist at its begin.
+    """Make garbage collection skip the objects that exist on entry, for the length of the block.
 
-    What numba and canopen load makes a full collection take 30 ms of a small machine, with every thread
-    stopped: long enough for a node to skip a scan, or a host a SYNC. Enter it when all is set up. What exists
-    by then and becomes garbage in a cycle stays until the end of the block.
+    The objects that numba and canopen load make a full collection take 30 ms on a small computer, and it
+    stops every thread: long enough for a node to skip a scan or a host to delay a SYNC. Enter the block when
+    all is set up. Objects that exist on entry and become cyclic garbage are freed after the block.
     """
     gc.collect()
     gc.freeze()
@@ -26,8 +26,10 @@ def without_long_collections() -> Iterator[None]:
 
 @contextmanager
 def responsive_threads() -> Iterator[None]:
-    """Within the block, a thread that computes lets another in after half a millisecond. At Python's 5 ms one
-    that receives, or draws, could hold up a scan for longer than it takes to solve."""
+    """Make a computing thread give way after 0.5 ms instead of Python's 5 ms, for the length of the block.
+
+    With 5 ms, a thread that receives or draws could delay a scan for longer than solving it takes.
+    """
     kept = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)
     try:

@@ -1,4 +1,4 @@
-"""How a program that runs until it is stop ends the ordinary way."""
+"""Lets a program that runs until Ctrl-C end the ordinary way."""
 
 from __future__ import annotations
 
@@ -11,9 +11,14 @@ from types import FrameType
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT (Ctrl-C), SIGTERM and, unless it is ignored as under nohup, SIGHUP (the terminal
-    is gone) set. The handlers from before are back at the end of the block. For the main thread; Python
-    allows no other to handle signals (ValueError)."""
+    """Yield an event that a signal to stop sets; handle the signals as before after the block.
+
+    The signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal has closed). SIGHUP is left alone if it
+    is ignored, as under nohup.
+
+    Raises:
+        ValueError: The caller is not the main thread, the only one that Python lets handle signals.
+    """
     stop = threading.Event()
 
     def set_stop(_signal: int, _frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Values as JSON holds them."""
+"""Makes values fit for JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def plain(value: Any) -> Any:
-    """``value`` as JSON can hold it: a figure that could not be had becomes null."""
+    """Return ``value`` with tuples as lists, and None in place of NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

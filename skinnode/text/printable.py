@@ -1,4 +1,4 @@
-"""Makes untrusted text printable: the one place that decides what may reach a terminal, a log or a page.
+r"""Makes untrusted text printable: the one place that decides what may reach a terminal, a log or a page.
 
 Untrusted is any text from a device, a file, a recording or the command line. The rules:
 
@@ -11,7 +11,7 @@ Untrusted is any text from a device, a file, a recording or the command line. Th
 
 Printable is defined by :meth:`str.isprintable`: no control characters (C0, DEL, C1), no format characters
 (such as those that reverse the direction of text, or have no width), no surrogates. Other characters are
-shown as Python escapes: ``\\x1b``, ``\\u202e``.
+shown as Python escapes: ``\x1b``, ``\u202e``.
 """
 
 from __future__ import annotations
@@ -27,8 +27,12 @@ _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
 
 
 def printable(text: str | bytes, most: int = MOST) -> str:
-    """Return ``text`` on one line of at most ``most`` characters and ``…``, without control sequences. Bytes
-    are a VISIBLE_STRING: one character a byte, without trailing NULs."""
+    """Return ``text`` on one line, without control sequences.
+
+    Args:
+        text: The text. Bytes are a VISIBLE_STRING: one character a byte, without trailing NULs.
+        most: Maximum characters; a longer text is cut and ends in ``…``.
+    """
     if isinstance(text, bytes):
         text = text.rstrip(b"\0").decode("latin-1")
     shown = text[: most + 1]
@@ -37,8 +41,10 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` without control sequences, at its full length and with its line ends and tabs; for
-    messages with untrusted parts."""
+    """Return ``text`` without control sequences, at its full length and with its line ends and tabs.
+
+    It is meant for messages that contain untrusted parts.
+    """
     return text if text.isprintable() else _SUSPECT_IN_LINES.sub(_escaped, text)
 
 
@@ -48,19 +54,23 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """A text stream, such as stdout, that escapes control characters instead of passing them on. Output of
-    rich must bypass it, and does so by the attribute ``rich_proxied_file``."""
+    """A text stream, such as stdout, that escapes control characters instead of passing them on.
+
+    Output of rich must bypass it, and does so by the attribute ``rich_proxied_file``.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self.rich_proxied_file = stream
 
     def write(self, text: str) -> int:
+        """Write ``text`` with its control characters escaped, and return its length."""
         if not isinstance(text, str):
             raise TypeError(f"write() argument must be str, not {type(text).__name__}")
         self.rich_proxied_file.write(printable_lines(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:
+        """Write each of ``lines`` with its control characters escaped."""
         for line in lines:
             self.write(line)
 

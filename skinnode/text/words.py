@@ -1,10 +1,16 @@
-"""Words for people that more than one room uses."""
+"""Plural forms and placeholders in messages."""
 
 from __future__ import annotations
 
 
 def counted(number: int, one: str, several: str = "") -> str:
-    """``1 node``, ``2 nodes``; ``several`` where that is not ``one`` and an s."""
+    """Return a number with its noun: ``1 node``, ``2 nodes``.
+
+    Args:
+        number: The number.
+        one: The noun in the singular.
+        several: The noun in the plural, unless that is ``one`` and an s.
+    """
     return f"{number} {one}" if number == 1 else f"{number} {several or one + 's'}"
 
 

@@ -105,12 +105,12 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
         (
             ["patches", 1, "node_id"],
             1,
-            "patches[1].node_id: got 1, allowed: one that patches[0] does not use",
+            "patches[1].node_id: got 1, allowed: a value that patches[0] does not use",
         ),
         (
             ["patches", 1, "name"],
             "thumb",
-            "patches[1].name: got 'thumb', allowed: one that patches[0] does not use",
+            "patches[1].name: got 'thumb', allowed: a value that patches[0] does not use",
         ),
         *(
             (path, name, f"{key}: got {name!r}, allowed: {NAME}")
@@ -264,7 +264,7 @@ def test_a_serial_number_is_of_one_patch() -> None:
         patch["serial"] = 1041
     with pytest.raises(ConfigError) as caught:
         parse_hand(table)
-    assert str(caught.value) == "patches[1].serial: got 1041, allowed: one that patches[0] does not use"
+    assert str(caught.value) == "patches[1].serial: got 1041, allowed: a value that patches[0] does not use"
 
 
 def test_same_node_id_on_two_buses_is_fine() -> None:
@@ -280,7 +280,7 @@ def test_two_buses_on_one_channel() -> None:
     table["buses"].append({"name": "can1"})
     with pytest.raises(ConfigError) as caught:
         parse_hand(table)
-    assert str(caught.value) == "buses[1].channel: got 'skin', allowed: one that buses[0] does not use"
+    assert str(caught.value) == "buses[1].channel: got 'skin', allowed: a value that buses[0] does not use"
 
 
 def write(folder: Path, text: str) -> Path:

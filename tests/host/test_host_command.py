@@ -249,7 +249,7 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
         (
             "node_id = 12",
             "node_id = 11",
-            ":17:1: patches[1].node_id: got 11, allowed: one that patches[0] does not use",
+            ":17:1: patches[1].node_id: got 11, allowed: a value that patches[0] does not use",
         ),
         (
             "node_id = 12",

@@ -25,7 +25,8 @@ class Verdict(StrEnum):
 
 class NotApplicable(Exception):
     """The device does not offer what the case is about. The text names the object, the entry of the EDS or
-    the answer on the bus that says so."""
+    the answer on the bus that says so.
+    """
 
 
 class Warned(Exception):

@@ -1,5 +1,6 @@
 """What the tests must not leave behind: the configuration of the device, read before and written back
-after."""
+after.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
 
 def write_back(dut: Dut, before: Values) -> list[str]:
     """Undo what was stored or restored: defaults first, then ``before`` where it differs from them, stored
-    again. The node has been reset. Returns what could not be written, a line each."""
+    again. The node has been reset. Returns what could not be written, a line each.
+    """
     problems: list[str] = []
     if dut.eds.find(RESTORE, 1) is not None:
         _try(problems, dut, RESTORE, 1, b"load")

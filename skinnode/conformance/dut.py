@@ -73,7 +73,8 @@ class Dut:
     def prepare(self) -> None:
         """Reset the node and bring it to PRE-OPERATIONAL. Another case (STATE-01) checks the boot-up message
         and whether the node starts by itself; here a node that answers is ready, and is commanded to enter
-        PRE-OPERATIONAL. Raises NodeTimeout if the node stays silent."""
+        PRE-OPERATIONAL. Raises NodeTimeout if the node stays silent.
+        """
         self._await_reset()
         self.nmt(PRE_OPERATIONAL)
 
@@ -101,7 +102,8 @@ class Dut:
 
     def start_heartbeat(self, period_ms: int = 20) -> None:
         """Have the node say its state; nothing is done where it has guarding alone. NotApplicable where it
-        has neither."""
+        has neither.
+        """
         if self.eds.find(HEARTBEAT) is not None:
             self.sdo.write_integer(HEARTBEAT, 0, period_ms, 2)
         else:
@@ -109,7 +111,8 @@ class Dut:
 
     def state(self, what: str) -> int:
         """The state by the next heartbeat, :meth:`start_heartbeat` comes before; by a remote frame where
-        there are none. The second heartbeat counts: the first may have been on its way."""
+        there are none. The second heartbeat counts: the first may have been on its way.
+        """
         if self.eds.find(HEARTBEAT) is None:
             return (self.guard(what) or 0) & 0x7F
         self.bus.pending(self.error_control_id)
@@ -145,7 +148,8 @@ class Dut:
 
     def need_storage(self, index: int, subindex: int) -> None:
         """NotApplicable where the device does not store (0x1010) or restore (0x1011) on command: bit 0 of the
-        value (CiA 301, 7.5.2.13 and 7.5.2.14)."""
+        value (CiA 301, 7.5.2.13 and 7.5.2.14).
+        """
         self.need(index, subindex)
         try:
             capability = self.sdo.integer(index, subindex)

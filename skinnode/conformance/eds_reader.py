@@ -28,7 +28,6 @@ SIZES: Final = {
 """Bytes of a value by its data type (CiA 301 v4.2.0, table 44); types not listed vary in length."""
 
 _MOST_ENTRIES: Final = 1 << 16
-_VARIABLE: Final = (0x09, 0x0A, 0x0B, 0x0F)
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
 UNSIGNED: Final = (0x05, 0x06, 0x07, 0x16, 0x18, 0x19, 0x1A, 0x1B)
 _REAL: Final = {0x08: "<f", 0x11: "<d"}
@@ -92,7 +91,8 @@ class EdsEntry:
 
     def default_bytes(self, node_id: int) -> bytes | None:
         """Return the default as transferred by SDO; None if the file has none, or none known to fit the type.
-        A string is transferred as the bytes in the file. Raises ValueError if a number is malformed."""
+        A string is transferred as the bytes in the file. Raises ValueError if a number is malformed.
+        """
         if self.given is not None or not self.default:
             return self.given
         if self.data_type == _TEXT:
@@ -166,7 +166,8 @@ def _hex(text: str) -> bytes | None:
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
     """Read an EDS or DCF in any encoding; if that is not ASCII, the source of the Eds says so. Returns the
     EDS and its text. Raises ConfigError, naming ``key``, if the file cannot be read, and ProfileError if it
-    is not an EDS."""
+    is not an EDS.
+    """
     name, data = str(path), read_input(key, path, MOST_EDS_BYTES)
     try:
         read = read_eds_text(data)

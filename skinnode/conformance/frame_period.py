@@ -21,7 +21,8 @@ def gaps_ms(frames: Sequence[Frame]) -> list[float]:
 
 def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_sooner: bool = False) -> None:
     """Raises Failed where frames do not come each ``period_ms``; ``or_sooner`` allows for events in
-    between."""
+    between.
+    """
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms
     too_seldom = mean > 1.3 or median > 1.25

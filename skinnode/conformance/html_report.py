@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import datetime
-import html
 from typing import Final
 
 from skinnode.conformance.case import Result, Verdict
 from skinnode.conformance.report import summary_line
 from skinnode.conformance.run import Report
-from skinnode.text.printable import printable_lines
+from skinnode.text.html_page import escaped, page
 
 AREA_NAMES: Final = {
     "EDS": "Data sheet",
@@ -72,36 +71,26 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 """
 
 
-def _text(text: str) -> str:
-    return html.escape(printable_lines(text))
-
-
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
     """The report. ``title`` says which node on which bus; cases that failed are unfolded."""
     areas: dict[str, list[Result]] = {}
     for result in report.results:
         areas.setdefault(result.case.area, []).append(result)
     body = [
-        f"<h1>CANopen conformance: {_text(title)}</h1>",
-        f'<p class="dim">{_text(summary_line(report))}</p>',
+        f"<h1>CANopen conformance: {escaped(title)}</h1>",
+        f'<p class="dim">{escaped(summary_line(report))}</p>',
         f'<p class="dim">{when:%Y-%m-%d %H:%M}; clauses are of CiA 301 v4.2.0 unless they name another</p>',
         _bar(report.results),
         f'<div class="counts">{"".join(_count(report, verdict) for verdict in Verdict)}</div>',
-        *(f'<p class="verdict failed">{_text(problem)}</p>' for problem in report.problems),
+        *(f'<p class="verdict failed">{escaped(problem)}</p>' for problem in report.problems),
         f'<div class="areas">{"".join(_area_link(area, results) for area, results in areas.items())}</div>',
     ]
     for area, results in areas.items():
         name = AREA_NAMES.get(area, area)
         count = f"{len(results)} case{'s' if len(results) > 1 else ''}"
-        body.append(f'<h2 id="{_text(area)}">{_text(name)} <span>{_text(area)}, {count}</span></h2>')
+        body.append(f'<h2 id="{escaped(area)}">{escaped(name)} <span>{escaped(area)}, {count}</span></h2>')
         body += map(_case, results)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>CANopen conformance: {_text(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
-        + "\n".join(body)
-        + "\n</body>\n</html>\n"
-    )
+    return page(f"CANopen conformance: {title}", _STYLE, body)
 
 
 def _bar(results: tuple[Result, ...] | list[Result]) -> str:
@@ -118,17 +107,17 @@ def _count(report: Report, verdict: Verdict) -> str:
 
 
 def _area_link(area: str, results: list[Result]) -> str:
-    return f'<a href="#{_text(area)}"><span>{_text(area)}</span>{_bar(results)}</a>'
+    return f'<a href="#{escaped(area)}"><span>{escaped(area)}</span>{_bar(results)}</a>'
 
 
 def _case(result: Result) -> str:
     kind = _CLASS[result.verdict]
-    why = f"<small>{_text(result.why)}</small>" if result.why else ""
-    frames = _text("\n".join(map(str, result.trace))) or "no frames"
+    why = f"<small>{escaped(result.why)}</small>" if result.why else ""
+    frames = escaped("\n".join(map(str, result.trace))) or "no frames"
     return (
         f'<details class="{kind}"{" open" if kind == "failed" else ""}><summary>'
-        f'<code>{_text(result.case.id)}</code><span class="verdict {kind}">{result.verdict}</span>'
-        f"<span>{_text(result.case.title)}{why}</span>"
-        f"<time>{_text(result.case.clause)} · {result.seconds:.2f} s</time></summary>"
+        f'<code>{escaped(result.case.id)}</code><span class="verdict {kind}">{result.verdict}</span>'
+        f"<span>{escaped(result.case.title)}{why}</span>"
+        f"<time>{escaped(result.case.clause)} · {result.seconds:.2f} s</time></summary>"
         f"<pre>{frames}</pre></details>"
     )

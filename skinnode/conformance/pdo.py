@@ -91,7 +91,8 @@ def set_up(
 ) -> int:
     """Disable the PDO, write its parameters (inhibit time in 100 µs), enable it. Returns its CAN-ID. Discards
     frames that the PDO sent before, as from a node that starts by itself. Raises Unsupported if the node
-    rejects the parameters."""
+    rejects the parameters.
+    """
     cob_id = disable(dut, pdo)
     _set(dut, pdo, KIND, kind, 1)
     for subindex, value, size in ((INHIBIT, inhibit, 2), (EVENT_TIMER, event_ms, 2), (SYNC_START, start, 1)):
@@ -121,7 +122,8 @@ Trial = Callable[[Dut, Pdo], None]
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
     """Run ``trial`` on every TPDO that maps something, all others disabled, each from a fresh reset.
-    NotApplicable where none of them supports it."""
+    NotApplicable where none of them supports it.
+    """
     found = tpdos(dut)
     if not found:
         raise NotApplicable("the EDS has no TPDO (0x1800 to 0x19FF)")

@@ -71,7 +71,8 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
     """Let the device miss a heartbeat or, where it consumes none, its guarding. NotApplicable where it has
-    neither."""
+    neither.
+    """
     if dut.eds.find(CONSUMER, 1) is not None:
         partner = foreign_id(dut)
         consume(dut, partner, within_ms)

@@ -42,7 +42,8 @@ def summary_line(report: Report) -> str:
 
 def as_json(report: Report) -> dict[str, Any]:
     """For programs. Frames are strings: seconds since the case began, Tx (the tester's) or Rx, COB-ID,
-    length, payload."""
+    length, payload.
+    """
     return {
         "eds": report.eds,
         "passed": report.count(Verdict.PASSED),
@@ -67,7 +68,8 @@ def as_json(report: Report) -> dict[str, Any]:
 
 def as_junit(report: Report) -> str:
     """Return JUnit XML with a suite for each area: failures carry the frames, cases that do not apply are
-    skipped, warnings are passed tests with the warning as their output."""
+    skipped, warnings are passed tests with the warning as their output.
+    """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}
     for result in report.results:

@@ -43,7 +43,8 @@ class Report:
 def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
     """Reset the node and say what it is. Without an EDS it has to be a patch of this project, whose EDS
     follows
-    from its descriptor (0x2000). Raises NodeTimeout where nobody answers, ConfigError without an EDS."""
+    from its descriptor (0x2000). Raises NodeTimeout where nobody answers, ConfigError without an EDS.
+    """
     bus = Tester(port)
     Dut(bus, node_id, _NO_EDS).prepare()
     return Dut(bus, node_id, eds if eds is not None else _own_eds(SdoClient(bus, node_id)))
@@ -81,7 +82,8 @@ def _own_eds(sdo: SdoClient) -> Eds:
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
     """Run ``cases`` one after the other and call ``say`` with each result. Raises BusError where the
     interface fails; whatever the node does ends in a result. The node is left reset, with the configuration
-    it had."""
+    it had.
+    """
     results: list[Result] = []
     problems: list[str] = []
     before = read_configuration(dut)

@@ -125,13 +125,15 @@ class SdoClient:
 
     def aborts(self, request: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
         """Send a request that must be aborted with one of ``codes`` or the general error, naming the object;
-        returns the code."""
+        returns the code.
+        """
         return self.check_abort(self.ask(request, what), index, subindex, codes, what)
 
     @staticmethod
     def check_abort(answer: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
         """The code of ``answer``, which must be an abort of that object with one of ``codes`` or the general
-        error."""
+        error.
+        """
         allowed = " or ".join(f"0x{code:08X}" for code in sorted({*codes, GENERAL_ERROR}))
         expected = f"{what} aborted with {allowed}"
         if answer[0] != 0x80:
@@ -179,7 +181,8 @@ class SdoClient:
         self, index: int, subindex: int = 0, *, crc: bool = False, size: int = _BLOCK_SIZE
     ) -> bytes:
         """Block upload with sub-blocks of ``size`` segments. Checks sequence numbers, announced length and,
-        if both sides have it, the CRC."""
+        if both sides have it, the CRC.
+        """
         what = f"block read of 0x{index:04X}:{subindex:02X}"
         start = bytes((0xA0 | crc << 2,)) + mux(index, subindex) + bytes((size, 0))
         answer = self.served(start, what)

@@ -17,7 +17,8 @@ CASES: Final[tuple[Case, ...]] = tuple(
 
 def select(names: Sequence[str]) -> tuple[Case, ...]:
     """The cases of the areas and ids named, in their own order; all for no names. Raises ConfigError for a
-    name that is neither."""
+    name that is neither.
+    """
     if not names:
         return CASES
     wanted = {name.strip().upper() for name in names if name.strip()}

@@ -96,7 +96,8 @@ class Tester:
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
         """The first frame of ``can_id`` that matches, out of the inbox or to come; None after
-        ``within_s``."""
+        ``within_s``.
+        """
 
         def wanted(frame: Frame) -> bool:
             return frame.can_id == can_id and not frame.remote and (match is None or match(frame))

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import functools
-import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.color import Color
 from rich.columns import Columns
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.panel import Panel
 from rich.segment import Segment
-from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from skinnode.model.layout import Float
+from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_map
+from skinnode.monitor.patch_panel import shear_text
 
-# Five points of matplotlib's "magma" (CC0): equal steps of depth look like equal steps of brightness.
-_COLOURS = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], dtype=float)
-_LEVELS = 48
-"""Shades on the screen; more could not be told apart and would cost time to draw."""
-_ARROWS = "→↗↑↖←↙↓↘"
 MAP_SIZE = 16
 """Characters across a height map; two pixels above each other make one character, so it is square."""
 
@@ -58,58 +52,27 @@ class BusView:
     latency_p99_ms: float
 
 
-@functools.lru_cache(maxsize=_LEVELS * _LEVELS)
-def _style(above: int, below: int) -> Style:
-    """A character's upper half in the colour of one level, its lower half in that of another."""
-    return Style(color=Color.from_rgb(*_rgb(above)), bgcolor=Color.from_rgb(*_rgb(below)))
-
-
-def _rgb(level: int) -> tuple[float, float, float]:
-    position = level / (_LEVELS - 1) * (len(_COLOURS) - 1)
-    low = min(int(position), len(_COLOURS) - 2)
-    red, green, blue = _COLOURS[low] + (position - low) * (_COLOURS[low + 1] - _COLOURS[low])
-    return float(red), float(green), float(blue)
-
-
-def _resample(grid: Float, size: int) -> Float:
-    """Bilinear, so that ten electrodes fill sixteen pixels without steps."""
-    rows, columns = (np.linspace(0, n - 1, size) for n in grid.shape)
-    across = np.stack([np.interp(columns, np.arange(grid.shape[1]), row) for row in grid])
-    return np.stack([np.interp(rows, np.arange(grid.shape[0]), column) for column in across.T], axis=1)
-
-
 class HeightMap:
-    """Depth of the surface as coloured half blocks; the first upper wire is at the bottom.
+    """Draws the depth of a surface as the monitor does; the first upper wire is at the bottom."""
 
-    Segments are made directly, a run of equal colours in one: as text with a style a character it would cost
-    the host milliseconds a redraw.
-    """
-
-    def __init__(self, displacement_m: Float | None, full_scale_m: float) -> None:
-        depth = np.zeros((2, 2)) if displacement_m is None else -displacement_m[..., 2] / full_scale_m
-        levels = np.rint(np.clip(_resample(depth, MAP_SIZE), 0.0, 1.0) * (_LEVELS - 1))
-        self._levels = levels[::-1].astype(int).tolist()
+    def __init__(self, surface: Surface, full_scale_m: float) -> None:
+        height = MAP_SIZE // 2
+        self._lines = paint_map(surface, MapStyle(full_scale_m, "rgb"), MAP_SIZE, height, arrows=False)
 
     def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
         return Measurement(MAP_SIZE, MAP_SIZE)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for upper, lower in zip(self._levels[0::2], self._levels[1::2], strict=True):
-            for pair, run in itertools.groupby(zip(upper, lower, strict=True)):
-                yield Segment("▀" * sum(1 for _ in run), _style(*pair))
+        for line in self._lines:
+            yield from line
             yield Segment.line()
 
 
-def shear_arrow(displacement_m: Float) -> str:
-    """Direction and size of the mean tangential displacement, weighted by depth; blank without contact."""
-    weight = np.clip(-displacement_m[..., 2], 0.0, None)
-    if weight.sum() <= 0.0:
-        return "-"
-    x, y = (float((displacement_m[..., axis] * weight).sum() / weight.sum()) for axis in (0, 1))
-    size_um = 1e6 * float(np.hypot(x, y))
-    if size_um < 1.0:
-        return "-"
-    return f"{_ARROWS[round(np.arctan2(y, x) / (np.pi / 4)) % 8]} {size_um:.0f} µm"
+def _surface(displacement_m: Float | None) -> Surface:
+    """Return the surface of a field without its deviations; a flat one if there is no field yet."""
+    moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
+    unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
+    return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)
 
 
 def _micro(value_m: float) -> str:
@@ -120,18 +83,17 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
     rows = Table.grid(padding=(0, 1), expand=True)
     rows.add_column(style="dim")
     rows.add_column(justify="right")
-    if patch.displacement_m is None:
-        depth, shear = float("nan"), "-"
-    else:
-        depth, shear = float(-patch.displacement_m[..., 2].min()), shear_arrow(patch.displacement_m)
-    rows.add_row("depth", _micro(depth))
+    surface = _surface(patch.displacement_m)
+    depth_m = math.nan if patch.displacement_m is None else surface.deepest_m
+    shear = shear_text(mean_shear_m(surface)) or "-"
+    rows.add_row("depth", _micro(depth_m))
     rows.add_row("±", _micro(patch.depth_std_m))
     rows.add_row("shear", shear)
     rows.add_row("err RMS", _micro(patch.error_m))
     rows.add_row("rate", f"{patch.rate_hz:.1f} Hz")
     good = patch.health == "operational" and patch.torn == 0
     return Panel(
-        Group(HeightMap(patch.displacement_m, full_scale_m), rows),
+        Group(HeightMap(surface, full_scale_m), rows),
         title=Text(patch.name),
         subtitle=Text(patch.health, "green" if good else "red"),
         width=MAP_SIZE + 4,

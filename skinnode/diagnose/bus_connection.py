@@ -96,14 +96,16 @@ class BusConnection:
 
     def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
         """Ask the node for its device type, twice if need be. Raises NodeError, whose message ends with
-        ``more``, if there is no valid answer."""
+        ``more``, if there is no valid answer.
+        """
         remote, since_ns = self.od(node_id), time.monotonic_ns()
         if not remote.answers() and not remote.answers():
             raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
 
     def wrong_answer(self, node_id: int, since_ns: int) -> str:
         """Return the newest frame received after ``since_ns`` in place of an SDO answer, as hexadecimal text;
-        empty if there was none. For a node without a valid answer."""
+        empty if there was none. For a node without a valid answer.
+        """
         newest = self.listener.node(node_id).newest_sdo
         if newest is None or newest[0] < since_ns:
             return ""
@@ -118,7 +120,8 @@ class BusConnection:
 
     def guarded(self, node_id: int) -> bool:
         """Whether the node expects a master to guard it: a remote frame of ours would then start its clock,
-        and our going away be taken for the master's."""
+        and our going away be taken for the master's.
+        """
         remote = self.od(node_id)
         try:
             return bool(remote.read(od.GUARD_TIME, 0, "u16") and remote.read(od.LIFE_TIME_FACTOR, 0, "u8"))
@@ -127,7 +130,8 @@ class BusConnection:
 
     def state(self, node_id: int, heartbeat_s: float | None, *, guarding: bool, since_ns: int = 0) -> State:
         """NMT state by the next heartbeat after ``since_ns``, or by guarding where there is none and
-        ``guarding`` allows it. ``heartbeat_s`` as of :meth:`heartbeat_s`."""
+        ``guarding`` allows it. ``heartbeat_s`` as of :meth:`heartbeat_s`.
+        """
         if heartbeat_s != 0:
             wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1
             beat = self._beat(node_id, since_ns, min(wait_s, LONGEST_HEARTBEAT_S))

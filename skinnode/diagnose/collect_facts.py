@@ -1,5 +1,6 @@
 """Gathers the facts of one bus. It listens and reads; unless told to be active it changes nothing, so that a
-hand that runs goes on as before."""
+hand that runs goes on as before.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def collect_facts(
     bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
 ) -> BusFacts:
     """Everything of one bus. ``active``: nodes that do not run are started, SYNC is sent where nobody does,
-    and they are pre-operational again at the end. A bus that fails is a fact, not an error."""
+    and they are pre-operational again at the end. A bus that fails is a fact, not an error.
+    """
     facts = BusFacts(
         bus.name,
         bus.interface,
@@ -151,7 +153,8 @@ def _examine(
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
     """The answer, or why there is none. Asked anew where that fails: a host that runs may have asked the node
-    at the same time, and a server has room for one transfer."""
+    at the same time, and a server has room for one transfer.
+    """
     failure = ""
     for pause_s in _PAUSES_S:
         time.sleep(pause_s)
@@ -173,7 +176,8 @@ def _listen(
     progress: Progress,
 ) -> tuple[bool, float]:
     """Take scans of the patches that run, or that are made to; whether SYNC was ours, and the load of the bus
-    in the busiest second of it."""
+    in the busiest second of it.
+    """
     overflows: dict[int, int] = {}
     for node_id, profile in profiles.items():
         overflows[node_id] = _overflow(connection, node_id)
@@ -210,7 +214,8 @@ def _listen(
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
     """Return the shortest SYNC period, s, at which a node that no host has configured finishes each scan
-    before the next; 0 for any other node. Bring-up sets an inhibit time that fits the hand's period."""
+    before the next; 0 for any other node. Bring-up sets an inhibit time that fits the hand's period.
+    """
     profile = profiles.get(patch.node_id)
     if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
         return 0.0
@@ -245,7 +250,8 @@ def _with_scans(
 
 def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
     """Count NMT commands that a host of this hand does not send: it starts its patches one by one, and
-    commands them to pre-operational. A second host of the same hand is detected by its SYNCs."""
+    commands them to pre-operational. A second host of the same hand is detected by its SYNCs.
+    """
     return sum(
         count
         for data, count in dict(heard.nmt).items()
@@ -258,7 +264,8 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
     """Count the frames of COB-IDs that neither the services, nor the nodes, nor ``others`` of the hand file
     explain. COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the
-    device; those of a patch of the hand that does not answer come from a host that polls it."""
+    device; those of a patch of the hand that does not answer come from a host that polls it.
+    """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}
     return {cob_id: count for cob_id, count in dict(heard.cob_ids).items() if cob_id not in explained}

@@ -49,7 +49,8 @@ def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_
     """Return the DCF of a device: its EDS with the value of each writable object and device commissioning.
 
     The file is UTF-8, whatever the encoding of the EDS; a string that UTF-8 would change is written byte by
-    byte."""
+    byte.
+    """
     parser = _parser(sheet.text)
     sections = {title.lower(): title for title in parser.sections()}
     written, as_bytes = 0, []
@@ -120,7 +121,8 @@ def _is_configuration(reading: Reading) -> bool:
 
 def _standard_form(reading: Reading, data: bytes) -> str | None:
     """Return the value in the form of CiA 306: numbers in hexadecimal, reals as their bit pattern, as
-    conforming tools expect. Returns None if no form of the standard preserves these bytes."""
+    conforming tools expect. Returns None if no form of the standard preserves these bytes.
+    """
     if reading.data_type in _STRINGS:
         return _plain(data, _STRINGS[reading.data_type])
     if reading.data_type in _OCTETS:

@@ -132,7 +132,8 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
 def _let_others_finish(connection: BusConnection) -> None:
     """Wait while another client's SDO transfers are under way: a question of ours would abort them. A host
-    has some at bring-up, and none while it runs."""
+    has some at bring-up, and none while it runs.
+    """
     end_s = time.monotonic() + OTHERS_S
     while time.monotonic() < end_s:
         before = _sdo_frames(connection)
@@ -148,7 +149,8 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
     """Nodes without a node-ID, and whether there are more than time allowed to find. They wait again at the
-    end."""
+    end.
+    """
     found: list[LssAddress] = []
     end_s = time.monotonic() + LSS_S
     if not connection.lss.any_unconfigured():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import html
 import io
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +14,7 @@ from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, ScanFacts
 from skinnode.diagnose.noise import LEAST_SCANS, analyse_noise
 from skinnode.diagnose.root_causes import Group
 from skinnode.model.layout import Float
-from skinnode.text.printable import printable_lines
+from skinnode.text.html_page import escaped, page
 from skinnode.text.words import counted, known
 
 _STYLE = """
@@ -35,24 +34,17 @@ def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> s
     """The report. Needs matplotlib where there are scans."""
     when = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
     parts = [
-        "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}: examination</title>',
-        f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{_text(title)}: {counted(len(groups), 'finding')}</h1>",
-        f"<p>{_text(when)}</p>",
+        f"<h1>{escaped(title)}: {counted(len(groups), 'finding')}</h1>",
+        f"<p>{escaped(when)}</p>",
         *(_group(group) for group in groups),
         *([] if groups else ["<p>No fault found in what was checked.</p>"]),
-        *(f"<p>Also on the bus: {_text(line)}</p>" for bus in buses for line in others(bus)),
-        *(f"<p>Not judged: {_text(line)}</p>" for bus in buses for line in not_judged(bus)),
+        *(f"<p>Also on the bus: {escaped(line)}</p>" for bus in buses for line in others(bus)),
+        *(f"<p>Not judged: {escaped(line)}</p>" for bus in buses for line in not_judged(bus)),
     ]
     for bus in buses:
         parts.append(_bus(bus))
         parts += [_patch(patch) for patch in bus.patches]
-    return "\n".join([*parts, "</body></html>", ""])
-
-
-def _text(text: object) -> str:
-    return html.escape(printable_lines(str(text)))
+    return page(f"{title}: examination", _STYLE, parts)
 
 
 def _group(group: Group) -> str:
@@ -63,9 +55,9 @@ def _group(group: Group) -> str:
 
 def _finding(finding: Finding, below: str = "") -> str:
     return (
-        f'<div class="finding {finding.sure}"><p><b>{_text(finding.where)}: {_text(finding.what)}</b> '
-        f'<span class="sure">{finding.sure}</span></p><p>{_text(finding.evidence)}</p>'
-        f"<p>→ {_text(finding.advice)}</p>{below}</div>"
+        f'<div class="finding {finding.sure}"><p><b>{escaped(finding.where)}: {escaped(finding.what)}</b> '
+        f'<span class="sure">{finding.sure}</span></p><p>{escaped(finding.evidence)}</p>'
+        f"<p>→ {escaped(finding.advice)}</p>{below}</div>"
     )
 
 
@@ -78,7 +70,7 @@ def _bus(bus: BusFacts) -> str:
         ("dropped by this machine", bus.dropped),
         ("SYNC", "our own" if bus.sync_ours else f"{len(bus.sync_s)} heard"),
     ]
-    return f"<h2>Bus {_text(bus.name)}</h2>{_table(rows)}"
+    return f"<h2>Bus {escaped(bus.name)}</h2>{_table(rows)}"
 
 
 def _patch(patch: PatchFacts) -> str:
@@ -98,11 +90,11 @@ def _patch(patch: PatchFacts) -> str:
     plots = ""
     if scans is not None and scans.scans >= LEAST_SCANS:
         plots = _maps(scans) + _timeline(scans)
-    return f"<h2>Patch {_text(patch.name)}</h2>{_table(rows)}{plots}"
+    return f"<h2>Patch {escaped(patch.name)}</h2>{_table(rows)}{plots}"
 
 
 def _table(rows: Sequence[tuple[str, object]]) -> str:
-    lines = "".join(f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows)
+    lines = "".join(f"<tr><th>{escaped(name)}</th><td>{escaped(value)}</td></tr>" for name, value in rows)
     return f"<table>{lines}</table>"
 
 

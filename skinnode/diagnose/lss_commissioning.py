@@ -63,7 +63,8 @@ def commission(
 ) -> Commissioned | None:
     """Set what is given; ``agreed`` is told the present node-ID before anything is written, and None is
     returned where it says no. Raises ConfigError for a node-ID that is taken or a node that is not there,
-    LssFailed where it refuses."""
+    LssFailed where it refuses.
+    """
     if node_id is not None and connection.ask_all(node_id, _ASK_DEVICE_TYPE, _ASKED_S):
         raise ConfigError("--node-id", node_id, "one that no other node has")
     if not connection.lss.select(address):

@@ -71,7 +71,8 @@ def command_nodes(
     connection: BusConnection, node_ids: Sequence[int], command: Command, *, at_once: bool
 ) -> list[Change]:
     """Command these nodes, ``at_once`` by one message to all nodes of the bus, else one after the other, and
-    see what they do. Raises BusError."""
+    see what they do. Raises BusError.
+    """
     watches = [_watch(connection, node_id) for node_id in node_ids]
     sent_ns = time.monotonic_ns()
     for node_id in [ALL_NODES] if at_once else node_ids:

@@ -132,7 +132,8 @@ class _Reader:
 
 def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None) -> NodeInfo:
     """Ask the node everything. ``sheet`` names the objects of a device other than a patch. Raises
-    NodeError where it does not answer."""
+    NodeError where it does not answer.
+    """
     remote = connection.od(node_id)
 
     def its_state() -> str:

@@ -118,7 +118,8 @@ def _roughness(series: Float) -> Float:
 
 def _unexplained(moved: Float) -> Float:
     """(U, K) deviation that is left of each crossing without the leading half of the functions of time of all
-    other upper wires, or of all other lower wires where that leaves more. ``moved`` has mean 0."""
+    other upper wires, or of all other lower wires where that leaves more. ``moved`` has mean 0.
+    """
     count = len(moved)
     flat = moved.reshape(count, -1)
     gram, left = flat @ flat.T, np.zeros(moved.shape[1:])
@@ -162,7 +163,8 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
     """Where each crossing made its largest step, how large that was, and whether it is all that happened: the
-    medians before and after differ by it, and little else does."""
+    medians before and after differ by it, and little else does.
+    """
     jumps = np.diff(safe, axis=0)
     at = np.abs(jumps).argmax(axis=0)
     by = np.take_along_axis(jumps, at[None], axis=0)[0]

@@ -1,5 +1,6 @@
 """The object dictionary of a node as people read and write it: named and typed by its EDS (CiA 306), dumped
-to a DCF, compared with an EDS or a DCF."""
+to a DCF, compared with an EDS or a DCF.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +64,8 @@ class Reading:
     @property
     def content(self) -> bytes | None:
         """Value as bytes, None if the node refused. Many nodes refuse to read an empty string for lack of
-        data: its content is empty."""
+        data: its content is empty.
+        """
         if self.refused_code == AbortCode.NO_DATA and self.data_type in _STRINGS:
             return b""
         return self.data
@@ -97,7 +99,8 @@ class Difference:
 
 def parse_address(text: str) -> tuple[int, int | None]:
     """``1018:4``, ``0x1018``: index in hexadecimal, as CANopen writes it, sub-index decimal or 0x… Raises
-    ConfigError."""
+    ConfigError.
+    """
     match = _ADDRESS.fullmatch(text)
     subindex = None if match is None or match[2] is None else int(match[2], 0)
     if match is None or (subindex or 0) > 255:
@@ -172,7 +175,8 @@ def unnamed(eds: Eds, index: int, subindex: int) -> EdsEntry:
 
 def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], int]) -> list[EdsEntry]:
     """Return the entries at an address: one value, or all of an object. An object that the EDS lacks is named
-    by CiA 301; an object that CiA 301 lacks too is accessed as given. ``count`` reads its sub-index 0."""
+    by CiA 301; an object that CiA 301 lacks too is accessed as given. ``count`` reads its sub-index 0.
+    """
     if subindex is None:
         listed = list(eds.between(index, index))
         if not listed:
@@ -222,7 +226,8 @@ def compare(
     remote: RemoteOd, eds: Eds, node_id: int, progress: Callable[[str], None] = lambda _: None
 ) -> list[Difference]:
     """Where the node is not as the file has it: every value that is given there and can be read, but for what
-    a node says of its own state."""
+    a node says of its own state.
+    """
     found: list[Difference] = []
     given = [
         entry
@@ -249,14 +254,16 @@ def compare(
 
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
     """Return whether the node's value is that of the file; a string may have trailing zeros that the default
-    of an EDS cannot express."""
+    of an EDS cannot express.
+    """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
     return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)
 
 
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
     """Return the texts of two different values; their bytes from the first difference on if the texts are
-    equal, as those of strings that differ in trailing zeros."""
+    equal, as those of strings that differ in trailing zeros.
+    """
     if got.data is None or expected.data is None or got.text != expected.text:
         return got.text, expected.text
     pairs = enumerate(zip(got.data, expected.data, strict=False))

@@ -144,14 +144,16 @@ RULES: Final = (
 
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
     """Return all findings of these buses grouped by root cause: groups with the most certain finding first,
-    then those with the most consequences."""
+    then those with the most consequences.
+    """
     groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
     return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))
 
 
 def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]:
     """Return each distinct finding once, with the places where it was made; an overload affects every
-    patch."""
+    patch.
+    """
     places: dict[str, list[Finding]] = {}
     for finding in findings:
         places.setdefault(finding.what, []).append(finding)

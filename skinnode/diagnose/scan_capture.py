@@ -25,7 +25,8 @@ _LONGEST_NS: Final = 10_000_000_000
 
 class ScanCapture:
     """Assembles the scans of some patches and notes every SYNC. :meth:`on_frames` is for the mainline of a
-    link; what it has is read when it is quiet."""
+    link; what it has is read when it is quiet.
+    """
 
     def __init__(self) -> None:
         self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
@@ -95,7 +96,8 @@ class ScanCapture:
 
     def _sync_ns(self, scan: Scan) -> int | None:
         """When the SYNC of a scan came: the newest before its first frame, of its counter where SYNCs have
-        one. The next SYNC may be there before the last frame."""
+        one. The next SYNC may be there before the last frame.
+        """
         for t_ns, number in reversed(list(self.syncs)):  # another thread may note one meanwhile
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None

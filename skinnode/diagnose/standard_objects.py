@@ -114,7 +114,8 @@ def standard_entry(index: int, subindex: int) -> EdsEntry | None:
 
 def standard_entries(index: int, count: int) -> Iterator[EdsEntry]:
     """Yield all entries of an object whose sub-index 0 reads ``count``, or the single entry of an object
-    without sub-indices."""
+    without sub-indices.
+    """
     item = _find(index)
     if item is None:
         return

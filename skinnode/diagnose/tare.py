@@ -81,7 +81,8 @@ def tare(
 ) -> Tared:
     """Tare one node and read its new baseline back. A node that does not answer, or refuses, gives a result,
     not an exception. ``sync_period_s``: SYNC period of a host that may be running. Raises BusError if the bus
-    fails."""
+    fails.
+    """
     try:
         return _tare(connection, node_id, patch, sync_period_s, progress)
     except NodeError as error:
@@ -130,7 +131,8 @@ def _runs(connection: BusConnection, node_id: int) -> bool:
 
 def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
     """Read the baseline: (U, K) R0 in ohm. Repeats the upload if another client interrupted it. Raises
-    NodeError if the upload fails or has the wrong size."""
+    NodeError if the upload fails or has the wrong size.
+    """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             data = remote.read_block(od.BASELINE_DOMAIN)
@@ -148,7 +150,8 @@ def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile
 
 def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
     """Wait until the node's SDO channel has been quiet for QUIET_S, or for ``at_least_s`` if no other client
-    begins; at most OTHERS_S."""
+    begins; at most OTHERS_S.
+    """
     begun_s = quiet_s = time.monotonic()
     request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)
     count, heard = -1, False

@@ -1,5 +1,8 @@
-"""A hand on a full screen: what `skinnode monitor` shows, and how it gets it without a host noticing.
+"""The full-screen view behind ``skinnode monitor``, of a running host or a recording.
 
-``source`` reads a running host or a recording, ``state`` makes a frozen view of that, ``paint`` and ``maps``
-make coloured text of the view, and ``app`` puts it on the terminal. Only the last needs textual.
+Data flows one way: ``source`` takes snapshots of a host or a recording without delaying it, ``view_model``
+condenses snapshots into a frozen view, ``touches`` finds contacts in a field, ``field_map`` draws fields,
+``patch_panel`` and ``screen`` lay out the lines of text, ``app`` shows them and handles keys, ``widgets`` and
+``terminal_driver`` write only what changed. ``report`` writes the view as JSON and collects faults. Only
+``app``, ``widgets`` and ``terminal_driver`` need textual.
 """

@@ -1,4 +1,4 @@
-"""The full screen: takes the newest from a source some times a second, and does what keys say."""
+"""The full-screen application: shows the newest view several times a second and handles keys."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from skinnode.monitor.report import FaultBook
 from skinnode.monitor.screen import screen
 from skinnode.monitor.source import Source
 from skinnode.monitor.terminal_driver import PatientDriver
-from skinnode.monitor.theme import Ui, theme_for
+from skinnode.monitor.theme import Paint, UiState, theme_for
 from skinnode.monitor.view_model import History, Level, LogLine, View, log_line, time_of_day
 from skinnode.monitor.widgets import Canvas, Dialog
 
 PERIOD_S: Final = 0.1
-"""From one picture to the next, at least."""
+"""Minimum interval between pictures."""
 SHARE: Final = 0.2
-"""Share of a processor that drawing may take: what costs more is drawn less often."""
+"""Maximum share of a processor for drawing; slow pictures are drawn less often."""
 SLOWEST_S: Final = 0.5
 
 _LOG_LINES: Final = 500
@@ -36,24 +36,32 @@ _BEGIN_S: Final = 3.0
 _MESSAGE_S: Final = 5.0
 
 HELP: Final = """\
- 1 … 9, ← →, tab   choose a patch
- z, enter          that patch alone, and back (also esc)
- t, T              tare it, or all of them: what is felt now is zero
- r                 record, and stop recording
- space             hold the picture; the host goes on
- a                 arrows of shear on the maps, or not
+ 1 … 9, ← →, tab   select a patch
+ z, enter          show that patch alone, or all (also esc)
+ t, T              tare it, or all patches: the present reading becomes zero
+ r                 start or stop a recording
+ space             freeze the picture; the host continues
+ a                 show or hide shear arrows on the maps
  q, ctrl-c         quit
 
- Bright is deep; the bar beside "touches" says how deep. Arrows show
- shear, to the right along the upper wires, upwards across them. A
- map without colours is an old one: its patch sends nothing now."""
+ Bright means deep; the scale beside "touches" says how deep. Arrows
+ show shear: right is along the upper wires, up is across them. A map
+ without colours is out of date: its patch sends nothing."""
 
-# What libraries warn of is for programmers.
-_SAID_BY_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
+_SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
+"""Loggers whose warnings the event log shows already."""
 
 
 class MonitorApp(App[None]):
-    """The monitor of a source, until a key, ``over`` or ``seconds`` end it. Recordings go to ``folder``."""
+    """The monitor of a source.
+
+    Args:
+        source: Host or recording; the caller closes it.
+        folder: Folder of recordings.
+        colours: Colours of the terminal.
+        over: Called on each turn; True ends the monitor.
+        seconds: Maximum duration; None for no limit.
+    """
 
     ENABLE_COMMAND_PALETTE = False
     CSS = "Screen { background: #11131a; } Screen:ansi { background: ansi_default; }"
@@ -84,9 +92,9 @@ class MonitorApp(App[None]):
         super().__init__(driver_class=PatientDriver, ansi_color=colours != "rgb")
         self.faults = FaultBook()
         self.failure: SkinError | None = None
-        """What ended the source."""
-        self._source, self._folder, self._told, self._seconds = source, folder, over, seconds
-        self._look = theme_for(colours)
+        """Error that ended the source."""
+        self._source, self._folder, self._over, self._seconds = source, folder, over, seconds
+        self._theme = theme_for(colours)
         self.canvas = Canvas()
         self._names = [patch.name for patch in source.hand.patches]
         self._selected = 0
@@ -105,32 +113,35 @@ class MonitorApp(App[None]):
         self._records = _Records(self._lines)
 
     def compose(self) -> ComposeResult:
+        """Yield the canvas."""
         yield self.canvas
 
     def on_mount(self) -> None:
+        """Begin to draw."""
         logging.getLogger().addHandler(self._records)
         self._begun_s = time.monotonic()
         self._cpu_s = time.thread_time()
         self._turn()
 
     def on_unmount(self) -> None:
+        """Give log messages back to the program."""
         logging.getLogger().removeHandler(self._records)
 
     @property
     def terminal_is_deaf(self) -> bool:
-        """After the end: whether the terminal took not even the last of what was written."""
+        """Whether the terminal did not take the last output before the end."""
         return isinstance(self._driver, PatientDriver) and self._driver.deaf
 
     @property
     def view(self) -> View:
-        """What is shown. There is something from the first turn on."""
+        """The view on the screen; there is one from the first turn on."""
         assert self._view is not None
         return self._view
 
     # --- the picture
 
     def _turn(self) -> None:
-        """Look and draw, and come back when it is time."""
+        """Take the newest view, draw it, and schedule the next turn."""
         now_s = time.monotonic()
         driver = self._driver
         gone = isinstance(driver, PatientDriver) and driver.gone
@@ -139,7 +150,7 @@ class MonitorApp(App[None]):
             self._look_at_source()
         except SkinError as error:
             self.failure = error
-        if gone or late or self._told() or self.failure is not None:
+        if gone or late or self._over() or self.failure is not None:
             self.exit()
             return
         self._draw()
@@ -153,7 +164,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns())
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # that a hand begins is no news
+            if not begins:  # at start every patch becomes operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -161,7 +172,7 @@ class MonitorApp(App[None]):
             self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
-        """Show how things are, unless the terminal has not taken the last picture yet: the next turn will."""
+        """Draw the view, unless the terminal is still busy with the last picture."""
         driver = self._driver
         if isinstance(driver, PatientDriver):
             if driver.busy:
@@ -169,14 +180,15 @@ class MonitorApp(App[None]):
             if driver.torn:
                 driver.torn = False
                 self.screen.refresh()
-        view, ui, full_m, log = self._view, self._ui(), self._scale.full_m, tuple(self._lines)
+        view, log = self._view, tuple(self._lines)
+        paint = Paint(self._theme, self._ui(), self._scale.full_m)
         if view is not None:
-            self.canvas.show(lambda width, height: screen(view, ui, log, full_m, self._look, width, height))
+            self.canvas.show(lambda width, height: screen(view, paint, log, width, height))
 
-    def _ui(self) -> Ui:
+    def _ui(self) -> UiState:
         now_s = time.monotonic()
         until_s, message, level = self._message
-        return Ui(
+        return UiState(
             title=self._source.title,
             selected=self._names[self._selected],
             elapsed_s=now_s - self._begun_s,
@@ -198,37 +210,46 @@ class MonitorApp(App[None]):
     # --- keys
 
     def action_leave(self) -> None:
+        """Quit."""
         self.exit()
 
     def action_choose(self, step: int) -> None:
+        """Select the next patch, or the previous one."""
         self._selected = (self._selected + step) % len(self._names)
         self._draw()
 
     def action_choose_number(self, number: int) -> None:
+        """Select a patch by its number, from 1."""
         if number <= len(self._names):
             self._selected = number - 1
             self._draw()
 
     def action_zoom(self) -> None:
+        """Show the selected patch alone, or all patches."""
         self._zoomed = not self._zoomed
         self._draw()
 
     def action_unzoom(self) -> None:
+        """Show all patches."""
         self._zoomed = False
         self._draw()
 
     def action_pause(self) -> None:
+        """Freeze the picture, or continue."""
         self._paused = not self._paused
         self._draw()
 
     def action_arrows(self) -> None:
+        """Show or hide shear arrows on the maps."""
         self._arrows = not self._arrows
         self._draw()
 
     def action_help(self) -> None:
+        """Show the keys."""
         self.push_screen(Dialog(HELP, question=False))
 
     def action_tare(self, everything: bool) -> None:
+        """Ask, then tare the selected patch or all patches."""
         names = self._names if everything else [self._names[self._selected]]
         if not self._source.live:
             self._say("a recording cannot be tared", "bad")
@@ -244,7 +265,7 @@ class MonitorApp(App[None]):
         )
 
     def _tare(self, names: list[str]) -> None:
-        """Tare on daemon threads, which nothing waits for, not even the exit of the monitor."""
+        """Tare on daemon threads, which do not delay the exit of the monitor."""
         self._say(f"{', '.join(names)}: tare requested")
 
         def tare(name: str) -> None:
@@ -259,11 +280,12 @@ class MonitorApp(App[None]):
             threading.Thread(target=tare, args=(name,), name=f"tare {name}", daemon=True).start()
 
     def _settle_tares(self) -> None:
-        """Tell what became of tares."""
+        """Show the results of tares."""
         while not self._tares.empty():
             self._say(*self._tares.get())
 
     async def action_record(self) -> None:
+        """Start or stop a recording."""
         source = self._source
         try:
             if source.recording is None:
@@ -280,20 +302,20 @@ class MonitorApp(App[None]):
 
 
 class _Records(logging.Handler):
-    """Warnings of the log, as lines on the screen: on the terminal they would destroy the picture."""
+    """Shows logged warnings in the event log; written to the terminal they would destroy the picture."""
 
     def __init__(self, lines: deque[LogLine]) -> None:
         super().__init__(logging.WARNING)
         self._lines = lines
 
     def emit(self, record: logging.LogRecord) -> None:
-        if record.name.startswith("skinnode") and record.name not in _SAID_BY_EVENTS:
+        if record.name.startswith("skinnode") and record.name not in _SHOWN_AS_EVENTS:
             text = " ".join(record.getMessage().split())
             self._lines.append(LogLine(time_of_day(int(record.created * 1e9)), "", text, "note"))
 
 
 def terminal_colours(environment: Mapping[str, str]) -> Colours:
-    """What the terminal has by its environment, as rich works it out."""
+    """Return the colours of the terminal, as rich derives them from environment variables."""
     from rich.console import Console
 
     if environment.get("NO_COLOR"):

@@ -1,8 +1,8 @@
-"""A field as characters: depth as brightness, shear as arrows. Plain functions; who paints gives the size.
+"""Draws a displacement field as characters: depth as brightness, shear as arrows. Pure functions.
 
-A map is seen as the skin is: x, along the upper wires, to the right; y, across them, upwards. Two pixels one
-above the other make a character, so they are about square. Where colours are few or none, a character shows
-the mean of its two pixels by a sign that is the heavier the deeper.
+The x axis, along the upper wires, points right; the y axis, across them, points up. Two pixels, one above the
+other, make a character, so a pixel is about square. Without colours, a character shows the mean of its two
+pixels as a sign; a denser sign means deeper.
 """
 
 from __future__ import annotations
@@ -25,58 +25,63 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 Colours = Literal["rgb", "ansi", "none"]
-"""What the terminal has: as many as wanted (or 256), the sixteen of old, or none, as NO_COLOR asks for."""
+"""Colours of the terminal: 256 or more, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
-"""A line of the screen, or a part of one."""
+"""A line of the screen, or a part of a line."""
 
 # Five points of matplotlib's "magma" (CC0): equal steps of depth look like equal steps of brightness.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
-"""Shades on the screen; more could not be told apart and would cost time and line to draw."""
+"""Number of shades. More could not be distinguished and would take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
-"""The level of skin of which nothing is known."""
+"""Level of skin without a measurement."""
 _SIGNS: Final = "·:-=+*#%@"
-"""From untouched to deep, each covering more of its character."""
+"""Signs from untouched to deep, each denser than the one before."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
 SURE: Final = 4.0
-"""Deviations from which a shear is drawn."""
+"""Minimum shear drawn, in standard deviations."""
 _SHORT: Final = 0.15
-"""Share of the full scale of shear below which no arrow is drawn."""
+"""Minimum shear drawn as an arrow, as a share of the full scale."""
 
 _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""The finest full scale, so that noise does not look like a touch."""
+"""Smallest full scale, m: noise must not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""How long a deep press keeps the scale coarse."""
+"""How long a deep press determines the scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A field, as far as maps show it. All (U, N), the first upper wire first; metres."""
+    """The part of a displacement field that maps show. Arrays are (U, N), upper wire 0 first, in metres."""
 
     depth_m: Float
-    """Positive where the skin is pressed in."""
+    """Positive where the skin is pressed inwards."""
     shear_m: Float
-    """(2, U, N) along the wires and across them."""
+    """(2, U, N): along the upper wires, across them."""
     shear_std_m: Float
     unknown: NDArray[np.bool_]
-    """Electrodes of which nothing is known."""
+    """Electrodes without a measurement."""
     aspect: float
-    """Width over height of the patch."""
+    """Width of the patch divided by its height."""
 
     @property
     def deepest_m(self) -> float:
-        """Of what is known."""
+        """Depth of the deepest electrode with a measurement, m."""
         return float(np.max(self.depth_m, initial=0.0, where=~self.unknown))
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """The surface of a patch with its electrodes at rest at ``upper_m`` (U, N, 3)."""
+    """Return what maps show of a field.
+
+    Args:
+        field: Newest field of the patch.
+        upper_m: (U, N, 3) positions of the electrodes at rest, m.
+    """
     moved = np.moveaxis(field.displacement_m, -1, 0)
     std_m = field.displacement_std_m
     return Surface(
@@ -89,7 +94,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
 
 def aspect_of(upper_m: Float) -> float:
-    """Width over height of a patch, each electrode standing for a cell of its own."""
+    """Return the width of a patch divided by its height; each electrode represents one cell."""
     wires, electrodes = upper_m.shape[:2]
     width, height = np.ptp(upper_m[..., :2].reshape(-1, 2), axis=0)
     width, height = width / max(electrodes - 1, 1) * electrodes, height / max(wires - 1, 1) * wires
@@ -97,15 +102,14 @@ def aspect_of(upper_m: Float) -> float:
 
 
 def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """The largest map of this shape in a box of characters; a character is twice as high as wide."""
+    """Return width and height of the largest map in a box; a character is twice as high as wide."""
     across = min(width, round(2 * height * aspect))
     return max(2, across), max(1, min(height, round(across / (2 * aspect))))
 
 
 @functools.lru_cache(maxsize=64)
 def _weights(size: int, n: int) -> Float:
-    """(size, n): how the pixels of a map take part in n electrodes; bilinear, each electrode in the middle of
-    its cell."""
+    """Return (size, n) bilinear weights of n electrodes in each pixel; electrodes are centres of cells."""
     at = np.clip((np.arange(size) + 0.5) / size * n - 0.5, 0.0, n - 1)
     low = np.minimum(at.astype(int), max(n - 2, 0))
     made = np.zeros((size, n))
@@ -115,18 +119,18 @@ def _weights(size: int, n: int) -> Float:
 
 
 def resample(grid: Float, width: int, height: int) -> Float:
-    """(height, width) pixels of a grid (U, N), the first upper wire in the last row."""
+    """Return (height, width) pixels of a (U, N) grid; upper wire 0 is the last row."""
     rows, columns = _weights(height, grid.shape[0]), _weights(width, grid.shape[1])
     return np.asarray((rows @ grid @ columns.T)[::-1])
 
 
 def arrow(x: float, y: float) -> str:
-    """The arrow of eight that comes nearest."""
+    """Return the arrow, one of eight, nearest to the direction (x, y)."""
     return ARROWS[round(math.atan2(y, x) / (math.pi / 4)) % 8]
 
 
 def mean_shear_m(surface: Surface) -> tuple[float, float]:
-    """The mean of the shear, weighted by depth; nothing where nothing is pressed."""
+    """Return the mean shear (x, y), m, weighted by depth; zero if nothing is pressed."""
     weight = np.where(surface.unknown, 0.0, np.clip(surface.depth_m, 0.0, None))
     total = float(weight.sum())
     if total <= 0.0:
@@ -136,15 +140,17 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """The depth drawn brightest: the least round number that the deepest press of the last seconds has
-    room in. One for all patches, so that they compare."""
+    """Depth drawn brightest: the smallest round number above the deepest press of the last seconds.
+
+    All patches share it, so that their maps compare.
+    """
 
     def __init__(self) -> None:
         self._peaks: deque[tuple[int, float]] = deque()
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Take a new picture into account."""
+        """Take the deepest press at ``t_ns``, m, into account."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -154,17 +160,31 @@ class Scale:
         self.full_m = next((step for step in _STEPS_M if step >= 0.999 * peak_m), _STEPS_M[-1])
 
 
+@dataclass(frozen=True, slots=True)
+class MapStyle:
+    """How maps are drawn."""
+
+    full_m: float
+    """Depth drawn brightest, m."""
+    colours: Colours
+
+    @property
+    def full_shear_m(self) -> float:
+        """Shear drawn brightest, m: rubber moves less along the surface than into it."""
+        return 0.25 * self.full_m
+
+
 def paint_map(
-    surface: Surface, width: int, height: int, full_m: float, colours: Colours, *, arrows: bool
+    surface: Surface, style: MapStyle, width: int, height: int, *, arrows: bool = False
 ) -> list[Line]:
-    """Depth as ``height`` lines of ``width`` characters, ``full_m`` the brightest; with ``arrows`` for shear
-    here and there, where there is any."""
+    """Draw depth as ``height`` lines of ``width`` characters; ``arrows`` adds arrows where there is shear."""
+    full_m, colours = style.full_m, style.colours
     levels = np.rint(
         np.clip(resample(surface.depth_m, width, 2 * height) / full_m, 0.0, 1.0) * (LEVELS - 1)
     ).astype(int)
     unknown = resample(surface.unknown.astype(float), width, 2 * height) > 0.5
     levels[unknown] = _UNKNOWN
-    drawn = _arrows_on(surface, width, height, full_m) if arrows else {}
+    drawn = _arrows_on(surface, style, width, height) if arrows else {}
     upper, lower = levels[0::2].tolist(), levels[1::2].tolist()
     return [
         _depth_line(above, below, {x: sign for (x, y), sign in drawn.items() if y == row}, colours)
@@ -172,8 +192,8 @@ def paint_map(
     ]
 
 
-def _arrows_on(surface: Surface, width: int, height: int, full_m: float) -> dict[tuple[int, int], str]:
-    """Arrows by column and line, every few characters: a press has room for several."""
+def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> dict[tuple[int, int], str]:
+    """Return arrows by column and line, spaced so that a press covers several."""
     down = 1 if height < 7 else 2 if height < 18 else 3
     across = 2 * down
     rows, columns = (
@@ -183,7 +203,7 @@ def _arrows_on(surface: Surface, width: int, height: int, full_m: float) -> dict
     x, y = (resample(axis, width, height) for axis in surface.shear_m)
     std = resample(np.where(np.isfinite(surface.shear_std_m), surface.shear_std_m, 1.0), width, height)
     size = np.hypot(x, y)
-    shown = size > np.maximum(SURE * std, _SHORT * shear_scale_m(full_m))
+    shown = size > np.maximum(SURE * std, _SHORT * style.full_shear_m)
     return {
         (column, row): arrow(x[row, column], y[row, column])
         for row, column in itertools.product(rows, columns)
@@ -191,14 +211,12 @@ def _arrows_on(surface: Surface, width: int, height: int, full_m: float) -> dict
     }
 
 
-def shear_scale_m(full_m: float) -> float:
-    """The shear drawn brightest: rubber gives way along the skin less than into it."""
-    return 0.25 * full_m
+def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
+    """Draw shear as arrows; larger shear is brighter.
 
-
-def paint_shear(surface: Surface, width: int, height: int, full_m: float, colours: Colours) -> list[Line]:
-    """Shear as arrows, the brighter the larger: one for each electrode as far as there is room, and between
-    them where there is more."""
+    Each electrode has an arrow if there is room; with more room there are arrows in between.
+    """
+    colours = style.colours
     wires, electrodes = surface.depth_m.shape
     across, down = min(6, max(2, width // electrodes)), min(3, max(1, height // wires))
     columns, rows = width // across, height // down
@@ -206,7 +224,7 @@ def paint_shear(surface: Surface, width: int, height: int, full_m: float, colour
     std = resample(np.where(np.isfinite(surface.shear_std_m), surface.shear_std_m, 1.0), columns, rows)
     unknown = resample(surface.unknown.astype(float), columns, rows) > 0.5
     size = np.hypot(x, y)
-    strength = np.clip(size / shear_scale_m(full_m), 0.0, 1.0)
+    strength = np.clip(size / style.full_shear_m, 0.0, 1.0)
     left, top = (width - across * columns + across) // 2, (height - down * rows + down) // 2
     drawn: dict[tuple[int, int], tuple[str, Style]] = {}
     for row, column in itertools.product(range(rows), range(columns)):
@@ -222,10 +240,10 @@ def paint_shear(surface: Surface, width: int, height: int, full_m: float, colour
     return [_grouped([drawn.get((column, row), blank) for column in range(width)]) for row in range(height)]
 
 
-def legend(full_m: float, width: int, colours: Colours, text: Style) -> Line:
-    """The colours from untouched to the brightest, with its depth."""
+def legend(style: MapStyle, width: int, text: Style) -> Line:
+    """Draw the colours from untouched to the brightest, with the depth of the brightest."""
     levels = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int).tolist()
-    return [*_depth_line(levels, levels, {}, colours), Segment(f" {1e6 * full_m:.0f} µm", text)]
+    return [*_depth_line(levels, levels, {}, style.colours), Segment(f" {1e6 * style.full_m:.0f} µm", text)]
 
 
 def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, str], colours: Colours) -> Line:
@@ -237,7 +255,7 @@ def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, st
 
 
 def _grouped(cells: Sequence[tuple[str, Style]]) -> Line:
-    """Segments of equal style in one: what is drawn costs by the segment."""
+    """Merge neighbours of equal style: drawing time grows with the number of segments."""
     return [
         Segment("".join(sign for sign, _ in run), style)
         for style, run in itertools.groupby(cells, key=lambda cell: cell[1])

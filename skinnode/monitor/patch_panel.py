@@ -1,9 +1,10 @@
-"""A patch as lines of text: as a tile among others, or alone with all that is known of it."""
+"""Draws a patch: as a tile among others, or alone with all its figures."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from rich.segment import Segment
@@ -12,28 +13,27 @@ from rich.style import Style
 from skinnode.canopen.nmt import STATE_NAMES
 from skinnode.monitor import field_map
 from skinnode.monitor.field_map import Line
-from skinnode.monitor.theme import Theme, Ui, beside, centred, pad, spread
+from skinnode.monitor.theme import Paint, Theme, beside, centred, pad, spread
 from skinnode.monitor.view_model import PatchView
 
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
-"""Conditions in which the newest field is an old one."""
+"""Conditions in which the newest field is out of date."""
 _AROUND: Final = 3
-"""Lines of a tile beside its map."""
+"""Lines of a tile besides its map."""
 _LEAST_OUTLINED: Final = (8, 5)
 """Minimum size of a box, in characters and lines, for a map with an outline."""
 _LABEL: Final = 10
-"""Width of the names of figures beside a patch alone."""
+"""Width of the names of figures, characters."""
 
 
-def tiles(
-    patches: Sequence[PatchView], ui: Ui, full_m: float, theme: Theme, width: int, height: int
-) -> list[Line]:
-    """All patches, in as many columns as make the maps largest; at most ``height`` lines."""
+def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
+    """Draw all patches in as many columns as make the maps largest; at most ``height`` lines."""
+    theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Lines of a map in one of so many columns."""
+        """Return the lines of a map if there are this many columns."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -43,31 +43,31 @@ def tiles(
     lines: list[Line] = []
     for first in range(0, count, columns):
         row = [
-            (_tile(first + number, patch, ui, full_m, theme, wide - 1, high), wide)
+            (_tile(first + number, patch, paint, wide - 1, high), wide)
             for number, patch in enumerate(patches[first : first + columns], 1)
         ]
         lines += [pad(line, width, theme) for line in beside(row, high, theme)]
     return lines[:height]
 
 
-def _tile(
-    number: int, patch: PatchView, ui: Ui, full_m: float, theme: Theme, width: int, height: int
-) -> list[Line]:
+def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) -> list[Line]:
+    theme, ui = paint.theme, paint.ui
     chosen = theme.chosen if patch.name == ui.selected else theme.strong
     forces = [touch.force_n for touch in patch.touches if touch.force_n is not None]
     force = [Segment(f"{sum(forces):.2f} N ", theme.text)] if forces and patch.condition not in GONE else []
     name = f" {number} {patch.name} " if width >= 12 else patch.name
     title = spread([Segment(name, chosen)], force if width >= 16 else [], width, theme)
-    body = _map(patch, ui, full_m, theme, width, height - _AROUND, arrows=ui.arrows)
+    body = _map(patch, paint, width, height - _AROUND, arrows=ui.arrows)
     return [title, *body, _figures(patch, theme, width), _health(patch, theme, width)]
 
 
-def _map(
-    patch: PatchView, ui: Ui, full_m: float, theme: Theme, width: int, height: int, *, arrows: bool
-) -> list[Line]:
-    """Draw the height map centred in its box. It has an outline because untouched skin is as dark as the
-    screen. The last map of a patch that is gone has no colours and shows the condition across it, so that
-    nobody takes it for live data."""
+def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
+    """Draw the height map centred in its box.
+
+    The map has an outline because untouched skin is as dark as the screen. The last map of a patch without
+    data has no colours and shows the condition across it, so that it cannot be taken for live data.
+    """
+    theme = paint.theme
     if patch.surface is None:
         blank = [pad([], width, theme) for _ in range(height)]
         blank[height // 2] = centred([Segment("no field", theme.dim)], width, theme)
@@ -76,17 +76,16 @@ def _map(
     gone = patch.condition in GONE
     lines = field_map.paint_map(
         patch.surface,
+        replace(paint.map_style, colours="none") if gone else paint.map_style,
         across,
         down,
-        full_m,
-        "none" if gone else theme.colours,
         arrows=arrows and not gone and down > 3,
     )
     if gone:
         lines = [[Segment(segment.text, theme.dim) for segment in line] for line in lines]
         age_s = patch.health.scan_age_s
-        told = [f" {patch.condition} ", *([f" for {_span(age_s)} "] if age_s is not None else [])]
-        for row, text in enumerate(told, max(0, down // 2 - 1)):
+        texts = [f" {patch.condition} ", *([f" for {_span(age_s)} "] if age_s is not None else [])]
+        for row, text in enumerate(texts, max(0, down // 2 - 1)):
             if row < down:
                 lines[row] = centred([Segment(text[:across], theme.alarm)], across, theme)
     if frame:
@@ -96,8 +95,10 @@ def _map(
 
 
 def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
-    """Return the size of the largest map of this shape in a box, and the characters that the outline takes on
-    each side: none in a small box."""
+    """Return width and height of the largest map in a box, and the characters that its outline takes.
+
+    A small box has no outline.
+    """
     frame = 2 if width >= _LEAST_OUTLINED[0] and height >= _LEAST_OUTLINED[1] else 0
     return (*field_map.fit(width - frame, height - frame, aspect), frame)
 
@@ -113,19 +114,19 @@ def outlined(lines: Sequence[Line], across: int, theme: Theme) -> list[Line]:
 
 
 def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
-    """How deep, and how far along the skin."""
+    """Draw depth and shear."""
     if patch.depth_m is None or patch.condition in GONE:
         return pad([], width, theme)
     line = [Segment(f" {1e6 * patch.depth_m:.0f}", theme.text)]
     if patch.depth_std_m is not None and width >= 18:
         line.append(Segment(f" ± {1e6 * patch.depth_std_m:.1f}", theme.dim))
     line.append(Segment(" µm", theme.dim))
-    shear = _shear(patch.shear_m)
+    shear = shear_text(patch.shear_m)
     return spread(line, [Segment(f"{shear} ", theme.text)] if width >= 20 else [], width, theme)
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """The condition with what is wrong, or else the rate."""
+    """Draw the condition with the first fault; without a fault, the rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
@@ -137,35 +138,36 @@ def _health(patch: PatchView, theme: Theme, width: int) -> Line:
     return spread([Segment(f" {patch.condition}", style)], rate, width, theme)
 
 
-def _shear(shear_m: tuple[float, float]) -> str:
-    """Arrow and size; nothing below a micrometre."""
+def shear_text(shear_m: tuple[float, float]) -> str:
+    """Return a shear, m, as an arrow and a size; empty below a micrometre."""
     size_um = 1e6 * float((shear_m[0] ** 2 + shear_m[1] ** 2) ** 0.5)
     return "" if size_um < 1.0 else f"{field_map.arrow(*shear_m)} {size_um:.0f} µm"
 
 
-def alone(patch: PatchView, ui: Ui, full_m: float, theme: Theme, width: int, height: int) -> list[Line]:
-    """One patch: depth, shear, and everything that is known of it."""
+def alone(patch: PatchView, paint: Paint, width: int, height: int) -> list[Line]:
+    """Draw one patch: depth, shear and all figures."""
+    theme, style = paint.theme, paint.map_style
     high = height - 2
     aspect = 1.0 if patch.surface is None else patch.surface.aspect
     wide = max(8, (width - 36) // 2)
     across, down, frame = _fit(wide, high, aspect)
-    depth = _map(patch, ui, full_m, theme, across + frame, down + frame, arrows=False)
+    depth = _map(patch, paint, across + frame, down + frame, arrows=False)
     blocks = [
         (
             [
                 _caption("depth", theme),
                 *depth,
-                field_map.legend(full_m, max(2, min(12, across - 8)), theme.colours, theme.text),
+                field_map.legend(style, max(2, min(12, across - 8)), theme.text),
             ],
             across + frame + 2,
         )
     ]
     if patch.surface is not None and patch.condition not in GONE:
-        shear = field_map.paint_shear(patch.surface, across, down, full_m, theme.colours)
+        shear = field_map.paint_shear(patch.surface, style, across, down)
         if frame:
             shear = outlined(shear, across, theme)
-        said = f"→ brightest {1e6 * field_map.shear_scale_m(full_m):.0f} µm"
-        blocks.append(([_caption("shear", theme), *shear, [Segment(said, theme.dim)]], across + frame + 2))
+        caption = f"→ brightest {1e6 * style.full_shear_m:.0f} µm"
+        blocks.append(([_caption("shear", theme), *shear, [Segment(caption, theme.dim)]], across + frame + 2))
     else:
         blocks.append(([_caption("shear", theme)], across + frame + 2))
     rest = width - sum(wide for _, wide in blocks) - 1
@@ -181,7 +183,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
-    """All figures of a patch, a name and a value a line."""
+    """Return all figures of a patch, a name and a value on each line."""
     health, stream = patch.health, patch.stream
     counts = stream.assembler
     lines = [
@@ -206,7 +208,7 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
     if patch.depth_m is not None:
         std = "" if patch.depth_std_m is None else f" ± {1e6 * patch.depth_std_m:.1f}"
         fact("deepest", f"{1e6 * patch.depth_m:.1f}{std} µm")
-        fact("shear", _shear(patch.shear_m) or "none")
+        fact("shear", shear_text(patch.shear_m) or "none")
         trust = "trusted" if patch.trusted else "not trusted"
         fact("field", f"{patch.method}, {trust}", theme.text if patch.trusted else theme.note)
     fact("scans", f"{patch.rate_hz:.1f}/s, newest {patch.scan}" if patch.scan is not None else "none yet")
@@ -236,12 +238,11 @@ def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-
     return textwrap.wrap(text, width) or [""]
 
 
 def _span(seconds: float) -> str:
-    """A time for people."""
+    """Return a duration in a readable unit."""
     if seconds < 1.0:
         return f"{1e3 * seconds:.0f} ms"
     if seconds < 120.0:

@@ -1,4 +1,4 @@
-"""What is left of a session when the screen is gone, and what programs get instead of one."""
+"""The faults of a session, reported at its end, and the view as JSON for programs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ SETTLE_NS: Final = 3_000_000_000
 """How long a patch may take to become operational before the monitor counts it as a fault."""
 
 LOOK_S: Final = 0.1
+"""Interval at which the source is checked for faults."""
+
 LINE_S: Final = 1.0
-"""How often a program is told, and how often it is looked for faults."""
+"""Interval of the JSON lines."""
 
 
 class FaultBook:
-    """What was wrong during a session, each fault once, in the order it was seen."""
+    """Faults of a session, each once, in the order of their appearance."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[str, str], str] = {}
@@ -31,12 +33,17 @@ class FaultBook:
 
     @property
     def lines(self) -> list[str]:
-        """A line each."""
+        """One line for each fault."""
         return list(self._found.values())
 
     def update(self, view: View, real_ns: int, *, ending: bool = False) -> None:
-        """Write down what is wrong at ``real_ns``, by the clock of the monitor; ``ending``: for the last
-        time, so that nothing is waited for any more."""
+        """Note every fault in a view.
+
+        Args:
+            view: The hand now.
+            real_ns: Monotonic time of the monitor, ns; not that of a recording.
+            ending: Whether the session ends: patches that are not operational yet then count as faults.
+        """
         if self._begun_ns is None:
             self._begun_ns = real_ns
         patient = not ending and real_ns - self._begun_ns < SETTLE_NS
@@ -59,7 +66,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """What is wrong beside the condition; what makes it one fault, and its text."""
+    """Return the faults besides the condition: a key that identifies the fault, and its text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:
@@ -71,16 +78,25 @@ def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
 
 
 def watch(
-    source: Source, told: threading.Event, seconds: float | None, faults: FaultBook
+    source: Source, stop: threading.Event, seconds: float | None, faults: FaultBook
 ) -> Iterator[dict[str, Any]]:
-    """A table for programs every second until told, time is up or the source is over, and one at the end;
-    what was wrong meanwhile goes into ``faults``. Raises the SkinError that ended the source."""
+    """Yield the view as a JSON table every second, and once more at the end.
+
+    Args:
+        source: Host or recording.
+        stop: Ends the iteration.
+        seconds: Maximum duration; None for no limit.
+        faults: Receives the faults of the session.
+
+    Raises:
+        SkinError: The source failed.
+    """
     begun_s = due_s = time.monotonic()
     due_s += LINE_S
     history = History(source.hand, live=source.live)
     ending, pending = False, list[str]()
     while not ending:
-        ending = told.wait(LOOK_S) or source.over
+        ending = stop.wait(LOOK_S) or source.over
         now_s = time.monotonic()
         ending |= seconds is not None and now_s >= begun_s + seconds
         view = history.add(source.snapshot())
@@ -93,7 +109,7 @@ def watch(
 
 
 def as_json(view: View) -> dict[str, Any]:
-    """The view for programs: without the fields themselves."""
+    """Return the view for programs, without the fields."""
     return {
         "patches": {patch.name: _patch_json(patch) for patch in view.patches},
         "buses": {

@@ -1,4 +1,4 @@
-"""The screen as lines of text: header, buses, patches, touches and log, of any size."""
+"""Draws the whole screen at any size: header, buses, patches, touches, event log, keys."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ from rich.segment import Segment
 from skinnode.monitor import field_map
 from skinnode.monitor.field_map import Line
 from skinnode.monitor.patch_panel import GONE, alone, facts, tiles
-from skinnode.monitor.theme import Theme, Ui, beside, pad, spread, width_of
+from skinnode.monitor.theme import Paint, Theme, UiState, beside, pad, spread, width_of
 from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import BusView, LogLine, PatchView, View
 from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
-"""A smaller screen shows only how large it would have to be."""
+"""Minimum size of the screen, characters; a smaller one shows only what it needs."""
 
 
-def screen(
-    view: View, ui: Ui, log: Sequence[LogLine], full_m: float, theme: Theme, width: int, height: int
-) -> list[Line]:
-    """``height`` lines of ``width`` characters; the log's newest line is its last."""
+def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
+    """Draw ``height`` lines of ``width`` characters; the newest line of ``log`` is its last."""
+    theme, ui = paint.theme, paint.ui
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
-        told = f"{width} × {height} is too small: {LEAST_WIDTH} × {LEAST_HEIGHT} at least"
-        return [pad([Segment(told[:width], theme.text)], width, theme)] + [
+        text = f"{width} × {height} is too small: {LEAST_WIDTH} × {LEAST_HEIGHT} at least"
+        return [pad([Segment(text[:width], theme.text)], width, theme)] + [
             pad([], width, theme) for _ in range(height - 1)
         ]
     worst_first = sorted(view.buses, key=lambda bus: ("bad", "note", "good").index(bus.level))
@@ -35,26 +34,21 @@ def screen(
     upper = height - 2 - len(buses) - (8 if height < 28 else 12)
     if ui.zoomed:
         patch = view.patch(ui.selected)
-        middle = alone(patch, ui, full_m, theme, width, upper)
+        middle = alone(patch, paint, width, upper)
         log = [line for line in log if line.subject in (patch.name, patch.bus, "")]
     else:
-        middle = tiles(view.patches, ui, full_m, theme, width, upper)
+        middle = tiles(view.patches, paint, width, upper)
     lower = height - 2 - len(buses) - len(middle)
     return [
         _header(view, ui, theme, width),
         *buses,
         *middle,
-        *_lower(view, ui, log, full_m, theme, width, lower),
+        *_lower(view, paint, log, width, lower),
         _keys(ui, theme, width),
     ]
 
 
-def as_text(lines: Sequence[Line]) -> str:
-    """Without styles, for tests and for people who cannot see colours."""
-    return "\n".join("".join(segment.text for segment in line) for line in lines)
-
-
-def _header(view: View, ui: Ui, theme: Theme, width: int) -> Line:
+def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
     bar = theme.bar
     seconds = int(ui.elapsed_s)
     left = [
@@ -119,7 +113,7 @@ def _bus_line(bus: BusView, losses: str, theme: Theme, width: int) -> Line:
     return spread(line, where, width, theme)
 
 
-def _keys(ui: Ui, theme: Theme, width: int) -> Line:
+def _keys(ui: UiState, theme: Theme, width: int) -> Line:
     if ui.message:
         style = theme.alarm if ui.message_level == "bad" else theme.key
         return pad([Segment(f" {ui.message} ", style)], width, theme, theme.bar)
@@ -136,14 +130,12 @@ def _keys(ui: Ui, theme: Theme, width: int) -> Line:
 # --- touches and log
 
 
-def _lower(
-    view: View, ui: Ui, log: Sequence[LogLine], full_m: float, theme: Theme, width: int, height: int
-) -> list[Line]:
-    """Touches and events: below each other, or beside where there is room. Where there is a lot, the figures
-    of the patch that is chosen as well."""
+def _lower(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
+    """Draw touches above events; on a wide screen side by side, with the figures of the selected patch."""
+    theme, ui = paint.theme, paint.ui
     chosen = view.patch(ui.selected)
     patches = (chosen,) if ui.zoomed else view.patches
-    scale = [] if ui.zoomed else field_map.legend(full_m, 10, theme.colours, theme.text)
+    scale = [] if ui.zoomed else field_map.legend(paint.map_style, 10, theme.text)
     if width >= 130:
         left = min(80, width // 2)
         figures = [] if ui.zoomed else [[], *facts(chosen, theme, left - 2)]

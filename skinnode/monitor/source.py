@@ -1,5 +1,7 @@
-"""Where the monitor looks: a running host, or a recording that is played. Only the newest is taken, and
-nothing here makes the host wait."""
+"""The monitor's data sources: a running host, or a recording that is replayed.
+
+Only the newest data is taken, and nothing here makes the host wait.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +26,15 @@ from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
 _EVENTS: Final = 500
-"""Events that are kept for a screen that is not drawn meanwhile."""
+"""Maximum events kept until the screen is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A hand at one instant; by patch or by bus."""
+    """A hand at one instant, by patch or by bus."""
 
     t_ns: int
-    """By the clock of the source, which is the one of all its times: that of a recording for a recording."""
+    """Monotonic time, ns, of the host; of the recording host for a recording."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -42,7 +44,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A recording under way."""
+    """Progress of a recording."""
 
     path: Path
     frames: int
@@ -51,44 +53,46 @@ class Recording:
 
 
 class Source(Protocol):
-    """What the screen needs. All methods return at once but those of recording."""
+    """What the screen needs. All methods return at once, except those that start and stop a recording."""
 
     hand: HandConfig
     title: str
     live: bool
-    """Whether it can be tared and recorded."""
+    """Whether patches can be tared and recorded."""
 
     def snapshot(self) -> Snapshot:
-        """How things are now. Raises the SkinError that ended the source, if one did."""
+        """Return the hand now. Raises the SkinError that ended the source."""
 
     def events(self) -> list[HealthEvent]:
-        """What happened since it was asked last."""
+        """Return the events since the last call."""
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will come."""
+        """Whether the source has ended."""
 
     @property
     def flaws(self) -> list[str]:
-        """What of a recording could not be read or is not there, as far as it was played."""
+        """Parts of a recording, as far as it was replayed, that are missing or cannot be read."""
 
     def tare(self, patch: str) -> None:
-        """See :meth:`Host.tare`."""
+        """Tare a patch, as :meth:`Host.tare` does."""
 
     @property
-    def recording(self) -> Recording | None: ...
+    def recording(self) -> Recording | None:
+        """Progress of the recording; None if there is none."""
 
     def record(self, folder: Path) -> Path:
-        """Begin to record. Raises ConfigError where it cannot be written."""
+        """Start a recording and return its path. Raises ConfigError if it cannot be written."""
 
     def stop_recording(self) -> Recording:
-        """End the recording; what it came to."""
+        """End the recording and return its final figures."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release what the source holds."""
 
 
 class HostSource:
-    """A running host; its owner closes it."""
+    """Source for a running host; the host's owner closes the host."""
 
     live = True
 
@@ -96,12 +100,13 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # the host tells its subscribers why it cannot go on
+        self._fields = host.fields(capacity=_CAPACITY)  # subscribers learn why the host failed
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
     def snapshot(self) -> Snapshot:
-        for _ in range(_CAPACITY + 1):  # behind the fields may be a failure
+        """Return the hand now."""
+        for _ in range(_CAPACITY + 1):  # a failure may follow the fields
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(
@@ -114,34 +119,41 @@ class HostSource:
         )
 
     def events(self) -> list[HealthEvent]:
+        """Return the events since the last call."""
         return drain(self._events)
 
     @property
     def over(self) -> bool:
+        """Whether the source has ended."""
         return False
 
     @property
     def flaws(self) -> list[str]:
+        """Flaws of the recording."""
         return []
 
     def tare(self, patch: str) -> None:
+        """Tare a patch."""
         self._host.tare(patch)
 
     @property
     def recording(self) -> Recording | None:
+        """Progress of the recording; None if there is none."""
         if self._recorder is None:
             return None
         stats = self._recorder.stats()
         return Recording(self._recorder.path, stats.frames, stats.dropped, stats.failure)
 
     def record(self, folder: Path) -> Path:
+        """Start a recording."""
         recorder = Recorder(self.hand, folder)
         self._recorder, self._untap = recorder, self._host.tap(recorder)
         return recorder.path
 
     def stop_recording(self) -> Recording:
+        """End the recording."""
         recorder, untap = self._recorder, self._untap
-        assert recorder is not None  # of a recording under way
+        assert recorder is not None
         assert untap is not None
         untap()
         recorder.close()
@@ -151,6 +163,7 @@ class HostSource:
         return ended
 
     def close(self) -> None:
+        """Release what the source holds."""
         if self._recorder is not None:
             self.stop_recording()
         self._fields.close()
@@ -165,7 +178,7 @@ class HostSource:
 
 
 class ReplaySource:
-    """A recording, played on a thread of its own from construction to :meth:`close`."""
+    """Source for a recording, replayed on its own thread from construction to :meth:`close`."""
 
     live = False
 
@@ -174,13 +187,14 @@ class ReplaySource:
         self._run = run
         self._failure: SkinError | None = None
         self._running = ExitStack()
-        self._tell = tell = Events()
-        self._events: EventSubscription = tell.subscribe(_EVENTS)
-        self._running.enter_context(HealthWatch(self._health, self._bus_health, tell))
+        self._publish = events = Events()
+        self._events: EventSubscription = events.subscribe(_EVENTS)
+        self._running.enter_context(HealthWatch(self._health, self._bus_health, events))
         self._thread = threading.Thread(target=self._play, name="replay", daemon=True)
         self._thread.start()
 
     def snapshot(self) -> Snapshot:
+        """Return the hand now."""
         if self._failure is not None:
             raise self._failure
         return Snapshot(
@@ -193,30 +207,38 @@ class ReplaySource:
         )
 
     def events(self) -> list[HealthEvent]:
+        """Return the events since the last call."""
         return drain(self._events)
 
     @property
     def over(self) -> bool:
+        """Whether the source has ended."""
         return not self._thread.is_alive()
 
     @property
     def flaws(self) -> list[str]:
+        """Flaws of the recording."""
         return self._run.flaws
 
     def tare(self, patch: str) -> None:
+        """Tare a patch."""
         raise SkinError("a recording cannot be tared")
 
     @property
     def recording(self) -> Recording | None:
+        """Progress of the recording; None if there is none."""
         return None
 
     def record(self, folder: Path) -> Path:
+        """Start a recording."""
         raise SkinError("this is a recording already")
 
     def stop_recording(self) -> Recording:
+        """End the recording."""
         raise SkinError("this is a recording already")
 
     def close(self) -> None:
+        """Release what the source holds."""
         self._run.stop()
         self._thread.join()
         self._running.close()
@@ -234,8 +256,8 @@ class ReplaySource:
             for _ in self._run:
                 pass
             for flaw in self._run.flaws:
-                self._tell.tell(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # it must reach the user, not die with the thread
+                self._publish.tell(HealthEvent(self._run.clock(), self.title, "recording", flaw))
+        except Exception as error:  # the user must see it
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:
@@ -264,7 +286,7 @@ class ReplaySource:
 
 
 def drain(subscription: EventSubscription) -> list[HealthEvent]:
-    """All events that wait. A closed host has one more item, which is none."""
+    """Return all queued events; a closed host ends its queue with None."""
     found: list[HealthEvent] = []
     while (event := subscription.get(0.0)) is not None:
         found.append(event)

@@ -1,4 +1,4 @@
-"""A terminal that may stall, as over a slow line, or go away: neither holds up who draws, or the end."""
+"""Terminal output that never blocks: the terminal may stall, as over a slow line, or disappear."""
 
 from __future__ import annotations
 
@@ -13,78 +13,92 @@ from textual.drivers.linux_driver import LinuxDriver
 if TYPE_CHECKING:
     from textual.app import App
 
-_LAST_WORDS_S: Final = 1.0
-"""How long the end waits for a terminal to take what is still to be written."""
+_STDOUT: Final = 1
+
+_MAX_QUEUED: Final = 30
+"""Maximum writes queued for the terminal: a few pictures."""
+
+_END_S: Final = 1.0
+"""Maximum wait at the end for a terminal to take what is queued."""
 
 
-class _Output:
-    """Standard output as a file that never raises: python's own would keep a lock while the terminal stalls,
-    and the end of the interpreter would wait for it."""
+class _Writer(threading.Thread):
+    """Writes text to a file descriptor on a daemon thread.
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self.gone = threading.Event()
+    It does not use Python's own standard output, which would hold a lock while the terminal stalls; the
+    interpreter would wait for that lock at exit.
+    """
 
-    def write(self, text: str) -> None:
-        data = text.encode("utf-8", "replace")
-        while data and not self.gone.is_set():
-            try:
-                data = data[os.write(self._descriptor, data) :]
-            except OSError:
-                self.gone.set()
+    def __init__(self, descriptor: int, gone: threading.Event) -> None:
+        super().__init__(daemon=True, name="terminal-output")
+        self.queue: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
+        self._descriptor, self._gone = descriptor, gone
 
-    def flush(self) -> None:
-        """Nothing is kept."""
+    def run(self) -> None:
+        """Write until None is queued."""
+        while (text := self.queue.get()) is not None:
+            data = text.encode("utf-8", "replace")
+            while data and not self._gone.is_set():
+                try:
+                    data = data[os.write(self._descriptor, data) :]
+                except OSError:
+                    self._gone.set()
 
-    def fileno(self) -> int:
-        return self._descriptor
+    def end(self) -> None:
+        """Stop after what is queued. A thread that waits for a stalled terminal ends with the process."""
+        with suppress(queue.Full):
+            self.queue.put_nowait(None)
+        self.join(_END_S)
 
 
 class PatientDriver(LinuxDriver):
-    """Textual's driver, which can say that the terminal has not taken the last picture yet, or is gone."""
+    """Textual driver that reports whether the terminal is behind, or gone, instead of waiting for it."""
 
     def __init__(self, app: App[Any], **options: Any) -> None:
         super().__init__(app, **options)
-        self._output = _Output(1)
-        self._file: Any = self._output
+        self._gone = threading.Event()
+        self._writer: _Writer | None = None
         self.torn = False
-        """Something was not written since too much waited; the picture has to be drawn anew."""
+        """Whether output was discarded because the queue was full; the screen must then be redrawn."""
+
+    def start_application_mode(self) -> None:
+        """Start the writer thread, then enter application mode."""
+        self._writer = _Writer(_STDOUT, self._gone)
+        self._writer.start()
+        super().start_application_mode()  # type: ignore[no-untyped-call]
 
     def write(self, data: str) -> None:
-        """Never waits: what finds the line full is thrown away."""
-        writer = self._writer_thread
-        if writer is None or writer._queue.full():
+        """Queue ``data`` for the terminal; discard it if the queue is full."""
+        try:
+            if self._writer is not None:
+                self._writer.queue.put_nowait(data)
+        except queue.Full:
             self.torn = True
-        else:
-            writer.write(data)
 
     @property
     def busy(self) -> bool:
-        """Whether something is still to be written: a new picture would only wait behind it."""
-        writer = self._writer_thread
-        return writer is not None and writer._queue.qsize() > 0
+        """Whether output is still queued; a new picture would only wait behind it."""
+        return self._writer is not None and self._writer.queue.qsize() > 0
 
     @property
     def gone(self) -> bool:
-        """Whether the terminal does not exist any more."""
-        return self._output.gone.is_set()
+        """Whether the terminal no longer exists."""
+        return self._gone.is_set()
 
     @property
     def deaf(self) -> bool:
-        """Whether what is written now would wait for a terminal that stalls, or find none."""
-        writer = self._writer_thread
-        return self.gone or (writer is not None and writer.is_alive())
+        """Whether a write would block on a stalled terminal, or find none."""
+        return self.gone or (self._writer is not None and self._writer.is_alive())
 
-    def _run_input_thread(self) -> None:
+    def run_input_thread(self) -> None:
+        """Read keys until the end; an input error means that the terminal is gone."""
         try:
-            self.run_input_thread()
+            super().run_input_thread()
         except OSError:
-            self._output.gone.set()
+            self._gone.set()
 
     def close(self) -> None:
-        """End the writing thread; one that waits for a stalled terminal is left to end with the process."""
-        writer = self._writer_thread
-        if writer is not None:
-            with suppress(queue.Full):
-                writer._queue.put_nowait(None)
-            writer.join(_LAST_WORDS_S)
+        """End the writer thread, then Textual's."""
+        if self._writer is not None:
+            self._writer.end()
+        super().close()

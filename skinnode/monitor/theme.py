@@ -1,4 +1,4 @@
-"""What lines of the screen are made with: styles, choices of the user, and lines of a width."""
+"""Styles of the screen, what the user has chosen, and the layout of styled text in lines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.cells import cell_len, set_cell_size
 from rich.segment import Segment
 from rich.style import Style
 
-from skinnode.monitor.field_map import Colours, Line
+from skinnode.monitor.field_map import Colours, Line, MapStyle
 from skinnode.monitor.source import Recording
 from skinnode.monitor.view_model import Level
 from skinnode.text.printable import printable
@@ -17,30 +17,30 @@ from skinnode.text.printable import printable
 
 @dataclass(frozen=True, slots=True)
 class Theme:
-    """Styles for a number of colours."""
+    """Styles for a terminal with the given colours."""
 
     colours: Colours
     text: Style
     dim: Style
     strong: Style
     bar: Style
-    """Header and keys."""
+    """Style of header and key bar."""
     key: Style
     good: Style
     note: Style
     bad: Style
     chosen: Style
     alarm: Style
-    """A recording, a pause, a patch that is gone."""
+    """Style of a recording, a pause, a lost patch."""
     gauge: Style
 
     def of(self, level: Level) -> Style:
-        """The style of a level."""
+        """Return the style of a level."""
         return {"good": self.good, "note": self.note, "bad": self.bad}[level]
 
 
 def theme_for(colours: Colours) -> Theme:
-    """The styles that a terminal of so many colours can show."""
+    """Return the theme for a terminal with the given colours."""
     if colours == "none":
         plain, bold = Style(), Style(bold=True)
         back = Style(reverse=True)
@@ -80,8 +80,8 @@ def theme_for(colours: Colours) -> Theme:
 
 
 @dataclass(frozen=True, slots=True)
-class Ui:
-    """What the person at the keys has chosen, and what is told about it."""
+class UiState:
+    """What the user has chosen, and the message in the key bar."""
 
     title: str
     selected: str
@@ -90,15 +90,30 @@ class Ui:
     paused: bool = False
     arrows: bool = True
     over: bool = False
-    """A recording has ended."""
+    """Whether the recording has ended."""
     live: bool = True
     recording: Recording | None = None
     message: str = ""
     message_level: Level = "good"
 
 
+@dataclass(frozen=True, slots=True)
+class Paint:
+    """What every part of the screen is drawn with."""
+
+    theme: Theme
+    ui: UiState
+    full_m: float
+    """Depth drawn brightest, m."""
+
+    @property
+    def map_style(self) -> MapStyle:
+        """Style of the maps."""
+        return MapStyle(self.full_m, self.theme.colours)
+
+
 def pad(line: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """``line`` cut or filled up to ``width``."""
+    """Return ``line`` cut or padded to ``width`` characters."""
     made, left = [], width
     for segment in line:
         if left <= 0:
@@ -114,17 +129,18 @@ def pad(line: Line, width: int, theme: Theme, style: Style | None = None) -> Lin
 
 
 def width_of(line: Line) -> int:
+    """Return the width of a line in characters."""
     return sum(cell_len(segment.text) for segment in line)
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """``right`` at the right end; ``left`` gives way."""
+    """Put ``right`` at the right end of a line; ``left`` is cut if there is no room for both."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 
 
 def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) -> list[Line]:
-    """Blocks of lines, each with its width, side by side."""
+    """Put blocks of lines, each with its width, side by side."""
     return [
         [
             segment
@@ -136,5 +152,6 @@ def beside(blocks: Sequence[tuple[list[Line], int]], height: int, theme: Theme) 
 
 
 def centred(line: Line, width: int, theme: Theme) -> Line:
+    """Centre ``line`` in ``width`` characters."""
     left = max(0, width - width_of(line)) // 2
     return pad([Segment(" " * left, theme.text), *line], width, theme)

@@ -1,4 +1,4 @@
-"""What presses on a patch, by what its field has to tell."""
+"""Finds what presses on a patch, from its field."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Share of the deepest from which skin counts as touched, where contacts are told by depth alone: under
-Hertz's pressure the skin at the rim of the contact is half as deep as in its middle."""
+"""Minimum depth of touched skin, as a share of the deepest, if contacts are found by depth alone. Under
+Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
-"""Deviations of depth that make a touch; of 100 electrodes, noise does so once in 10 million fields."""
+"""Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds it once in 10 million
+fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touch:
-    """Something that presses on a patch. The posterior tells forces; of an exact field without a stiffness
-    there is place, area and depth alone. Numbers with their deviation where there is one, None: unknown."""
+    """One contact on a patch; None for unknown figures.
+
+    The posterior estimates forces. An exact field without a stiffness has only place, area and depth.
+    """
 
     x_m: float
     y_m: float
@@ -35,8 +38,15 @@ class Touch:
 
 
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
-    """What presses on a patch, the strongest first: the posterior's contacts; of an exact field, patches of
-    skin pressed in, with the force where a stiffness was given."""
+    """Return the contacts on a patch, the strongest first.
+
+    They are the posterior's contacts or, for an exact field, connected regions of pressed skin, with forces
+    if a stiffness was given.
+
+    Args:
+        field: Newest field of the patch.
+        rest_m: (U, N, 3) positions of the electrodes at rest, m.
+    """
     if field.method == "posterior":
         return tuple(
             Touch(
@@ -56,7 +66,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
 
 def _depth_at(field: FieldFrame, rest_m: Float, place_m: Float) -> float:
-    """Depth of the electrode nearest to a place."""
+    """Return the depth, m, of the electrode nearest to a place."""
     away = np.hypot(rest_m[..., 0] - place_m[0], rest_m[..., 1] - place_m[1])
     return float(-field.displacement_m[..., 2].flat[int(away.argmin())])
 

@@ -1,4 +1,4 @@
-"""What is shown, as data: a frozen view made of snapshots of a host. Plain functions, no terminal."""
+"""What the screen shows, as frozen data computed from snapshots. Pure functions, no terminal."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
-"""How much it matters: all is well, worth a look, a fault."""
-
+"""Severity: good, worth a look, a fault."""
 HISTORY_NS: Final = 2_000_000_000
-"""Rates and latencies are of this long."""
+"""Period over which rates and latencies are computed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,13 +39,13 @@ class PatchView:
     condition: str
     level: Level
     words: tuple[str, ...]
-    """What is wrong beside the condition, the worst first."""
+    """Faults besides the condition, the worst first."""
     health: PatchHealth
     stream: StreamStats
     rate_hz: float
-    """Fields a second."""
+    """Fields per second."""
     latency_s: float | None
-    """Last frame to field, the median of those shown lately."""
+    """Median time from a scan's last frame to its field, over the fields shown recently."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool
@@ -54,9 +53,9 @@ class PatchView:
     surface: Surface | None
     depth_m: float | None
     depth_std_m: float | None
-    """Of the deepest electrode."""
+    """Standard deviation of the deepest electrode's depth."""
     shear_m: tuple[float, float]
-    """Mean, weighted by depth."""
+    """Mean shear, weighted by depth."""
     touches: tuple[Touch, ...]
 
 
@@ -70,10 +69,10 @@ class BusView:
     level: Level
     words: tuple[str, ...]
     load: float
-    """Share of the last second that frames took."""
+    """Share of the last second that frames occupied."""
     frames_hz: float
     lost: int
-    """Frames that the kernel or the host had no room for."""
+    """Frames dropped by the kernel or the host."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,24 +83,25 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Fields a second, of the fastest patch: the pace of SYNC where all is well."""
+    """Fields per second of the fastest patch: the SYNC rate if all is well."""
     fields_hz: float
-    """Of all patches together."""
+    """Fields per second of all patches together."""
     latency_s: float | None
     latency_max_s: float | None
 
     @property
     def deepest_m(self) -> float:
+        """Deepest press on any patch, m."""
         return max((patch.depth_m or 0.0 for patch in self.patches), default=0.0)
 
     def patch(self, name: str) -> PatchView:
-        """Raises KeyError."""
+        """Return a patch by its name. Raises KeyError for an unknown name."""
         return {patch.name: patch for patch in self.patches}[name]
 
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """Something that happened, with the time of the day."""
+    """One event, with its time of day."""
 
     time: str
     subject: str
@@ -110,14 +110,14 @@ class LogLine:
 
 
 class History:
-    """The snapshots of the last seconds."""
+    """The snapshots of the last seconds, condensed into views."""
 
     def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
         self._hand, self._live = hand, live
         self._kept: deque[Snapshot] = deque()
 
     def add(self, snapshot: Snapshot) -> View:
-        """Take a new snapshot, the newest; the view of it."""
+        """Take the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
             kept.clear()  # a recording whose time jumps
@@ -130,8 +130,13 @@ class History:
 
 
 def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True) -> View:
-    """The view of the newest snapshot; rates are since the oldest, latencies of all, where they are those of
-    a host that is ``live``."""
+    """Return the view of the newest snapshot.
+
+    Args:
+        hand: The hand.
+        history: Snapshots, the oldest first; rates are computed since the oldest.
+        live: Whether the source is a running host; a recording has no latencies.
+    """
     now, before = history[-1], history[0]
     elapsed_s = max(1e-3, (now.t_ns - before.t_ns) * 1e-9)
     patches = tuple(_patch_view(patch, history, elapsed_s, live) for patch in hand.patches)
@@ -189,7 +194,7 @@ def _patch_view(patch: PatchConfig, history: Sequence[Snapshot], elapsed_s: floa
 
 
 def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
-    """Of the fields of a patch that were made during these snapshots, each once."""
+    """Return the latency, s, of each field of a patch in these snapshots."""
     found: dict[int, float] = {}
     since_ns = history[-1].t_ns - HISTORY_NS
     for snapshot in history:
@@ -202,17 +207,35 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """(U, N, 3) electrodes at rest; of a patch that knows its own, those that stand for them."""
+    """Return (U, N, 3) positions at rest, m; a stand-in if only the patch knows its layout."""
     return layout.build().upper_m
 
 
 def judge_patch(
     health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
-    """The condition, how much it matters, and what else is wrong."""
-    condition, words = health.condition, []
+    """Return the condition, its severity, and all other faults."""
+    condition = health.condition
     if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()
+    words = _faults(health)
+    losses = stream.assembler.chunks_lost - before.assembler.chunks_lost
+    missed = stream.assembler.scans_missed - before.assembler.scans_missed
+    lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
+    if condition is not Condition.OPERATIONAL:
+        lossy = []  # a patch that is gone loses everything
+    level: Level = "good"
+    if lossy or words:
+        level = "note"
+    if condition is Condition.BOOTING:
+        level = "note"
+    elif condition is not Condition.OPERATIONAL or health.duplicate_id:
+        level = "bad"
+    return str(condition), level, (*words, *lossy)
+
+
+def _faults(health: PatchHealth) -> list[str]:
+    words = []
     if health.refusal:
         words.append(health.refusal)
     if health.defect:
@@ -224,19 +247,7 @@ def judge_patch(
     words += [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     if health.error_register:
         words.append(health.emergency_text or f"error: {register_text(health.error_register)}")
-    losses = stream.assembler.chunks_lost - before.assembler.chunks_lost
-    missed = stream.assembler.scans_missed - before.assembler.scans_missed
-    lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
-    if condition is not Condition.OPERATIONAL:
-        lossy = []  # what is gone loses all
-    level: Level = "good"
-    if lossy or words:
-        level = "note"
-    if condition is Condition.BOOTING:
-        level = "note"
-    elif condition is not Condition.OPERATIONAL or health.duplicate_id:
-        level = "bad"
-    return str(condition), level, (*words, *lossy)
+    return words
 
 
 def _bus_view(
@@ -282,7 +293,7 @@ def _bus_view(
 
 
 def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
-    """An event as a line of the log."""
+    """Return an event as a line of the log."""
     level: Level = "bad"
     if event.what in ("operational", "well", "back", "rejoins", "baselines"):
         level = "good"
@@ -292,7 +303,7 @@ def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
 
 
 def time_of_day(t_ns: int) -> str:
-    """Local time of the day, to the second."""
+    """Return the local time of day, to the second, of a wall clock in ns."""
     import datetime
 
     return datetime.datetime.fromtimestamp(t_ns * 1e-9).strftime("%H:%M:%S")

@@ -1,4 +1,4 @@
-"""What the screen is made of: a canvas that draws only lines that changed, and two dialogs."""
+"""Widgets of the screen: a canvas that redraws only changed lines, and a dialog."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from textual.widgets import Static
 from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
-"""Lines for a width and a height."""
+"""Returns the lines of a picture for a width and a height."""
 
 
 class Canvas(Widget):
-    """Shows what a painter paints. Of a new picture only the lines that differ go to the terminal."""
+    """Shows the lines of a painter; only lines that changed go to the terminal.
+
+    Textual has no widget that compares lines: its own would redraw the whole picture each time.
+    """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
 
@@ -31,20 +34,22 @@ class Canvas(Widget):
         self._strips: list[Strip] = []
 
     def show(self, painter: Painter) -> None:
-        """Show this from now on, at whatever size."""
+        """Show this painter's picture from now on, at any size."""
         self._painter = painter
         self._paint()
 
     @property
     def text(self) -> str:
-        """What is to be read."""
+        """The text on the canvas, without styles."""
         return "\n".join(strip.text for strip in self._strips)
 
     def on_resize(self) -> None:
+        """Redraw everything at the new size."""
         self._strips = []
         self._paint()
 
     def render_line(self, y: int) -> Strip:
+        """Return line ``y`` for Textual to draw."""
         return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
 
     def _paint(self) -> None:
@@ -63,7 +68,7 @@ class Canvas(Widget):
 
 
 class Dialog(ModalScreen[bool]):
-    """Some text in a box; closed with True by ``enter`` or ``y`` where it is a question, else by any key."""
+    """Text in a box. ``enter`` or ``y`` answers a question with True; any other key closes the box."""
 
     CSS = """
     Dialog { align: center middle; background: $background 40%; }
@@ -83,14 +88,16 @@ class Dialog(ModalScreen[bool]):
 
     @property
     def text(self) -> str:
-        """What it says."""
+        """The text in the box."""
         return self._text
 
     def compose(self) -> ComposeResult:
+        """Yield the text."""
         yield Static(self._text, markup=False)
 
     def on_key(self, event: Key) -> None:
+        """Close the box with the answer."""
         event.stop()
-        if not self._answered:  # keys that were typed ahead find it on its way out
+        if not self._answered:  # keys typed ahead arrive while it closes
             self._answered = True
             self.dismiss(self._question and event.key in ("y", "enter"))

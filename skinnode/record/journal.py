@@ -123,7 +123,8 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
 
 def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
     """Header, events, and a complaint for each line that cannot be read. Raises ConfigError where there is no
-    journal, or its first line is not that of one."""
+    journal, or its first line is not that of one.
+    """
     try:
         with path.open("rb") as file:
             return _read_lines(path, file)

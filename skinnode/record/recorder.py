@@ -1,5 +1,6 @@
 """Writes down a host as it runs. The host's threads leave what they have in a queue; a thread of the
-recorder's own writes, so that a slow disk costs nobody but the recording anything."""
+recorder's own writes, so that a slow disk costs nobody but the recording anything.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +80,8 @@ def make_folder(path: Path) -> Path | None:
 
 def _is_folder(path: Path) -> bool:
     """Return whether ``path`` is a folder. Raises ConfigError if it cannot be a file or a folder, such as a
-    name that is too long."""
+    name that is too long.
+    """
     try:
         return path.is_dir()
     except OSError as error:

@@ -141,7 +141,8 @@ class Replay:
     @property
     def flaws(self) -> list[str]:
         """What of the recording could not be read or is not there, a line each; all of it after an iteration
-        to the end."""
+        to the end.
+        """
         found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
         if self.log.damaged > len(found):
             found.append(f"{self.log.damaged - len(found)} more places like these")

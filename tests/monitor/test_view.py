@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from skinnode.model.frames import FieldFrame, SolveStats
 from skinnode.model.layout import PatchLayout
 from skinnode.model.status import Status
 from skinnode.monitor import field_map
-from skinnode.monitor.field_map import Colours, Scale, aspect_of, paint_map, paint_shear, surface_of
+from skinnode.monitor.field_map import Colours, MapStyle, Scale, aspect_of, paint_map, paint_shear, surface_of
 from skinnode.monitor.report import FaultBook, as_json
-from skinnode.monitor.screen import as_text, screen
+from skinnode.monitor.screen import screen
 from skinnode.monitor.source import HostSource, ReplaySource
-from skinnode.monitor.theme import Ui, theme_for
+from skinnode.monitor.theme import Paint, UiState, theme_for
 from skinnode.monitor.view_model import History, View
 from skinnode.record import Recorder, replay
 from vcan_sim.faults import Faults
@@ -29,6 +30,11 @@ from .conftest import a_hand
 
 LAYOUT = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
 """10 × 10 electrodes."""
+
+
+def as_text(lines: Sequence[field_map.Line]) -> str:
+    """The text without its styles."""
+    return "\n".join("".join(segment.text for segment in line) for line in lines)
 
 
 def a_field(moved_m: dict[tuple[int, int], tuple[float, float, float]], std_m: float = 1e-7) -> FieldFrame:
@@ -54,7 +60,7 @@ def cells(lines: list[field_map.Line], sign: str) -> set[tuple[int, int]]:
 @pytest.mark.parametrize(("wire", "electrode"), [(0, 0), (9, 9), (2, 7)])
 def test_an_electrode_has_its_cell(width: int, height: int, wire: int, electrode: int) -> None:
     surface = surface_of(a_field({(wire, electrode): (0.0, 0.0, -3e-4)}), LAYOUT.upper_m)
-    lines = paint_map(surface, width, height, 3e-4, "none", arrows=False)
+    lines = paint_map(surface, MapStyle(3e-4, "none"), width, height, arrows=False)
     heaviest = next(sign for sign in "@%#*+=-:" if sign in as_text(lines))
     found = cells(lines, heaviest)
     across, down = width / 10, height / 10
@@ -65,7 +71,7 @@ def test_an_electrode_has_its_cell(width: int, height: int, wire: int, electrode
 
 def test_colours_are_the_brighter_the_deeper() -> None:
     steps = {(5, i): (0.0, 0.0, -3e-5 * i) for i in range(10)}
-    lines = paint_map(surface_of(a_field(steps), LAYOUT.upper_m), 10, 10, 3e-4, "rgb", arrows=False)
+    lines = paint_map(surface_of(a_field(steps), LAYOUT.upper_m), MapStyle(3e-4, "rgb"), 10, 10, arrows=False)
     line = lines[4]  # that of wire 5
     shades = []
     for segment in line:
@@ -81,8 +87,8 @@ def test_colours_are_the_brighter_the_deeper() -> None:
 def test_sixteen_colours_and_none_are_kept_to() -> None:
     surface = surface_of(a_field({(4, 4): (1e-4, 0.0, -3e-4)}), LAYOUT.upper_m)
     for colours in ("ansi", "none"):
-        lines = paint_map(surface, 30, 15, 3e-4, colours, arrows=True)
-        lines += paint_shear(surface, 30, 15, 3e-4, colours)
+        lines = paint_map(surface, MapStyle(3e-4, colours), 30, 15, arrows=True)
+        lines += paint_shear(surface, MapStyle(3e-4, colours), 30, 15)
         for segment in (segment for line in lines for segment in line):
             style = segment.style
             for colour in () if style is None else (style.color, style.bgcolor):
@@ -101,16 +107,16 @@ def test_arrows_of_all_eight_directions(turn: int) -> None:
     }
     surface = surface_of(a_field(everywhere), LAYOUT.upper_m)
     sign = "→↗↑↖←↙↓↘"[turn]
-    assert len(cells(paint_shear(surface, 40, 20, 3e-4, "none"), sign)) >= 100
-    assert cells(paint_map(surface, 40, 20, 3e-4, "none", arrows=True), sign)
-    assert not cells(paint_map(surface, 40, 20, 3e-4, "none", arrows=False), sign)
+    assert len(cells(paint_shear(surface, MapStyle(3e-4, "none"), 40, 20), sign)) >= 100
+    assert cells(paint_map(surface, MapStyle(3e-4, "none"), 40, 20, arrows=True), sign)
+    assert not cells(paint_map(surface, MapStyle(3e-4, "none"), 40, 20, arrows=False), sign)
 
 
 def test_shear_within_its_noise_is_no_arrow_and_unknown_skin_is_not_untouched() -> None:
     noisy = surface_of(a_field({(4, 4): (1e-4, 0.0, -3e-4)}, std_m=5e-5), LAYOUT.upper_m)
-    assert "→" not in as_text(paint_shear(noisy, 40, 20, 3e-4, "none"))
+    assert "→" not in as_text(paint_shear(noisy, MapStyle(3e-4, "none"), 40, 20))
     unknown = surface_of(a_field({}, std_m=np.inf), LAYOUT.upper_m)
-    assert set(as_text(paint_map(unknown, 20, 10, 3e-4, "none", arrows=True))) == {"?", "\n"}
+    assert set(as_text(paint_map(unknown, MapStyle(3e-4, "none"), 20, 10, arrows=True))) == {"?", "\n"}
     assert unknown.deepest_m == 0.0
 
 
@@ -188,8 +194,8 @@ def test_every_line_has_its_width_at_every_size(patches: int, colours: Colours) 
         view = History(hand).add(source.snapshot())
     for width, height in ((80, 24), (50, 16), (132, 43), (200, 50), (20, 5)):
         for zoomed in (False, True):
-            ui = Ui("hand", "p0", zoomed=zoomed, message="said" if zoomed else "")
-            lines = screen(view, ui, [], 1e-4, theme_for(colours), width, height)
+            ui = UiState("hand", "p0", zoomed=zoomed, message="said" if zoomed else "")
+            lines = screen(view, Paint(theme_for(colours), ui, 1e-4), [], width, height)
             assert len(lines) == height
             assert {sum(segment.cell_length for segment in line) for line in lines} == {width}
             if width >= 80 and not zoomed:
@@ -205,10 +211,10 @@ def test_untouched_skin_has_an_outline() -> None:
             time.sleep(0.02)
             view = history.add(source.snapshot())
     for width, height in ((80, 24), (132, 43)):
-        text = as_text(screen(view, Ui("hand", "p0"), [], 1e-4, theme_for("rgb"), width, height))
+        text = as_text(screen(view, Paint(theme_for("rgb"), UiState("hand", "p0"), 1e-4), [], width, height))
         assert text.count("┌") == text.count("┘") == 2
-        alone = Ui("hand", "p0", zoomed=True)
-        text = as_text(screen(view, alone, [], 1e-4, theme_for("rgb"), width, height))
+        alone = UiState("hand", "p0", zoomed=True)
+        text = as_text(screen(view, Paint(theme_for("rgb"), alone, 1e-4), [], width, height))
         assert text.count("┌") == text.count("┘") == 2  # depth and shear
 
 
@@ -216,14 +222,14 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
     hand = a_hand(2, sync={"period_ms": 50})
     with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:
         history = History(hand)
-        ui, theme = Ui("hand", "p0"), theme_for("rgb")
+        ui, theme = UiState("hand", "p0"), theme_for("rgb")
         begun_s = time.monotonic()
         while time.monotonic() < begun_s + 8.0:
             time.sleep(0.05)
             view = history.add(source.snapshot())
             if all(patch.level == "good" and patch.depth_m is not None for patch in view.patches):
                 break
-        well = as_text(screen(view, ui, [], 1e-4, theme, 120, 40))
+        well = as_text(screen(view, Paint(theme, ui, 1e-4), [], 120, 40))
         fleet.inject(Faults(lost=0.05, open_upper=1), "p0")
         while time.monotonic() < begun_s + 20.0:
             time.sleep(0.05)
@@ -231,7 +237,7 @@ def test_no_line_says_that_all_is_well_beside_a_fault() -> None:
             patch = view.patch("p0")
             if patch.level == "bad" and patch.stream.assembler.chunks_lost:
                 break
-        lines = screen(view, ui, [], 1e-4, theme, 120, 40)
+        lines = screen(view, Paint(theme, ui, 1e-4), [], 120, 40)
     assert "nothing happened" in well
     assert "nothing lost" in well
     ill = as_text(lines)

@@ -46,7 +46,8 @@ def _none(expected: str, faults: list[str]) -> None:
 
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
     """Compare default values. 0x1010 and 0x1011 return the device's capabilities, not defaults, so a
-    difference from the EDS there is a warning."""
+    difference from the EDS there is a warning.
+    """
     faults: list[str] = []
     doubts: list[str] = []
     for entry in entries:

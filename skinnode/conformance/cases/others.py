@@ -1,5 +1,6 @@
 """Others 1 to 10: storing and restoring by 0x1010 and 0x1011, 0x1020, and CAN-IDs that nothing may be set
-to."""
+to.
+"""
 
 from __future__ import annotations
 

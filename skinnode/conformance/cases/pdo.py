@@ -159,7 +159,8 @@ def cyclic(dut: Dut) -> None:
 
 def _first_of_cycle(dut: Dut, can_id: int, kind: int, name: str) -> int:
     """Return the number of the SYNC, from 1, that triggered the first TPDO of a cycle. The type fixes the
-    distance between TPDOs, but not the phase unless there is a start value (sub-index 6)."""
+    distance between TPDOs, but not the phase unless there is a start value (sub-index 6).
+    """
     for number in range(1, kind + 1):
         sync(dut)
         if dut.bus.take(can_id, _FIRST_S if number < kind else ANSWER_S) is not None:

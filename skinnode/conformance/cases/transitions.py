@@ -72,7 +72,8 @@ def resets(dut: Dut) -> None:
 
 def _transition(dut: Dut, command: int, *others: int) -> None:
     """``command`` leads to its state after each of ``others``, by node-ID and for all nodes; commands for
-    another node, or that are none, change nothing."""
+    another node, or that are none, change nothing.
+    """
     state, name = _COMMANDS[command], _NAMES[command]
     dut.start_heartbeat()
     for other in others:

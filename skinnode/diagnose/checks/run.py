@@ -37,7 +37,8 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 
 def others(facts: BusFacts) -> list[str]:
     """Describe each device that is neither a patch nor in the hand file, in one line: what it is, not what is
-    wrong."""
+    wrong.
+    """
     lines = []
     for node in facts.strangers:
         if node.is_patch:

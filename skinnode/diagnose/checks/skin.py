@@ -194,7 +194,8 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 def may_be_frozen(scans: ScanFacts) -> bool:
     """Whether a converter gave the same codes in all of LEAST_SCANS or more, of which nothing follows: what
-    noise it has, as is told, does not show in every code."""
+    noise it has, as is told, does not show in every code.
+    """
     known, still = _still(scans)
     return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
 

@@ -56,6 +56,20 @@ def test_files_named_exist(page: Path) -> None:
         assert (package / name).is_file() or (package / "skinnode" / name).is_file(), name
 
 
+NOT_OURS = re.compile(
+    r"\b(told|whoever|dealers?|lanes?|bringers?|rivals?|tells of|comes of)\b", flags=re.IGNORECASE
+)
+"""Words of translated English and of earlier code; the glossary in docs/concepts.md has better words."""
+
+
+@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=lambda page: page.name)
+def test_prose_uses_the_words_of_the_glossary(page: Path) -> None:
+    prose = re.sub(
+        r"^ *```.*?^ *```$|`[^`\n]*`|doctor: [^;|]*", "", text_of(page), flags=re.MULTILINE | re.DOTALL
+    )
+    assert NOT_OURS.findall(prose) == []
+
+
 def test_the_page_of_the_solver_stays_short() -> None:
     assert len(PAGE.split()) < 5000
 

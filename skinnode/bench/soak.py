@@ -34,7 +34,7 @@ from skinnode.config import HandConfig, parse_hand
 from skinnode.errors import BusError
 from skinnode.host import Condition, Host, HostStats
 from skinnode.host.accounting import discrepancies
-from skinnode.host.patch_stream import check_solvable
+from skinnode.host.scan_solver import check_solvable
 from skinnode.model.frames import FieldFrame
 from skinnode.protocol.device_time import TIME_STEP_US
 from skinnode.text.words import counted

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from skinnode.host import HostStats
-from skinnode.host.patch_stream import Solver
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.transport import Frame
 from vcan_sim.faults import Injected
 from vcan_sim.fleet import Fleet
@@ -37,7 +37,7 @@ class FrameCounter:
         with self._counting:
             self.sent_on[bus][kind_of(frame.can_id, frame.data, frame.remote)] += 1
 
-    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
+    def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Nothing to count."""
 
     def withheld(self, patch: str) -> None:

@@ -40,7 +40,7 @@ def host(
     from skinnode.cli._host_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold
     from skinnode.config import load_hand
-    from skinnode.host.patch_stream import check_solvable
+    from skinnode.host.scan_solver import check_solvable
     from skinnode.process.signals import stop_on_signal
 
     plan = load_hand(hand).on(interface, channel)

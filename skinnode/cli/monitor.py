@@ -146,7 +146,7 @@ def _running(
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
-    from skinnode.host.patch_stream import check_solvable
+    from skinnode.host.scan_solver import check_solvable
     from skinnode.monitor.source import HostSource
     from skinnode.process.garbage_collection import responsive_threads, without_long_collections
     from skinnode.text.words import counted

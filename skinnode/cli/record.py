@@ -74,7 +74,7 @@ def _run(
     """What was wrong meanwhile, a line each."""
     from skinnode.cli._host_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
-    from skinnode.host.patch_stream import check_solvable
+    from skinnode.host.scan_solver import check_solvable
 
     for patch in plan.patches:
         check_solvable(patch, plan.solver)

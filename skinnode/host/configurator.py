@@ -21,6 +21,7 @@ from skinnode.config import BusConfig, HandConfig, PatchConfig
 from skinnode.errors import NodeError, NodeTimeout, SdoAbort
 from skinnode.host import nmt_master
 from skinnode.host.hand_files import load_baseline
+from skinnode.host.node_facts import NodeFacts
 from skinnode.host.sdo_client import Abandoned, RemoteOd
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.protocol.codes import CodeScale
@@ -35,28 +36,6 @@ HEARTBEATS_WATCHED: Final = 3
 """Heartbeats of the host that a node may miss before it falls silent, where the host sends one."""
 
 _POLL_S: Final = 0.02
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NodeFacts:
-    """What bring-up learned about a patch."""
-
-    config: PatchConfig
-    layout: PatchLayout
-    profile: PatchProfile
-    scale: CodeScale
-    baseline_ohm: Float
-    """(U, K) resistances at rest, as the node encodes with them."""
-    serial: int | None
-    """None where nobody could ask."""
-    heartbeat_s: float
-    """How often the node sends one."""
-    checked: bool = False
-    """Whether the node is known to send a check with every scan; False if its revision could not be read."""
-
-    def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """The same patch after a tare."""
-        return replace(self, baseline_ohm=baseline_ohm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +64,6 @@ class Configurator:
         """
         if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
             return self._from_files(patch, profile)
-        with remote.until(self.abandoned):
-            return self._configure_by_sdo(patch, profile, remote)
-
-    def _configure_by_sdo(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
         master = self.bus.role == "master"
         self._wait_for(patch, remote)
         self.on_answer(patch)
@@ -105,7 +80,7 @@ class Configurator:
             remote.read(od.DESCRIPTOR, od.CODE_LO, "f32"),
             remote.read(od.DESCRIPTOR, od.CODE_HI, "f32"),
         )
-        baseline_ohm = self._settle_baseline(patch, profile, remote)
+        baseline_ohm = self.settle_baseline(patch, profile, remote)
         return NodeFacts(
             patch, layout, profile, scale, baseline_ohm, serial, heartbeat_s, checked=profile.checked
         )
@@ -257,10 +232,6 @@ class Configurator:
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         """(U, K) R0 that the node encodes with, in ohm: its own or, written to it where it differs, that of
         the file. A node that still tares itself has zeros; it may take the boot deadline."""
-        with remote.until(self.abandoned):
-            return self._settle_baseline(patch, profile, remote)
-
-    def _settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         wanted = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = time.monotonic() + self.boot_deadline_s
         while True:

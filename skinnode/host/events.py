@@ -5,28 +5,19 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
-from skinnode.host.containment import Defects, DefectStats, keep_on
-from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.host.containment import Defects
+from skinnode.host.drop_oldest_queue import DropOldestQueue, End
 from skinnode.host.publish import check_capacity
-from skinnode.text.words import counted
 
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
 """Events that a subscriber may lag behind before it loses the oldest."""
-
-_LOOK_S: Final = 0.05
-"""How often the watch looks: what is over sooner shows in counters alone."""
-
-_QUIET_NS: Final = 1_000_000_000
-"""A counter that keeps growing is told of this often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,32 +41,24 @@ class EventSubscription:
     over it until the host closes, or ask with :meth:`get`."""
 
     def __init__(self, capacity: int) -> None:
-        self._queue: queue.SimpleQueue[HealthEvent | None] = queue.SimpleQueue()
-        self._capacity = capacity
+        self._queue: DropOldestQueue[HealthEvent] = DropOldestQueue(capacity)
         self.dropped = 0
 
     def get(self, timeout_s: float | None = None) -> HealthEvent | None:
         """The next event, or None after ``timeout_s``, or None at once when the host has closed."""
         try:
-            event = self._queue.get(timeout=timeout_s)
+            event = self._queue.get(timeout_s)
         except queue.Empty:
             return None
-        if event is None:
-            self._queue.put(None)  # the next one to ask hears it too
-        return event
+        return None if isinstance(event, End) else event
 
     def __iter__(self) -> Iterator[HealthEvent]:
         while (event := self.get()) is not None:
             yield event
 
-    def _offer(self, event: HealthEvent | None) -> None:
-        while self._queue.qsize() >= self._capacity:
-            try:
-                self._queue.get_nowait()
-            except queue.Empty:  # the reader was faster
-                break
-            self.dropped += 1
-        self._queue.put(event)
+    def offer(self, event: HealthEvent | End) -> None:
+        """Queue an event. Never blocks; any thread."""
+        self.dropped += self._queue.put(event)
 
 
 class Events:
@@ -94,10 +77,10 @@ class Events:
         with self._lock:
             self._subscriptions.add(subscription)
             if self._ended:
-                subscription._offer(None)
+                subscription.offer(End())
         return subscription
 
-    def tell(self, event: HealthEvent) -> None:
+    def publish(self, event: HealthEvent) -> None:
         """Pass ``event`` to all subscribers and to the log. Never raises."""
         try:
             _log.info("%s", event)
@@ -108,148 +91,13 @@ class Events:
     def end(self) -> None:
         """The host has closed."""
         self._ended = True
-        self._offer(None)
+        self._offer(End())
 
-    def _offer(self, event: HealthEvent | None) -> None:
+    def _offer(self, event: HealthEvent | End) -> None:
         with self._lock:
             subscriptions = list(self._subscriptions)
         for subscription in subscriptions:
             try:
-                subscription._offer(event)
+                subscription.offer(event)
             except Exception as error:
                 self._defects.report("passing an event to a subscriber", error)
-
-
-_PATCH_COUNTERS: Final = {
-    "boot_ups": ("boot-up", ""),
-    "emergencies": ("emergency", "emergencies"),
-    "rejoins": ("rejoin", ""),
-    "baselines": ("new baseline in use", "new baselines in use"),
-    "conflicts": ("conflict", ""),
-}
-"""Counters, and what is counted: one, and several where that is not one and an s."""
-_BUS_COUNTERS: Final = {
-    "bus_offs": ("bus-off", ""),
-    "error_frames": ("error frame", ""),
-    "foreign": ("foreign frame", ""),
-    "kernel_dropped": ("frame dropped by the kernel", "frames dropped by the kernel"),
-    "dropped": ("frame dropped", "frames dropped"),
-    "malformed": ("malformed frame", ""),
-    "outages": ("outage", ""),
-    "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
-    "other_masters": ("command of another master", "commands of another master"),
-}
-
-
-class HealthWatch:
-    """Looks at the health of all patches and buses, on a thread of its own from construction to
-    :meth:`close`, and tells what changed."""
-
-    def __init__(
-        self,
-        patches: Callable[[], Mapping[str, PatchHealth]],
-        buses: Callable[[], Mapping[str, BusHealth]],
-        events: Events,
-        defects: Defects | None = None,
-        all_defects: Callable[[], Mapping[str, DefectStats]] = dict,
-    ) -> None:
-        self._patches, self._buses, self._events = patches, buses, events
-        self._defects = Defects("host") if defects is None else defects
-        self._all_defects = all_defects
-        self._ended = False
-        self._patch_before, self._bus_before = dict(patches()), dict(buses())
-        self._told: dict[tuple[str, str], tuple[int, int]] = {}  # when, and how many
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """End and join the thread, after a last look."""
-        self._stop.set()
-        self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _run(self) -> None:
-        keep_on(self._turn, self._defects, "watching the health")
-
-    def _turn(self) -> bool:
-        """Wait, then compare the health with the last check. Returns False after the last check. A check that
-        raised is repeated: an event may come twice, but none is missed."""
-        if self._ended:
-            return False
-        self._ended = self._stop.wait(_LOOK_S)
-        for look in (self._look_at_patches, self._look_at_buses, self._look_at_defects):
-            try:
-                look()
-            except Exception as error:
-                self._defects.report("watching the health", error)
-        return True
-
-    def _look_at_patches(self) -> None:
-        for name, health in self._patches().items():
-            self._compare_patch(name, self._patch_before[name], health)
-            self._patch_before[name] = health
-
-    def _look_at_buses(self) -> None:
-        for name, bus in self._buses().items():
-            self._compare_bus(name, self._bus_before[name], bus)
-            self._bus_before[name] = bus
-
-    def _look_at_defects(self) -> None:
-        words = ("defect of the host", "defects of the host")
-        for name, stats in self._all_defects().items():
-            self._compare_count(name, "defects", 0, stats.count, words, f", last {stats.newest}")
-
-    def _compare_bus(self, name: str, before: BusHealth, now: BusHealth) -> None:
-        if now.away != before.away:
-            self._tell(name, "away" if now.away else "back", now.away or "the bus is back")
-        if now.no_sync != before.no_sync:
-            text = "no SYNC of its master is heard" if now.no_sync else "SYNC is heard"
-            self._tell(name, "no SYNC" if now.no_sync else "SYNC", text)
-        if now.controller is not before.controller and now.controller is not None:
-            self._tell(name, now.controller.value, f"the controller is {now.controller}")
-        self._compare_counters(name, before, now, _BUS_COUNTERS)
-
-    def _compare_patch(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
-        if now.condition is not before.condition:
-            why = f" ({now.reason})" if now.reason else ""
-            self._tell(name, now.condition.value, f"{before.condition}, now {now.condition}{why}")
-        if now.restarts_in_a_loop and not before.restarts_in_a_loop:
-            self._tell(name, "restarts in a loop", "restarts in a loop: supply, or watchdog?")
-        if now.duplicate_id and not before.duplicate_id:
-            self._tell(name, "duplicate node-ID", f"two nodes have node-ID {now.node_id}")
-        for fault in sorted({*now.wires} - {*before.wires}):
-            self._tell(name, fault.state.value, f"{fault.side} wire {fault.number} is {fault.state}")
-        for fault in sorted({*before.wires} - {*now.wires}):
-            self._tell(name, "well", f"{fault.side} wire {fault.number} is not {fault.state} any more")
-        self._compare_counters(name, before, now, _PATCH_COUNTERS)
-
-    def _compare_counters(
-        self, name: str, before: object, now: object, counters: Mapping[str, tuple[str, str]]
-    ) -> None:
-        for counter, words in counters.items():
-            detail = ""
-            if isinstance(now, BusHealth) and counter == "foreign":
-                detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
-            elif isinstance(now, PatchHealth) and counter == "emergencies":
-                detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
-            self._compare_count(name, counter, getattr(before, counter), getattr(now, counter), words, detail)
-
-    def _compare_count(
-        self, name: str, counter: str, then: int, count: int, words: tuple[str, str], detail: str
-    ) -> None:
-        when_ns, told = self._told.get((name, counter), (0, then))
-        t_ns = time.monotonic_ns()
-        if count > told and t_ns - when_ns > _QUIET_NS:
-            self._told[name, counter] = t_ns, count
-            self._tell(name, counter, f"{counted(count - told, *words)}{detail}")
-
-    def _tell(self, subject: str, what: str, text: str) -> None:
-        self._events.tell(HealthEvent(time.monotonic_ns(), subject, what, text))

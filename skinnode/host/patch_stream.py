@@ -10,29 +10,22 @@ from __future__ import annotations
 import bisect
 import contextlib
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-import numpy as np
-
-from skinnode.config import Partial, PatchConfig, SolverConfig
-from skinnode.errors import ConfigError, SkinError
-from skinnode.host.configurator import NodeFacts
+from skinnode.config import Partial
+from skinnode.errors import SkinError
 from skinnode.host.containment import Defects, one_line
 from skinnode.host.publish import Publisher
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sync import Tick
 from skinnode.host.workers import Inline, Workers
-from skinnode.model.forward import resistance_ohm
-from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
+from skinnode.model.frames import ScanStamp
 from skinnode.protocol.assembler import ScanAssembler
-from skinnode.protocol.codes import Decoder, as_baseline
 from skinnode.protocol.scan import AssemblerStats, Scan
 from skinnode.protocol.summary import SummaryFlag
-from skinnode.solve.inputs import CodeMap
-from skinnode.solve.tracker import Tracker
 
 _log = logging.getLogger(__name__)
 
@@ -42,75 +35,6 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 WATCH_AFTER_NS: Final = 5_000_000
 """How long after its last frame a scan is looked at for what is wrong with it: the fields that a program
 waits for come first, and those of all patches of one SYNC are due together."""
-
-
-class Solver:
-    """Scans of one patch to fields. Owned by one thread at a time. ``clock`` says when a field is ready."""
-
-    def __init__(
-        self, facts: NodeFacts, config: SolverConfig, clock: Callable[[], int] = time.monotonic_ns
-    ) -> None:
-        self.facts = facts
-        self._clock = clock
-        calibration = facts.config.calibration
-        gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
-        scale = facts.scale
-        self._codes = CodeMap(
-            baseline_ohm=as_baseline(facts.baseline_ohm),
-            lo=scale.lo,
-            step=scale.step,
-            steps=scale.steps,
-            rounding_ohm=scale.relative_std * facts.baseline_ohm,
-            relative_noise=facts.config.relative_noise,
-            gain=gain,
-        )
-        self._tracker = Tracker(
-            facts.layout,
-            method=config.method,
-            operator=config.operator,
-            relative_noise=facts.config.relative_noise,
-            baseline_ohm=facts.baseline_ohm,
-            stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
-            rubber=calibration.rubber,
-            deadline_us=config.deadline_us,
-            estimate_noise=config.estimate_noise,
-            drift=config.drift,
-            normal_only=config.normal_only,
-            codes=self._codes,
-        )
-        self._decoder = Decoder(facts.baseline_ohm, scale)
-
-    def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Resistances of a scan, NaN where there is none."""
-        resistance_ohm, valid = self._decoder.decode(scan.codes)
-        if self._codes.gain is not None:
-            resistance_ohm *= self._codes.gain
-        return ResistanceFrame(resistance_ohm, valid, stamp)
-
-    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Field of a scan, stamped, its arrays read-only, and how many codes were no measurement. The noise
-        is that of the front end and of the codes together."""
-        if self._tracker.method == "posterior":
-            frame, codes = self.decode(scan, stamp), self._codes
-            noise = np.hypot(codes.relative_noise, codes.rounding_ohm / frame.resistance_ohm)
-            field = self._tracker.update(frame.resistance_ohm, frame.valid, noise)
-            invalid = frame.valid.size - int(np.count_nonzero(frame.valid))
-        else:
-            field, invalid = self._tracker.update_codes(scan.codes)
-        contacts = tuple(sealed(contact) for contact in field.contacts)
-        return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid
-
-
-def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Raise ConfigError for a layout that can be sensed but not solved. The first call compiles the kernels,
-    or reads them from the cache: not while a node waits."""
-    layout = patch.layout.build()
-    try:
-        Tracker(layout, method=config.method, operator=config.operator).update(
-            resistance_ohm(layout, layout.upper_m)
-        )
-    except ValueError as error:
-        raise ConfigError(f"patch {patch.name!r}", layout.name, str(error)) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,56 +62,75 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Who writes down what, beside the frames, decides which scans a stream makes of them. Mainline."""
+    """Records what decides, besides the frames, which scans a stream passes on. Called on the mainline."""
 
-    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
-        """:meth:`PatchStream.resume` let scans through."""
+    def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
+        """:meth:`PatchStream.resume` began to pass scans on."""
 
     def withheld(self, patch: str) -> None:
         """:meth:`PatchStream.withhold` was called."""
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """:meth:`PatchStream.poll` ended a scan."""
+        """:meth:`PatchStream.poll` ended an incomplete scan."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """A scan, of this number and whose last frame came then, was overtaken by a newer one before a worker
-        was free."""
+        """A newer scan replaced this one, whose last frame was received at ``t_receive_ns``, in the box."""
+
+
+def _ignore(scan: Scan) -> None:
+    """Take no notice of a scan."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamOutput:
+    """Where the scans of a stream are solved, and where fields and exceptions go."""
+
+    workers: Workers | Inline
+    publisher: Publisher
+    defects: Defects | None = None
+    """Gets the exceptions of decoding and solving; without it, the first one ends the publisher."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamOptions:
+    """Settings of a stream."""
+
+    tick: Callable[[int], Tick | None]
+    """Returns the newest SYNC with this counter."""
+    on_scan: Callable[[Scan], None] = _ignore
+    """Called with each assembled scan at once."""
+    watch: Callable[[Scan], None] = _ignore
+    """Called with each assembled scan :data:`WATCH_AFTER_NS` later."""
+    partial: Partial = "pass"
+    """``pass`` or ``withhold``: what to do with incomplete scans."""
+    under_way: bool = False
+    """Whether another master starts the node, which may be sending when its scans are first passed on."""
 
 
 class PatchStream:
-    """One patch on its way through the host. Scans are withheld until :meth:`resume` says how to decode
-    them. ``on_scan`` is told of each at once, ``watch`` a while later. ``under_way``: others start the node,
-    which may be sending already whenever its scans are let through. A scan whose decoding or solving
-    raises is lost, and the exception is reported to ``defects``; without ``defects`` the publisher fails."""
+    """The scans of one patch on their way from frames to fields.
+
+    Scans are withheld until :meth:`resume` passes a solver. A scan whose decoding or solving raises is lost.
+
+    Threads: the mainline calls all methods; any thread may also call :meth:`settled` and :meth:`stats`.
+    """
 
     def __init__(
-        self,
-        patch: str,
-        assembler: ScanAssembler,
-        workers: Workers | Inline,
-        publisher: Publisher,
-        tick: Callable[[int], Tick | None],
-        on_scan: Callable[[Scan], None],
-        partial: Partial = "pass",
-        watch: Callable[[Scan], None] = lambda scan: None,
-        *,
-        under_way: bool = False,
-        defects: Defects | None = None,
+        self, patch: str, assembler: ScanAssembler, output: StreamOutput, options: StreamOptions
     ) -> None:
-        self._patch, self._passes_partial = patch, partial == "pass"
-        self._solver: Solver | None = None  # None: withhold
-        self._assembler, self._workers, self._publisher = assembler, workers, publisher
+        self._patch, self._options = patch, options
+        self._solver: ScanSolver | None = None  # None: withhold
+        self._assembler = assembler
+        self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
-        self._tick, self._on_scan = tick, on_scan
-        self._watch, self._under_way, self._defects = watch, under_way, defects
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        self._box: deque[tuple[Scan, ScanStamp, Solver]] = deque()  # one at most; both ends are atomic
+        self._box: deque[tuple[Scan, ScanStamp, ScanSolver]] = deque()  # one at most; both ends are atomic
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None
         self._left_out: list[int] = []
         self._left_out_within_ns = 0
         self.withholdings = 0
-        """How often scans began to be withheld."""
+        """Times that withholding began."""
         self.doubtful = False
         """Whether a summary was lost, or discarded with its scan, that may have announced a new baseline."""
         self._frames = self._withheld = self._partial = 0
@@ -217,7 +160,7 @@ class PatchStream:
     def poll(self, t_ns: int) -> None:
         """Let a scan go that has waited long enough for what it lacks."""
         while self._unwatched and t_ns >= self._unwatched[0][0]:
-            self._watch(self._unwatched.popleft()[1])
+            self._options.watch(self._unwatched.popleft()[1])
         deadline_ns = self._assembler.next_deadline_ns()
         if deadline_ns is None or t_ns < deadline_ns:
             return
@@ -240,7 +183,7 @@ class PatchStream:
         """Whether no scan is let through."""
         return self._solver is None
 
-    def resume(self, solver: Solver, withholdings: int, *, anew: bool) -> None:
+    def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
         """Let scans through from now on, decoded and solved by ``solver``; unless there was another reason to
         withhold them since there were ``withholdings``. ``anew``: the node was started, and what was
         assembled before belongs to another stream."""
@@ -250,7 +193,7 @@ class PatchStream:
         self.doubtful = False
         checked = solver.facts.checked
         if anew:
-            self._assembler.reset(under_way=self._under_way, checked=checked)
+            self._assembler.reset(under_way=self._options.under_way, checked=checked)
         elif checked:
             self._assembler.expect_check()
         if self.tap is not None:
@@ -267,13 +210,13 @@ class PatchStream:
         while self._unwatched:
             scan = self._unwatched.popleft()[1]
             with contextlib.suppress(Exception):  # no caller is left
-                self._watch(scan)
+                self._options.watch(scan)
 
     def _doubt(self) -> None:
         self.doubtful = True
 
     def _offer(self, scan: Scan) -> None:
-        self._on_scan(scan)
+        self._options.on_scan(scan)
         self._unwatched.append((scan.t_last_ns + WATCH_AFTER_NS, scan))
         if scan.flags & _BASELINE_CHANGED:  # this scan is the first with the new baseline
             self.withhold()
@@ -285,7 +228,7 @@ class PatchStream:
             return
         if not scan.empty:
             self.t_passed_ns = scan.t_last_ns
-        tick = self._tick(scan.counter)
+        tick = self._options.tick(scan.counter)
         stamp = ScanStamp(
             patch=self._patch,
             scan=scan.scan if tick is None else tick.number,
@@ -295,7 +238,7 @@ class PatchStream:
             t_receive_ns=scan.t_last_ns,
         )
         self._newest = stamp.scan
-        if not (scan.complete or self._passes_partial):
+        if not (scan.complete or self._options.partial == "pass"):
             self._partial += 1
             return
         self._offered += 1

@@ -9,28 +9,13 @@ import queue
 import threading
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator
-from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
 from skinnode.errors import SkinError
 from skinnode.host.containment import Defects
+from skinnode.host.drop_oldest_queue import DropOldestQueue, End
 from skinnode.model.frames import FieldFrame
-
-
-@dataclass(frozen=True, slots=True)
-class _Failure:
-    """Takes the place of a field when the host cannot go on."""
-
-    error: SkinError
-
-
-class _End:
-    """Takes the place of a field when the host has closed."""
-
-
-_Item = FieldFrame | _Failure | _End
-_END: Final = _End()
 
 
 def check_timeout(timeout_s: float | None) -> None:
@@ -54,8 +39,7 @@ class Subscription:
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
-        self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
-        self._capacity = capacity
+        self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._wanted = patches
         # One counter a patch: a patch has one worker at a time, so each has a single writer.
@@ -81,7 +65,7 @@ class Subscription:
         """The next field, or None when the host has closed. Raises queue.Empty after ``timeout_s`` and the
         SkinError that stopped the host, if one did."""
         check_timeout(timeout_s)
-        return self._open(self._queue.get(timeout=timeout_s))
+        return self._open(self._queue.get(timeout_s))
 
     async def take_async(self, timeout_s: float | None) -> FieldFrame | None:
         """As :meth:`take`, in an event loop."""
@@ -100,7 +84,7 @@ class Subscription:
                     await asyncio.sleep(0)  # others have their turn however fast fields come
                     arrived.clear()
                     try:
-                        return self._open(self._queue.get_nowait())
+                        return self._open(self._queue.get(0.0))
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
@@ -117,7 +101,7 @@ class Subscription:
     def end(self) -> None:
         """Want no more, and end the loop that reads, in whatever thread, after the fields still queued."""
         self.close()
-        self._offer(_END, "")
+        self.offer(End(), "")
 
     def __iter__(self) -> Iterator[FieldFrame]:
         """Fields until the host closes. Raises TimeoutError when none came for the subscription's timeout and
@@ -153,31 +137,22 @@ class Subscription:
     ) -> None:
         self.close()
 
-    def _open(self, item: _Item) -> FieldFrame | None:
+    def offer(self, item: FieldFrame | End, patch: str) -> None:
+        """Queue a field of ``patch``, unless it is not wanted, or an end. Never blocks; any thread."""
+        if patch and patch not in self._wanted:
+            return
+        self._dropped[patch] += self._queue.put(item)
+        self._wake()
+
+    def _open(self, item: FieldFrame | End) -> FieldFrame | None:
         if isinstance(item, FieldFrame):
             return item
-        self._offer(item, "")  # the next one to ask hears it too
-        if isinstance(item, _Failure):
+        self._wake()  # every reader gets the end
+        if item.error is not None:
             raise item.error
         return None
 
-    def _offer(self, item: _Item, patch: str) -> None:
-        """Never blocks."""
-        if patch and patch not in self._wanted:
-            return
-        self._queue.put(item)
-        ending: _Item | None = None
-        while self._queue.qsize() > self._capacity:
-            try:
-                oldest = self._queue.get_nowait()
-            except queue.Empty:  # the reader was faster
-                break
-            if isinstance(oldest, FieldFrame):
-                self._dropped[patch] += 1
-            else:
-                ending = oldest
-        if ending is not None:  # the one thing that no reader may miss, even if the queue grows by it
-            self._queue.put(ending)
+    def _wake(self) -> None:
         for wake in list(self._wakers.values()):
             wake()
 
@@ -192,7 +167,7 @@ class Publisher:
         self._latest: dict[str, FieldFrame] = {}
         self._subscriptions: dict[int, weakref.ref[Subscription]] = {}
         self._keys = itertools.count()
-        self._last: _Item | None = None
+        self._last: End | None = None
 
     def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
         """A subscription to one patch, or to all. Raises ValueError for a capacity below 1, a timeout that is
@@ -208,7 +183,7 @@ class Publisher:
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:
-            subscription._offer(self._last, "")
+            subscription.offer(self._last, "")
         return subscription
 
     def latest(self, patch: str) -> FieldFrame | None:
@@ -220,29 +195,29 @@ class Publisher:
     def publish(self, field: FieldFrame, patch: str) -> None:
         """Hand a field to everyone who wants it. Called by the worker that owns the patch; never blocks."""
         self._latest[patch] = field
-        self._tell(field, patch)
+        self._offer(field, patch)
 
     @property
     def failure(self) -> SkinError | None:
         """What stopped the host, if something did."""
-        return self._last.error if isinstance(self._last, _Failure) else None
+        return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
         """The host cannot go on: every subscriber hears why, after the fields it has queued."""
-        self._last = self._last or _Failure(error)
-        self._tell(self._last, "")
+        self._last = self._last or End(error)
+        self._offer(self._last, "")
 
     def end(self) -> None:
         """The host has closed: every subscriber's loop ends, after the fields it has queued."""
-        self._last = self._last or _END
-        self._tell(self._last, "")
+        self._last = self._last or End()
+        self._offer(self._last, "")
 
-    def _tell(self, item: _Item, patch: str) -> None:
+    def _offer(self, item: FieldFrame | End, patch: str) -> None:
         for reference in list(self._subscriptions.values()):
             subscription = reference()
             if subscription is None:
                 continue
             try:
-                subscription._offer(item, patch)
+                subscription.offer(item, patch)
             except Exception as error:
                 self._defects.report("passing a field to a subscriber", error)

@@ -11,14 +11,11 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.host.arrivals import ArrivalPredictor
 from skinnode.host.code_watch import CodeWatch
-from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import Dispatcher
-from skinnode.host.health import NodeMonitor
+from skinnode.host.node_monitor import NodeMonitor
 from skinnode.host.other_masters import OtherMasters
-from skinnode.host.patch_stream import PatchStream
-from skinnode.host.publish import Publisher
+from skinnode.host.patch_stream import PatchStream, StreamOptions, StreamOutput
 from skinnode.host.sync import SyncFollower, Ticks
-from skinnode.host.workers import Inline, Workers
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile
@@ -64,9 +61,7 @@ def receive_patch(
     hand: HandConfig,
     dispatcher: Dispatcher,
     ticks: Ticks,
-    workers: Workers | Inline,
-    publisher: Publisher,
-    defects: Defects | None = None,
+    output: StreamOutput,
 ) -> PatchReception:
     """Pass the frames of a patch to its monitor and its stream from now on.
 
@@ -95,21 +90,25 @@ def receive_patch(
         on_reject=dispatcher.reject,
         under_way=True,
     )
-    stream = PatchStream(
-        patch.name, assembler, workers, publisher, ticks.find, on_scan, hand.stream.partial, watch.on_scan,
-        under_way=dispatcher.config.role == "guest", defects=defects,
-    )  # fmt: skip
+    options = StreamOptions(
+        tick=ticks.find,
+        on_scan=on_scan,
+        watch=watch.on_scan,
+        partial=hand.stream.partial,
+        under_way=dispatcher.config.role == "guest",
+    )
+    stream = PatchStream(patch.name, assembler, output, options)
 
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)
         if len(data) == 1 and data[0] & STATE_MASK == NmtState.INITIALISING:
             stream.withhold()  # what it sends from here on is not as it was configured
 
-    dispatcher.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, defects)
-    dispatcher.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, defects)
-    dispatcher.handle(od.chunk_cob_id(patch.node_id), stream.on_chunk, defects)
-    dispatcher.handle(od.summary_cob_id(patch.node_id), stream.on_summary, defects)
-    dispatcher.poll_with(stream.poll, defects)
+    dispatcher.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, output.defects)
+    dispatcher.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, output.defects)
+    dispatcher.handle(od.chunk_cob_id(patch.node_id), stream.on_chunk, output.defects)
+    dispatcher.handle(od.summary_cob_id(patch.node_id), stream.on_summary, output.defects)
+    dispatcher.poll_with(stream.poll, output.defects)
     return PatchReception(stream, monitor)
 
 

@@ -12,12 +12,12 @@ from skinnode.canopen.nmt import NmtState
 from skinnode.config import HandConfig, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout
 from skinnode.host import nmt_master
-from skinnode.host.configurator import Configurator, NodeFacts, is_configured
+from skinnode.host.configurator import Configurator, is_configured
 from skinnode.host.containment import Defects
-from skinnode.host.link import BusLink
-from skinnode.host.lss_master import LssMaster
-from skinnode.host.patch_stream import Solver
+from skinnode.host.node_facts import NodeFacts
 from skinnode.host.reception import PatchReception
+from skinnode.host.scan_solver import ScanSolver
+from skinnode.host.served_bus import ServedBus
 from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
@@ -42,12 +42,11 @@ class RemoteNode:
         self,
         patch: PatchConfig,
         hand: HandConfig,
-        link: BusLink,
+        bus: ServedBus,
         reception: PatchReception,
-        lss: LssMaster,
         defects: Defects,
     ) -> None:
-        self.patch, self.link, self.defects = patch, link, defects
+        self.patch, self.link, self.defects = patch, bus.link, defects
         self.stream, self.monitor = reception.stream, reception.monitor
         self.bus = hand.bus(patch.bus)
         self.has_other_master = self.bus.role == "guest"
@@ -60,9 +59,9 @@ class RemoteNode:
         """When it last answered an SDO request."""
         self._answers = 0
         """SDO answers with its node-ID so far."""
-        self._hand, self._lss = hand, lss
+        self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
-        self._remote = link.remote_od(patch.node_id, self._on_answer, defects)
+        self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
 
     # --- mainline
 
@@ -87,7 +86,7 @@ class RemoteNode:
         deadline_s: float,
         abandoned: Callable[[], bool],
         on_answer: Callable[[PatchConfig], None] | None = None,
-    ) -> Solver:
+    ) -> ScanSolver:
         """Bring the node up and learn what it is; scans are withheld meanwhile. Raises as
         :meth:`Configurator.configure`."""
         self.boot_ups = self.monitor.boot_ups
@@ -102,7 +101,8 @@ class RemoteNode:
         configurator = self._configurator(deadline_s, abandoned, answered)
         answers = self._answers
         try:
-            self.facts = configurator.configure(self.patch, self._profile, self._remote)
+            with self._remote.abort_if(abandoned):
+                self.facts = configurator.configure(self.patch, self._profile, self._remote)
         except NodeError as error:
             if self._answers == answers or abandoned() or (count := self._answers_to_one_question()) < 2:
                 raise
@@ -111,11 +111,11 @@ class RemoteNode:
             why = f"one question got {count} answers: two nodes have node-ID {node_id} (see skinnode scan)"
             raise kind(node_id, f"{text}; {why}") from error
         try:
-            return Solver(self.facts, self._hand.solver)
+            return ScanSolver(self.facts, self._hand.solver)
         except ValueError as error:  # of electrodes that only the node knew
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
-    def start(self, solver: Solver, withholdings: int) -> None:
+    def start(self, solver: ScanSolver, withholdings: int) -> None:
         """Let scans through to ``solver`` and, as master, tell the node to send them. Raises BusError."""
         # What a guest finds running goes on, heard since its bus was opened, unless the node has booted.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
@@ -124,17 +124,18 @@ class RemoteNode:
             nmt_master.start(self.link.send, self.patch.node_id)
         self.monitor.running = True
 
-    def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> Solver | None:
+    def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> ScanSolver | None:
         """A solver with the baseline that the node has now; None where that is the one known and scans go
         through. Raises as :meth:`Configurator.settle_baseline`."""
         facts = self.facts
         assert facts is not None  # asked of nodes that run
         configurator = self._configurator(deadline_s, abandoned, lambda patch: None)
-        baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
+        with self._remote.abort_if(abandoned):
+            baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
         if (baseline_ohm == facts.baseline_ohm).all() and not self.stream.withholding:
             return None
         facts = facts.with_baseline(baseline_ohm)
-        solver = Solver(facts, self._hand.solver)
+        solver = ScanSolver(facts, self._hand.solver)
         self.facts = facts  # only now: if there is no solver, the baseline in use is the old one
         return solver
 

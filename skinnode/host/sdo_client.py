@@ -105,7 +105,7 @@ class RemoteOd:
         self._client = Client(network, node_id)
 
     @contextmanager
-    def until(self, abandoned: Callable[[], bool]) -> Iterator[None]:
+    def abort_if(self, abandoned: Callable[[], bool]) -> Iterator[None]:
         """Abort the transfers of this ``with`` block once ``abandoned`` returns True."""
         before, self.abandoned = self.abandoned, abandoned
         try:

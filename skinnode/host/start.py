@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from typing import Final
 
 from skinnode.canopen.nmt import NmtState
 from skinnode.config import Missing, PatchConfig
 from skinnode.errors import BusError, NodeError, NodeTimeout, SkinError
 from skinnode.host import nmt_master
-from skinnode.host.patch_stream import Solver
+from skinnode.host.node_supervision import START_DEADLINE_S
 from skinnode.host.remote_node import RemoteNode
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sdo_client import Abandoned
-from skinnode.host.supervisor import START_DEADLINE_S
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
@@ -49,32 +48,67 @@ def go_on_unless(cancelled: Callable[[], bool]) -> None:
 
 def configure_all(
     nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
-) -> dict[RemoteNode, Solver]:
-    """Those that are there, ready to start. The first failure stops the others at their next transfer.
+) -> dict[RemoteNode, ScanSolver]:
+    """Configure all nodes side by side. The first failure stops the others at their next transfer.
 
-    Raises what the bring-up of a node raises, NodeTimeout or BusError for silence unless it is to be waited
-    for, BringUpCancelled; ValueError for a deadline that no clock reaches.
+    Args:
+        nodes: The nodes.
+        missing: ``wait`` if silent nodes may join later, ``refuse`` if all must be there.
+        deadline_s: Longest time to the first response of a node, s.
+        cancelled: Called repeatedly; once it returns True, configuring ends.
+
+    Returns:
+        The nodes that are there, each with the solver of its scans.
+
+    Raises:
+        NodeTimeout: if a node is silent and ``missing`` is ``refuse``.
+        BusError: if all nodes of a bus are silent and ``missing`` is ``refuse``, or as
+            :meth:`RemoteNode.configure` raises.
+        BringUpCancelled: if ``cancelled`` returned True.
     """
-    if not 0 <= deadline_s < math.inf:
-        raise ValueError(f"boot_deadline_s: got {deadline_s!r}, must be finite and not negative")
-    over = threading.Event()
-    answered: list[PatchConfig] = []
+    return _Start(nodes, missing, deadline_s, cancelled).run()
 
-    def abandoned() -> bool:
-        return over.is_set() or cancelled()
 
-    def bring_up(node: RemoteNode) -> Solver:
+class _Start:
+    """Configures nodes side by side, on a pool of threads."""
+
+    def __init__(
+        self, nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
+    ) -> None:
+        self._nodes, self._waits, self._deadline_s = nodes, missing == "wait", deadline_s
+        self._cancelled = cancelled
+        self._over = threading.Event()
+        self._answered: list[PatchConfig] = []
+
+    def run(self) -> dict[RemoteNode, ScanSolver]:
+        """Return the nodes that are there."""
+        threads = min(len(self._nodes), BRING_UP_THREADS)
+        with ThreadPoolExecutor(threads, thread_name_prefix="bring-up") as pool:
+            try:
+                jobs = {node: pool.submit(self._configure, node) for node in self._nodes}
+                self._wait_for(jobs)
+            finally:  # jobs that still run after the first failure, or after Ctrl-C, stop
+                self._over.set()
+                pool.shutdown(cancel_futures=True)
+        solvers = {node: self._result(node, job) for node, job in jobs.items()}
+        go_on_unless(self._cancelled)
+        return {node: solver for node, solver in solvers.items() if solver is not None}
+
+    def _abandoned(self) -> bool:
+        return self._over.is_set() or self._cancelled()
+
+    def _configure(self, node: RemoteNode) -> ScanSolver:
         if node.listen_only:
-            _listen(node, deadline_s, abandoned)
-            answered.append(node.patch)
+            _listen(node, self._deadline_s, self._abandoned)
+            self._answered.append(node.patch)
         for left in reversed(range(_BRING_UPS)):
             try:
-                solver = node.configure(deadline_s, abandoned, answered.append)
+                solver = node.configure(self._deadline_s, self._abandoned, self._answered.append)
                 if not left or node.monitor.boot_ups == node.boot_ups:
                     return solver
             except BusError:
                 booted = node.monitor.boot_ups != node.boot_ups
-                if not left or node.patch not in answered or not booted:
+                if not left or node.patch not in self._answered or not booted:
                     raise
             except (SkinError, Abandoned):
                 raise
@@ -84,43 +118,36 @@ def configure_all(
                     patch = node.patch
                     text = f"patch {patch.name!r} on {patch.bus}: {node.defects.newest}"
                     raise _Defective(patch.node_id, text) from error
-        raise AssertionError("the last try returns or raises")
+        raise AssertionError("the last attempt returns or raises")
 
-    def may_wait(node: RemoteNode, failure: BaseException | None) -> bool:
-        silent = isinstance(failure, NodeTimeout) and node.patch not in answered
-        return missing == "wait" and (silent or isinstance(failure, _Defective))
+    def _may_join_later(self, node: RemoteNode, failure: BaseException) -> bool:
+        silent = isinstance(failure, NodeTimeout) and node.patch not in self._answered
+        return self._waits and (silent or isinstance(failure, _Defective))
 
-    with ThreadPoolExecutor(min(len(nodes), BRING_UP_THREADS), thread_name_prefix="bring-up") as pool:
-        try:
-            jobs = {node: pool.submit(bring_up, node) for node in nodes}
-            pending = set(jobs.values())
-            while pending:
-                done, pending = wait(pending, return_when=FIRST_EXCEPTION)
-                failures = {node: job.exception() for node, job in jobs.items() if job in done}
-                if any(failure and not may_wait(node, failure) for node, failure in failures.items()):
-                    break
-        finally:  # whoever still runs after the first failure, or after Ctrl-C, stops
-            over.set()
-            pool.shutdown(cancel_futures=True)
-    ready: dict[RemoteNode, Solver] = {}
-    for node, job in jobs.items():
+    def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
+        """Wait for all jobs, or until one fails so that the host cannot start."""
+        pending = set(jobs.values())
+        while pending:
+            done, pending = wait(pending, return_when=FIRST_EXCEPTION)
+            failures = {node: job.exception() for node, job in jobs.items() if job in done}
+            if any(failure and not self._may_join_later(node, failure) for node, failure in failures.items()):
+                break
+
+    def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
+        """Return the solver of a node, None if the node is not there; raise what must end the start."""
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
-            continue
+            return None
         if failure is None:
-            ready[node] = job.result()
-        elif isinstance(failure, _Defective) and may_wait(node, failure):
-            continue  # the supervisor keeps trying
-        elif isinstance(failure, NodeTimeout) and node.patch not in answered:
-            if not may_wait(node, failure):
-                raise _silence(node, nodes, answered, deadline_s) from None
-        else:
-            raise failure
-    go_on_unless(cancelled)
-    return ready
+            return job.result()
+        if self._may_join_later(node, failure):
+            return None
+        if isinstance(failure, NodeTimeout) and node.patch not in self._answered:
+            raise _silence(node, self._nodes, self._answered, self._deadline_s) from None
+        raise failure
 
 
-def start_all(ready: dict[RemoteNode, Solver]) -> None:
+def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
     """NMT start where the host is master, and each node says in a heartbeat that it is operational. Raises
     NodeTimeout. The deadline is counted in naps: nobody is late while this machine stands still."""
     t_start_ns = time.monotonic_ns()

@@ -6,11 +6,18 @@ import enum
 import threading
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from typing import Final
 
 from skinnode.host.containment import Pause
-from skinnode.host.patch_stream import Solver
 from skinnode.host.remote_node import RemoteNode
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
+
+JOIN_DEADLINE_S: Final = 1.0
+"""How long a node that was heard may take to answer SDO, and to tare itself."""
+
+LEAST_NS: Final = 300_000_000
+"""Least time from one bring-up of a node to the next, for nodes that restart in a loop."""
 
 
 class Phase(enum.StrEnum):
@@ -41,7 +48,7 @@ class NodeStats:
 class Joined:
     """Result of a job."""
 
-    solver: Solver | None
+    solver: ScanSolver | None
     withholdings: int
 
 

@@ -8,7 +8,8 @@ from typing import Protocol
 
 from skinnode.host.containment import Defects
 from skinnode.host.link import BusLink
-from skinnode.host.patch_stream import PatchStream, Solver, StreamTap
+from skinnode.host.patch_stream import PatchStream, StreamTap
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.transport import Frame
 
 
@@ -35,7 +36,7 @@ class ContainedTap:
     def sent(self, bus: str, frame: Frame) -> None:
         self._do(lambda: self._tap.sent(bus, frame))
 
-    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
+    def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         self._do(lambda: self._tap.resumed(patch, solver, anew=anew))
 
     def withheld(self, patch: str) -> None:

@@ -18,8 +18,9 @@ from skinnode.config import HandConfig
 from skinnode.errors import SkinError
 from skinnode.host import Host, PatchHealth
 from skinnode.host.dispatcher import BusStats
-from skinnode.host.events import Events, EventSubscription, HealthEvent, HealthWatch
+from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth
+from skinnode.host.health_watch import HealthWatch
 from skinnode.host.patch_stream import StreamStats
 from skinnode.model.frames import FieldFrame
 from skinnode.record import Recorder, Replay
@@ -187,7 +188,7 @@ class ReplaySource:
         self._run = run
         self._failure: SkinError | None = None
         self._running = ExitStack()
-        self._publish = events = Events()
+        self._all_events = events = Events()
         self._events: EventSubscription = events.subscribe(_EVENTS)
         self._running.enter_context(HealthWatch(self._health, self._bus_health, events))
         self._thread = threading.Thread(target=self._play, name="replay", daemon=True)
@@ -256,7 +257,7 @@ class ReplaySource:
             for _ in self._run:
                 pass
             for flaw in self._run.flaws:
-                self._publish.tell(HealthEvent(self._run.clock(), self.title, "recording", flaw))
+                self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
         except Exception as error:  # the user must see it
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from skinnode.config import BusConfig, HandConfig, PatchConfig, parse_hand
 from skinnode.errors import ConfigError
-from skinnode.host.configurator import NodeFacts
+from skinnode.host.node_facts import NodeFacts
 from skinnode.model.layout import PatchLayout
 from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import PatchProfile

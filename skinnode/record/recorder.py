@@ -20,7 +20,7 @@ from typing import Any, Final, Self
 from skinnode.config import HandConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects, keep_on
-from skinnode.host.patch_stream import Solver
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.record.journal import SUFFIX, Header, facts_table
 from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFrame, create
@@ -127,7 +127,7 @@ class Recorder:
         self._offset_ns = offset_ns
         self._at = dict.fromkeys(self._channels, 0)
         self._bus_of = {patch.name: patch.bus for patch in hand.patches}
-        self._solvers: dict[str, Solver] = {}
+        self._solvers: dict[str, ScanSolver] = {}
         self._lost = self._lost_told = 0
         self._defects = Defects(str(path))
         self._flush_s = self._sync_s = time.monotonic()
@@ -149,7 +149,7 @@ class Recorder:
     def sent(self, bus: str, frame: Frame) -> None:
         self._put(lambda: self._write_frames(bus, (frame,), sent=True), 1)
 
-    def resumed(self, patch: str, solver: Solver, *, anew: bool) -> None:
+    def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         known = self._solvers.get(patch) is solver
         self._solvers[patch] = solver
         facts: dict[str, Any] = {} if known else {"facts": facts_table(solver.facts)}

@@ -22,9 +22,10 @@ from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
 from skinnode.host.dispatcher import BusStats, Dispatcher
 from skinnode.host.health import PatchHealth
-from skinnode.host.patch_stream import Solver, StreamStats
+from skinnode.host.patch_stream import StreamOutput, StreamStats
 from skinnode.host.publish import Publisher
 from skinnode.host.reception import PatchReception, receive_bus, receive_patch
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sync import SyncFollower, Ticks
 from skinnode.host.workers import Inline
 from skinnode.model.frames import FieldFrame
@@ -233,17 +234,18 @@ class _Bus:
         hand = replay.hand
         self._ticks = Ticks(hand.sync.counter_overflow)
         self._dispatcher = _PollerlessDispatcher(config, {}, 0)
+        output = StreamOutput(Inline(), replay.publisher)
         receive_bus(hand, self._dispatcher, self._ticks)
         self._own_syncs = SyncFollower(self._ticks)
         self.patches: dict[str, PatchReception] = {
-            patch.name: receive_patch(patch, hand, self._dispatcher, self._ticks, Inline(), replay.publisher)
+            patch.name: receive_patch(patch, hand, self._dispatcher, self._ticks, output)
             for patch in hand.patches_on(config.name)
         }
         for name, heard in self.patches.items():
             mine = [e for e in events if e["event"] == "overtaken" and e["patch"] == name]
             heard.stream.leave_out([e["received_ns"] for e in mine], _ROUNDING_NS)
         self._events = deque(events)
-        self._solvers: dict[str, Solver | None] = {}
+        self._solvers: dict[str, ScanSolver | None] = {}
         self._received = self._sent = 0
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
@@ -290,14 +292,14 @@ class _Bus:
                 else:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
-    def _solver(self, event: dict[str, Any]) -> Solver | None:
+    def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
         """None where nobody knows how the scans are to be decoded."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None
             try:
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
-                self._solvers[name] = Solver(facts, replay.hand.solver, replay.clock)
+                self._solvers[name] = ScanSolver(facts, replay.hand.solver, replay.clock)
             except (KeyError, TypeError, OverflowError, ValueError) as error:
                 replay.complain(event, f"no facts of {name} ({type(error).__name__}: {error})")
         return self._solvers.get(name)

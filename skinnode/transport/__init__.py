@@ -1,4 +1,7 @@
-"""The only users of python-can at run time: ports on buses and the threads that empty them."""
+"""CAN interfaces: ports on buses, the threads that receive on them, and log files of frames.
+
+No other room uses python-can at run time.
+"""
 
 from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort

@@ -1,4 +1,7 @@
-"""Fault confinement of a CAN controller (ISO 11898-1), and how SocketCAN tells of it: <linux/can/error.h>."""
+"""Fault confinement states of a CAN controller (ISO 11898-1) as SocketCAN's error frames report them.
+
+The coding of the error frames is that of <linux/can/error.h>.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +16,19 @@ _CONTROLLER_BYTE: Final = 1
 
 
 class BusState(StrEnum):
-    """What a controller may do on the bus."""
+    """Fault confinement state of a controller."""
 
     ACTIVE = "error active"
     WARNING = "error warning"
-    """It has met some errors; it is active still."""
+    """Some errors occurred; the controller is still error active."""
     PASSIVE = "error passive"
-    """It has met many errors; it still sends and receives."""
+    """Many errors occurred; the controller still sends and receives."""
     OFF = "bus-off"
-    """It neither sends nor receives."""
+    """The controller neither sends nor receives."""
 
 
 def bus_state(frame: Frame) -> BusState | None:
-    """The state an error frame of SocketCAN tells; None where it is about something else."""
+    """Return the state that a SocketCAN error frame reports, or None if it reports something else."""
     if frame.can_id & _BUS_OFF:
         return BusState.OFF
     if frame.can_id & _RESTARTED:

@@ -1,9 +1,8 @@
-"""A bus made of datagrams, for load tests: frames as SocketCAN lays them out in memory, one in each UDP
-packet to this machine.
+"""A bus of UDP packets for load tests: each packet holds one frame in SocketCAN's memory layout.
 
-The reader is that of SocketCAN to the last line: the same system calls, times of the kernel, its bounded
-buffer and its count of what did not fit. What is not there is the CAN driver and the protocol below the
-socket; in their place is UDP over the loopback device, which costs the receiver about as much.
+The reader is exactly that of SocketCAN: the same system calls, kernel timestamps, bounded buffer and drop
+counter. Only the CAN driver and the protocol below the socket differ: UDP over the loopback device takes
+their place and costs the receiver about as much.
 """
 
 from __future__ import annotations
@@ -22,19 +21,28 @@ _MTU: Final = {False: 8, True: 64}  # bytes of data in <linux/can.h>'s struct ca
 
 
 def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
-    """The packet of a frame with an 11-bit identifier."""
+    """Return the packet of a frame with an 11-bit identifier.
+
+    Args:
+        can_id: 0 to 0x7FF.
+        data: Up to 8 bytes, or up to 64 bytes if ``fd``.
+        fd: Whether it is a CAN FD frame.
+    """
     return HEADER.pack(can_id, len(data), 0) + data.ljust(_MTU[fd], b"\0")
 
 
 def free_channel() -> str:
-    """A port of this machine that nobody listens to at the moment."""
+    """Return a UDP port of this machine on which no program listens at the moment."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((LOOPBACK, 0))
         return str(sock.getsockname()[1])
 
 
 class DatagramPort(CanPort):
-    """Listens to packets; ``channel`` is the number of its UDP port. It sends nothing."""
+    """A port that receives packets and sends nothing.
+
+    ``channel`` of its configuration is the number of a UDP port.
+    """
 
     def _open(self) -> can.BusABC:
         try:
@@ -61,7 +69,7 @@ class _DatagramBus(can.BusABC):
             raise
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        raise can.CanOperationError("a bus of datagrams only listens")
+        raise can.CanOperationError("a datagram bus only receives")
 
     def shutdown(self) -> None:
         super().shutdown()

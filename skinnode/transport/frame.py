@@ -1,4 +1,4 @@
-"""A frame off a bus, whatever the interface."""
+"""A received frame, the same for every interface."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """A frame off the bus. ``t_ns`` is monotonic; ``data`` is empty for a remote frame."""
+    """A received frame. ``t_ns`` is monotonic; ``data`` is empty for a remote frame."""
 
     can_id: int
     data: bytes

@@ -1,9 +1,9 @@
-"""Frames to a file through python-can's writers: candump's text (``.log``) and Vector's BLF.
+"""Write frames to a file with python-can's writers: candump's text (``.log``) or Vector's BLF.
 
-Both keep what was written before the last :meth:`FrameLog.flush` whatever happens to the process after it.
-A ``.log`` only grows. python-can's BLF writer keeps up to 128 kB of frames for itself, and a file header that
-it corrects at its end: so a flush ends the writer and opens another that appends, which leaves a whole BLF
-file each time.
+Both keep all frames written before the last :meth:`FrameLog.flush`, whatever happens to the process later. A
+``.log`` file only grows. python-can's BLF writer holds back up to 128 kB of frames, and corrects the file
+header when it stops; so each flush stops the writer and opens another that appends, which leaves a complete
+BLF file each time.
 """
 
 from __future__ import annotations
@@ -22,26 +22,30 @@ LogFormat = Literal["log", "blf"]
 SUFFIXES: Final = (".log", ".blf")
 
 _CONTAINER_BYTES: Final = 1 << 20
-"""Most of a BLF container, uncompressed: more than is written between two flushes, so that no frame lies in
-two of them."""
+"""Maximum size of a BLF container before compression: more than is written between two flushes, so that no
+frame is split over two containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """A frame as a log holds it: ``t_ns`` of the frame is of the wall clock, to 1 µs."""
+    """A frame in a log; its ``t_ns`` is wall-clock time, to 1 µs."""
 
     frame: Frame
     channel: str
-    """Name of the channel; in BLF, where channels are numbers, its number from 0 on."""
+    """Name of the channel; in BLF, which numbers channels, its number counted from 0."""
     sent: bool
-    """By whoever recorded."""
+    """Whether the recording program sent it."""
 
 
 class FrameLog:
-    """A log that is being written. Owned by one thread.
+    """A log file that is being written. Owned by one thread.
 
-    ``channels`` are the names that frames will come with; BLF numbers them in this order. Raises ConfigError
-    for a file that is there already or cannot be made. The other methods raise OSError where the disk does
-    not take what is written.
+    Args:
+        path: A new file ending in ``.log`` or ``.blf``.
+        channels: Names of the channels; BLF numbers them in this order.
+
+    Raises:
+        ConfigError: if the file exists already, or cannot be created.
+        OSError: from the other methods, if the disk does not take what is written.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
@@ -54,7 +58,7 @@ class FrameLog:
         self._writer: can.CanutilsLogWriter | can.BLFWriter | None = None
         self._begun = False
         self.frames = 0
-        """Frames written."""
+        """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
         """Write a frame; it is safe after the next :meth:`flush`."""
@@ -78,8 +82,11 @@ class FrameLog:
         self.frames += 1
 
     def flush(self, *, to_disk: bool) -> None:
-        """Hand what was written to the kernel, which keeps it if this process is killed; ``to_disk``: and
-        from there to the disk, which keeps it if the machine is."""
+        """Pass everything written so far to the kernel, which keeps it if this process is killed.
+
+        Args:
+            to_disk: Also wait until the disk has it, so that it survives a loss of power.
+        """
         if self._is_blf:
             self._end_blf()
         else:
@@ -88,7 +95,7 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """End the file. Does not raise: what could not be written has been complained of by then."""
+        """End the file. Never raises: earlier calls have already reported what could not be written."""
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):
@@ -107,17 +114,21 @@ class FrameLog:
         try:
             writer.stop()
         finally:
-            with contextlib.suppress(OSError):  # of a disk that is full, a second time
+            with contextlib.suppress(OSError):  # a full disk raises again
                 writer.file.close()
 
 
 def create(path: Path) -> TextIO:
-    """A new text file. Raises ConfigError where there is one already, or none can be made."""
+    """Create a new text file.
+
+    Raises:
+        ConfigError: if the file exists already, or cannot be created.
+    """
     try:
         return path.open("x", encoding="ascii")
     except FileExistsError:
         raise ConfigError(
-            "recording", str(path), "a new file; this one exists and is not written over"
+            "recording", str(path), "a new file; this one exists and is not overwritten"
         ) from None
     except OSError as error:
         raise ConfigError("recording", str(path), f"a file that can be made ({error.strerror})") from None

@@ -1,8 +1,8 @@
-"""Frames from a candump log or a BLF file, whatever state it is in.
+"""Read frames from a candump log or a BLF file, damaged or not.
 
-A file that was cut off, or has garbage in it, yields every frame that is whole; what is not is counted and
-named by line or offset (:class:`Damage`). Nothing in a file raises. A byte that was changed into another of
-the same kind shows in BLF, whose containers have checksums, and not in a candump log, which has none.
+A truncated or partly overwritten file yields every complete frame; the damage is counted and located by line
+or offset (:class:`Damage`). No content of a file raises. A byte changed into another of the same kind shows
+in BLF, whose containers have checksums, but not in a candump log, which has none.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
 
 DAMAGES_KEPT: Final = 100
-"""Damages that are described; more are only counted."""
+"""Maximum number of damages described; further ones are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +34,9 @@ class Damage:
     """A piece of a file that could not be read."""
 
     line: int | None
-    """Counted from 1; None in BLF, which has no lines."""
+    """Line number, counted from 1; None in BLF, which has no lines."""
     offset: int
-    """Bytes from the beginning of the file."""
+    """Offset from the beginning of the file, bytes."""
     what: str
 
     def __str__(self) -> str:
@@ -45,8 +45,11 @@ class Damage:
 
 
 class FrameLogReader:
-    """A log, read once from the beginning by iterating. Raises ConfigError for a file that cannot be opened
-    or whose name says that it is neither kind."""
+    """A log, read once from the beginning by iterating over it. Owned by one thread.
+
+    Raises:
+        ConfigError: if the file cannot be opened, or its name does not end in ``.log`` or ``.blf``.
+    """
 
     def __init__(self, path: Path) -> None:
         if path.suffix not in SUFFIXES:
@@ -57,16 +60,16 @@ class FrameLogReader:
             raise ConfigError("recording", str(path), f"a file that can be read ({error.strerror})") from None
         self.path = path
         self.damages: list[Damage] = []
-        """The first of them."""
+        """The first :data:`DAMAGES_KEPT` damages."""
         self.damaged = 0
-        """All of them, up to where iteration is."""
+        """Number of damages up to the present position."""
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         with self._file:
             yield from self._blf() if self.path.suffix == ".blf" else self._candump()
 
     def close(self) -> None:
-        """Read no further."""
+        """Stop reading."""
         self._file.close()
 
     def _complain(self, line: int | None, offset: int, what: str) -> None:
@@ -120,8 +123,7 @@ class FrameLogReader:
                 self._complain(None, size, f"cut off: a frame that ends after {counted(len(tail), 'byte')}")
 
     def _container(self, data: mmap.mmap, at: int) -> tuple[int, bytes | None]:
-        """Where the container at ``at`` ends, and what is in it, as far as it is there; None if it is
-        damaged."""
+        """Return the end of the container at ``at``, and its readable content; None if it is damaged."""
         _, _, _, size, _ = _OBJECT.unpack_from(data, at)
         end = at + size
         body = data[at + _CONTAINER_HEAD_BYTES : end]
@@ -145,8 +147,7 @@ class FrameLogReader:
         return min(end, len(data)), objects
 
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
-        """The objects in ``data`` that are whole, and the beginning of one that goes on in the next
-        container. What is between objects and is none is left out."""
+        """Return the complete objects of ``data``, and the beginning of an incomplete one at its end."""
         pieces: list[bytes] = []
         begin = at = 0  # of the objects that follow one another; of the next
         while True:
@@ -172,13 +173,13 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """The frames among ``objects``, by python-can, which gets a small file with nothing else in it."""
+        """Yield the frames among ``objects``. python-can reads them from a small file of nothing else."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:
             for message in can.BLFReader(file):
                 yield _blf_frame(message)
-        except Exception as error:  # python-can lets through what its parsing raises
+        except Exception as error:  # python-can does not catch what its parser raises
             self._complain(None, container, f"objects that cannot be read ({type(error).__name__}: {error})")
 
 
@@ -194,7 +195,7 @@ _ERROR_BIT: Final = 0x2000_0000
 
 
 def _candump_frame(line: bytes) -> LoggedFrame | None:
-    """The frame on a line as ``candump -L`` and python-can write it; None if it is none, or may be cut."""
+    """Return the frame on a line as ``candump -L`` and python-can write it; None for other or cut lines."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None
@@ -239,7 +240,7 @@ _MOST_OBJECT: Final = 1 << 16
 
 
 def _find_container(data: mmap.mmap, at: int) -> int:
-    """Where the next container begins; the end of the file if there is none."""
+    """Return the offset of the next container, or the length of the file if there is none."""
     while (at := data.find(b"LOBJ", at)) >= 0:
         if at + _OBJECT.size <= len(data):
             _, _, _, size, kind = _OBJECT.unpack_from(data, at)

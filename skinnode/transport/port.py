@@ -1,9 +1,8 @@
-"""One endpoint on a CAN bus, whatever the interface. The only user of python-can at run time: everything it
-raises leaves here as one line of :class:`~skinnode.errors.BusError`.
+"""An endpoint on a CAN bus, the same for every interface.
 
-Times are of the host's monotonic clock. Where the interface stamps frames with the wall clock (virtual,
-udp_multicast, socketcan) the age of the stamp is kept, so that a frame that waited in a queue is not dated
-late.
+Each error of python-can leaves here as a one-line :class:`~skinnode.errors.BusError`. Times are those of the
+host's monotonic clock. If the interface stamps frames with the wall clock (virtual, udp_multicast,
+socketcan), the age of the stamp is subtracted, so that waiting in a queue does not change a frame's time.
 """
 
 from __future__ import annotations
@@ -32,11 +31,12 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Frames that wait in an endpoint of python-can's virtual bus, about 4 s of a full bus at 1 Mbit/s. Without a
-bound an endpoint that nobody reads would eat the memory of the process."""
+"""Capacity of an endpoint of python-can's virtual bus: about 4 s of a full bus at 1 Mbit/s. Without a limit,
+an endpoint that is never read would fill the memory."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
-"""Asked of the kernel where the interface is a socket: a waiting frame takes about 800 bytes of it."""
+"""Size of the receive buffer requested from the kernel, if the interface is a socket; a waiting frame takes
+about 800 bytes."""
 
 # Python has no names for these. <asm-generic/socket.h>, <linux/in.h>, <linux/in6.h>
 SO_RCVBUFFORCE: Final = 33
@@ -44,11 +44,12 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
-"""A stamp older than this, or of the future, is not of this machine's wall clock: the time of reading
-counts."""
+"""Maximum age of a timestamp. An older stamp, or one in the future, is not of this machine's wall clock, so
+the time of reading is used."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""The kernel tells a socket once that its interface went down; a sender may be the one to hear it."""
+"""Errors by which the kernel reports, once for each socket, that its interface went down; the sender may be
+the one that gets it."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
@@ -61,20 +62,22 @@ logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 def is_interface(config: BusConfig) -> bool:
-    """Return whether python-can, or one of its plugins, has the interface of this bus."""
+    """Return whether python-can, or one of its plugins, provides the interface of this bus."""
     return config.interface in can.VALID_INTERFACES
 
 
 def allowed_interfaces(config: BusConfig) -> str:
-    """Return a phrase with the interface names that python-can knows, suggesting the closest match."""
+    """Return a phrase that lists python-can's interfaces and suggests the closest match."""
     known = ", ".join(sorted(can.VALID_INTERFACES))
     near = difflib.get_close_matches(config.interface.lower(), can.VALID_INTERFACES, 1)
     return f"one of {known}; did you mean {near[0]!r}?" if near else f"one of {known}"
 
 
 class _Message(can.Message):
-    """A message that python-can's virtual bus, which deep-copies one for each receiver, copies in a fifth of
-    the time its general way takes."""
+    """A message that copies five times as fast as python-can's.
+
+    Its virtual bus copies one for each receiver.
+    """
 
     __slots__ = ()
 
@@ -96,12 +99,18 @@ class _Message(can.Message):
 
 
 class CanPort:
-    """An open endpoint. Sends from any thread; receives on one.
+    """An open endpoint on a bus, from construction to :meth:`close` or the end of a ``with`` block.
 
-    The interface is opened by the constructor and closed by :meth:`close` or at the end of a ``with`` block.
-    An endpoint does not hear what it sent itself. Raises BusError where the interface does not open.
+    An endpoint does not receive what it sent itself. python-can's configuration files and environment
+    variables are ignored.
 
-    python-can's own configuration files and environment variables are not consulted: the argument is all.
+    Threads: any thread may send; one thread receives.
+
+    Args:
+        config: The bus: interface, channel, bit rates and options.
+
+    Raises:
+        BusError: if the interface does not open.
     """
 
     def __init__(self, config: BusConfig) -> None:
@@ -116,8 +125,8 @@ class CanPort:
         self._away = False
         self._bus = self._open()
         self._reader = self._open_reader()
-        # Frames sent to a multicast group come back, and every member has the same address and port. The one
-        # field that tells them apart is the channel, which python-can sends along and nobody reads.
+        # Frames sent to a multicast group come back, and every member has the same address and port. The only
+        # field that can mark them is the channel, which python-can sends but does not use.
         self._tag = f"skinnode-{uuid.uuid4().hex}" if config.interface == _MULTICAST else None
         self._send_timeout_s = 0.0 if config.interface == _VIRTUAL else None
 
@@ -145,7 +154,7 @@ class CanPort:
         return bus
 
     def _open_reader(self) -> SocketReader | None:
-        """Reads the interface in place of python-can; None where python-can does it."""
+        """Return the reader that takes python-can's place, or None if python-can reads."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
@@ -155,47 +164,53 @@ class CanPort:
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Of the socket of a port that :attr:`reads_batches`, to wait for several at once; -1 while it is
-        closed."""
+        """Return the socket's file descriptor if the port :attr:`reads_batches`, -1 while it is closed."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property
     def sent(self) -> int:
-        """Frames handed to the interface."""
+        """Number of frames passed to the interface."""
         return self._sent
 
     @property
     def received(self) -> int:
-        """Frames read, without the endpoint's own."""
+        """Number of frames read, without the endpoint's own."""
         return self._received
 
     @property
     def errors(self) -> int:
-        """Sends and receives that raised BusError."""
+        """Number of calls to send or receive that raised BusError."""
         return self._errors
 
     @property
     def undelivered(self) -> int:
-        """Frames on a virtual bus that some other endpoint had no room for: its loss, not the sender's."""
+        """Frames that another endpoint of a virtual bus had no room for and lost."""
         return self._undelivered
 
     @property
     def malformed(self) -> int:
-        """Packets of the multicast group that were no CAN frame."""
+        """Packets of the multicast group that were not CAN frames."""
         return self._malformed
 
     @property
     def dropped(self) -> int:
-        """Frames that the kernel had no room for; 0 on interfaces other than socketcan, which do not tell."""
+        """Frames for which the kernel had no room; 0 if the interface is not socketcan."""
         return self._dropped_before + (0 if self._reader is None else self._reader.dropped)
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Send a frame with an 11-bit identifier: a classic one with up to 8 bytes of ``data``; with more, on
-        a bus with ``fd``, a CAN FD frame with bit-rate switch, padded with zeros to a length that those have.
+        """Send a frame with an 11-bit identifier.
 
-        Raises BusError if the interface refuses it; ValueError for an identifier or a length that no frame of
-        this bus has. A full queue of another endpoint of a virtual bus is that endpoint's loss, as on a real
-        one.
+        More than 8 bytes, on a bus with ``fd``, make a CAN FD frame with bit-rate switch, padded with zeros
+        to a valid length. On a virtual bus, a full queue of another endpoint is that endpoint's loss.
+
+        Args:
+            can_id: 0 to 0x7FF.
+            data: Up to 8 bytes; up to 64 on a bus with ``fd``.
+            remote: Whether to send a remote frame.
+
+        Raises:
+            BusError: if the interface does not take the frame.
+            ValueError: if the identifier or the length is out of range for this bus.
         """
         if not 0 <= can_id <= 0x7FF:
             raise ValueError(f"can_id: got {can_id}, must be 0 to 0x7FF")
@@ -229,14 +244,24 @@ class CanPort:
             self._undelivered += undelivered
 
     def recv(self, timeout_s: float) -> Frame | None:
-        """The next frame, or None after ``timeout_s``. Raises BusError if the interface fails or is
-        closed."""
+        """Return the next frame, or None if none came within ``timeout_s``.
+
+        Raises:
+            BusError: if the interface fails or is closed.
+        """
         batch = self.recv_batch(timeout_s, 1)
         return batch[0] if batch else None
 
     def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Frames that wait, at most ``most``, and on interfaces other than socketcan one; waits up to
-        ``timeout_s`` for the first. Raises BusError if the interface fails or is closed."""
+        """Return the waiting frames; wait for the first if there is none.
+
+        Args:
+            timeout_s: Longest wait for the first frame, s.
+            most: Maximum number of frames. Interfaces other than socketcan return one at a time.
+
+        Raises:
+            BusError: if the interface fails or is closed.
+        """
         if self._reader is None:
             return self._recv_message(timeout_s)
         try:
@@ -265,13 +290,17 @@ class CanPort:
                     self._errors += 1
                     raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
                 self._malformed += 1
-            # The endpoint's own frame, or none at all: wait for what is left of the time.
+            # The endpoint's own frame, or not a frame: wait for the rest of the time.
             timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
-        """Close the interface and open it again, after it failed; the counters go on. What is sent meanwhile
-        raises BusError, and so does this where the interface does not open: try again later. A thread that
-        receives must have ended before."""
+        """Close and open the interface again after it failed; the counters continue.
+
+        While it is closed, sending raises BusError. The receiving thread must have ended before.
+
+        Raises:
+            BusError: if the interface does not open; it may be tried again later.
+        """
         if not self._away:
             self._away = True
             self._dropped_before, self._reader = self.dropped, None
@@ -282,9 +311,14 @@ class CanPort:
         self._away = False
 
     def set_bitrate(self, bitrate_bps: int) -> None:
-        """Change the bit rate and open the interface anew. On socketcan it is the kernel's: ``ip link`` sets
-        it, which takes the right to (CAP_NET_ADMIN). Raises BusError; the interface is then opened again as
-        it was. A thread that receives must have ended before."""
+        """Change the bit rate and open the interface again.
+
+        The bit rate of socketcan is set by ``ip link``, which needs the capability CAP_NET_ADMIN. The
+        receiving thread must have ended before.
+
+        Raises:
+            BusError: if the bit rate is not accepted; the interface is then open at the previous rate.
+        """
         before = self.config
         self.config = before.model_copy(update={"bitrate_bps": bitrate_bps})
         try:
@@ -297,7 +331,7 @@ class CanPort:
             self.reopen()
 
     def close(self) -> None:
-        """Close the interface. Closing twice is fine; a thread that receives must have ended before."""
+        """Close the interface. Closing twice is allowed; the receiving thread must have ended before."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()
@@ -315,14 +349,14 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Ask the kernel for room for bursts, and for the frames of this multicast group only."""
+    """Request a large receive buffer, and the frames of this multicast group only."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
             duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds to any address, and such a socket hears every group that anyone on the machine has
+        # python-can binds to any address, and such a socket receives every group that any program has
         # joined: two buses on two groups would be one.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
@@ -335,7 +369,7 @@ def _tune_socket(fileno: int) -> None:
 
 
 def _discard_waiting(sock: socket.socket) -> None:
-    """Forget what came while the socket still heard other groups."""
+    """Discard frames received while the socket still accepted other groups."""
     with contextlib.suppress(BlockingIOError):
         while True:
             sock.recv(1, socket.MSG_DONTWAIT)
@@ -358,14 +392,16 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _is_garbage(error: Exception) -> bool:
-    """Whether the multicast bus failed on what a packet said rather than on the network: its error then comes
-    from msgpack or from a check of the message, and not from the socket."""
+    """Return whether the multicast bus failed on the content of a packet, not on the network.
+
+    msgpack or a check of the message raised the error then, not the socket.
+    """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)
 
 
 def _why(error: BaseException) -> str:
-    """The most telling of a chain of errors, in one line."""
+    """Return the most informative error of a chain, in one line."""
     while error.__cause__ is not None:
         error = error.__cause__
     if error.__context__ is not None and isinstance(error.__context__, OSError):

@@ -1,5 +1,7 @@
-"""The receive context: threads that copy frames into bounded queues, count what does not fit, and nothing
-else. Whoever owns the receiver takes whole batches from the other end."""
+"""Receiving threads: they copy frames into bounded queues, count what does not fit, and do nothing else.
+
+One reader takes whole batches from the other end of the queues.
+"""
 
 from __future__ import annotations
 
@@ -18,41 +20,52 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Two seconds of a full bus at 1 Mbit/s (8,000 frames/s): longer than any pause a host survives otherwise."""
+"""Capacity of an intake: 2 s of a full bus at 1 Mbit/s (8,000 frames/s), longer than any pause that a host
+survives otherwise."""
 
 _POLL_S: Final = 0.02
-"""How long a thread waits for a frame before it says that there is none, and sees whether it should end."""
+"""Longest wait of a thread for a frame, after which it checks whether it should end, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause after a batch, as a network card moderates its interrupts: a thread that woke for each of 8,000
-frames a second would spend more on waking than on frames. The first frame after a silence does not wait for
-it, and each has the time of its arrival."""
+"""Pause after a batch, like the interrupt moderation of a network card: waking for each of 8,000 frames a
+second would cost more than handling them. The first frame after a silence does not wait, and each frame keeps
+its time of arrival."""
 
 LONG_NS: Final = 5_000_000
-"""The same while it is known when everything that somebody waits for should come. What comes unforeseen all
-the same may wait for it, and half as long again."""
+"""The same pause while the time of every awaited frame is predicted. An unpredicted frame may wait for one
+and a half times as long."""
 
 _BEFORE_NS: Final = 800_000
-"""What has gathered is fetched once more that long before something is expected, so that little is left to do
-when it is there."""
+"""Time before a predicted arrival at which waiting frames are fetched, so that little is left to do when it
+comes."""
 _SHORT_NS: Final = 300_000
-"""Least pause, when something is expected or overdue."""
+"""Shortest pause, when a frame is predicted or overdue."""
 _LATE_NS: Final = 600_000
-"""For how long something overdue is waited for with such pauses."""
+"""Time for which an overdue frame is awaited with such pauses."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""What is later than that does not come any more."""
+"""Time after which an overdue frame is not awaited any more."""
 _ANSWER_NS: Final = 20_000_000
-"""For how long after a question an answer may come at any time."""
+"""Time after a request during which a response may come at any instant."""
 _LAG_NS: Final = 50_000
-"""A frame is there to be read that long after the time of its arrival."""
+"""Time from a frame's arrival until it can be read."""
 
 
 class Intake:
-    """Frames of ``port`` on their way from the thread that receives them to the one that takes them.
+    """The bounded queue of one port, between the thread that receives and the thread that takes.
 
-    When the queue is full the newest frame is dropped, as a kernel socket does: what has been queued stays
-    complete and in order, and only the thread that fills the queue ever touches its end. ``dropped`` counts.
+    A full queue drops the newest frame, as a kernel socket does: queued frames stay complete and in order,
+    and only the receiving thread ever touches the end of the queue. ``dropped`` counts.
+
+    Threads: :meth:`take` and :meth:`expect` belong to the reader, the rest to the receiving thread, except
+    where any thread is mentioned.
+
+    Args:
+        port: The port to receive on.
+        capacity: Frames that may wait.
+
+    Raises:
+        ValueError: if ``capacity`` is below 1.
     """
 
     def __init__(self, port: CanPort, capacity: int = CAPACITY_FRAMES) -> None:
@@ -60,12 +73,12 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Whatever came before is queued, or was dropped; monotonic."""
+        """Monotonic time: all frames that arrived earlier are queued or were dropped."""
         self.due_ns = 0
-        """When to :meth:`fetch` again. The receiver's."""
+        """Monotonic time of the next :meth:`fetch`. Used by the receiver."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
-        self._put = self._taken = self._dropped = 0  # _taken is the reader's, the others the receiver's
+        self._put = self._taken = self._dropped = 0  # the reader writes _taken, the receiver the others
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
         self._first_ns = 0  # the earliest of them all; 0 while one of them may come at any time
@@ -73,18 +86,22 @@ class Intake:
 
     @property
     def dropped(self) -> int:
-        """Frames that found the queue full. What the kernel dropped is counted by the port."""
+        """Frames that found the queue full. The port counts those that the kernel dropped."""
         return self._dropped
 
     @property
     def queued(self) -> int:
-        """Frames waiting to be taken."""
+        """Number of frames waiting."""
         taken = self._taken  # first: there are never fewer put than taken
         return self._put - taken
 
     def take(self) -> list[Frame]:
-        """All frames waiting, in order of arrival; never waits. Raises BusError once the bus has failed,
-        after the frames that came before; and whatever else went wrong in receiving."""
+        """Return all waiting frames in order of arrival; never waits.
+
+        Raises:
+            BusError: if the bus failed, once the frames received before that have been taken.
+            Exception: whatever else receiving raised.
+        """
         error, batches = self._error, self._queue  # the error first: what is queued came before it
         if not batches:
             if error is not None:
@@ -97,21 +114,26 @@ class Intake:
         return frames
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """The last frame of ``what`` should come at one of ``times_ns``, monotonic and ascending, and is not
-        to wait for others then; empty: at any time. Holds until the same is expected anew."""
+        """Predict when the last frame of ``what`` will arrive; it will then be fetched without delay.
+
+        Args:
+            what: Name of the group of frames. A new prediction replaces the previous one of the same name.
+            times_ns: Monotonic times in ascending order, one of which applies; empty if it may come at any
+                time.
+        """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Something was sent at ``t_ns``, monotonic, that may be answered. From any thread."""
+        """Note that a request was sent at monotonic time ``t_ns``, so a response may follow. Any thread."""
         self._asked_ns = t_ns
 
     # --- the receiver's
 
     def gather(self, now_ns: int) -> None:
-        """After a batch: set :attr:`due_ns`, so that frames gather until then."""
+        """Set :attr:`due_ns` after a batch, so that frames gather until then."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # mostly so, and asked after every batch of every bus
+        if now_ns < self._first_ns:  # the usual case, decided after every batch of every bus
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)
@@ -119,8 +141,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """When to fetch for the sake of what is expected, and whether that is all that may come. What is late
-        may come at any time."""
+        """Return when to fetch a predicted frame, and whether all frames to come are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -133,15 +154,22 @@ class Intake:
 
     @property
     def failed(self) -> bool:
-        """Whether nothing more is received until :meth:`Receiver.resume`."""
+        """Whether receiving has stopped until :meth:`Receiver.resume`."""
         return self._error is not None
 
     def resume(self) -> None:
-        """Forget the error."""
+        """Clear the error."""
         self._error = None
 
     def fetch(self, timeout_s: float) -> bool:
-        """Queue what has come, waiting up to ``timeout_s`` for it; whether there is anything new to take."""
+        """Queue the frames that have arrived.
+
+        Args:
+            timeout_s: Longest wait for the first frame, s.
+
+        Returns:
+            Whether there is something new to take: frames or an error.
+        """
         now_ns = time.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
@@ -175,9 +203,12 @@ class _Shared:
 class Receiver:
     """Receives on the ports of ``intakes`` from construction until :meth:`close`.
 
-    Ports that read batches share one thread, which wakes for several buses at once where it can. Any other
-    may block in python-can, and has a thread of its own. A failure of a port stops only its own reception.
-    Any other exception is passed to ``on_defect``, on the thread that raised it, and reception continues.
+    Threads: ports that read batches share one thread, which wakes once for several buses if it can. Any other
+    port may block in python-can and has a thread of its own. A failing port stops only its own reception.
+
+    Args:
+        intakes: The queues to fill.
+        on_defect: Called with any other exception, on the thread that raised it; reception continues.
     """
 
     def __init__(
@@ -185,7 +216,7 @@ class Receiver:
     ) -> None:
         self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self._joining: deque[Intake] = deque()  # to those of the shared thread
+        self._joining: deque[Intake] = deque()  # waiting to be taken up by the shared thread
         self._stop = threading.Event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
@@ -196,12 +227,12 @@ class Receiver:
             self.resume(intake)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait up to ``timeout_s`` until there is something to take. One thread may."""
+        """Wait up to ``timeout_s`` until there is something to take. Only one thread may wait."""
         with contextlib.suppress(queue.Empty):
             self._news.get(timeout=timeout_s)
 
     def resume(self, intake: Intake) -> None:
-        """Receive again on a port that failed and was opened again. From any thread."""
+        """Receive again on a port that failed and was reopened. Any thread."""
         if intake.port.reads_batches:
             intake.resume()
             self._joining.append(intake)
@@ -215,7 +246,7 @@ class Receiver:
         self._alone[intake] = thread  # set after start(): a thread that did not start cannot be joined
 
     def close(self) -> None:
-        """End and join the threads. The ports stay open: they belong to whoever opened them."""
+        """End and join the threads. The ports stay open; their owner closes them."""
         self._stop.set()
         for thread in self._alone.values():
             thread.join()
@@ -263,7 +294,7 @@ class Receiver:
             for intake in failed:
                 del intakes[intake]
             shared.poll = _poll_of(intakes)
-        self._tell()
+        self._notify()
         now_ns = time.monotonic_ns()
         for intake in fetched:
             intake.gather(now_ns)
@@ -277,29 +308,31 @@ class Receiver:
                     return
                 # Polled twice: this thread may have been suspended since the first poll found nothing.
                 if intake.fetch(_POLL_S) or intake.fetch(0.0):
-                    self._tell()
+                    self._notify()
             except Exception as error:
                 self._on_defect(error)
                 time.sleep(_POLL_S)
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         if self._news.empty():  # once is enough
             self._news.put(None)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
-    """Whether there is anything new to take from any of them."""
+    """Fetch from every intake. Returns whether any has something new to take."""
     return sum(intake.fetch(0.0) for intake in intakes) > 0  # of each, whatever another has
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
-    """The end of a pause of about ``pause_ns``, from half of it to one and a half: the same instant for all
-    buses, so that one waking does for all."""
+    """Return the end of a pause of about ``pause_ns``, half to one and a half times as long.
+
+    It is the same instant for all buses, so that waking once serves all.
+    """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
 
 def _before(t_ns: int, now_ns: int) -> int:
-    """When to fetch for the sake of what is expected at ``t_ns``."""
+    """Return when to fetch for a frame predicted at ``t_ns``."""
     due_ns = t_ns + _LAG_NS
     if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
         due_ns -= _BEFORE_NS
@@ -315,7 +348,7 @@ def _poll_of(intakes: Iterable[Intake]) -> select.poll:
 
 
 def drain(port: CanPort, within_s: float) -> list[Frame]:
-    """Every frame that arrives within ``within_s``. For tools and tests that need no thread."""
+    """Return every frame that arrives within ``within_s``. For tools and tests without a receiving thread."""
     frames: list[Frame] = []
     end_ns = time.monotonic_ns() + int(within_s * 1e9)
     while (left_ns := end_ns - time.monotonic_ns()) > 0:

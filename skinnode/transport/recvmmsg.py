@@ -1,7 +1,7 @@
-"""Many messages of a socket in one system call: recvmmsg(2), which Python's socket module does not have.
+"""Receive many messages of a socket in one system call: recvmmsg(2), which Python's socket module lacks.
 
-The call is made with the interpreter's lock held. It does not wait, takes about a microsecond a message, and
-letting go of the lock for each of 8,000 messages a second would cost every other thread more than that.
+The call holds the interpreter's lock. It does not wait and takes about a microsecond a message; releasing the
+lock for each of 8,000 messages a second would cost every other thread more.
 """
 
 from __future__ import annotations
@@ -48,7 +48,10 @@ _libc: Final = ctypes.PyDLL(None, use_errno=True)
 
 
 class MessageBatch:
-    """Room for ``count`` messages of up to ``size`` bytes with ``control`` bytes of ancillary data each."""
+    """Buffers for ``count`` messages of up to ``size`` bytes, each with ``control`` bytes of ancillary data.
+
+    Owned by one thread.
+    """
 
     def __init__(self, count: int, size: int, control: int) -> None:
         self._count, self._size, self._record = count, size, size + control
@@ -65,9 +68,14 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """How many messages were waiting, at most ``most`` and ``count``; they take the place of those
-        before. It does not wait. Raises OSError; where messages came before the error, it is raised by the
-        next call."""
+        """Receive up to ``most`` and ``count`` waiting messages in place of the previous ones; never waits.
+
+        Returns:
+            Number of messages received.
+
+        Raises:
+            OSError: if receiving fails; if messages came before the error, the next call raises it.
+        """
         used = self._got * _USED.size
         self._memory[:used] = self._fresh[:used]  # the kernel wrote there what it used of the room
         self._got = 0
@@ -81,20 +89,23 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Bytes of ancillary data and of the message, of each message received."""
+        """Yield for each received message the lengths of its ancillary data and of the message, bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
-        """The messages received, each followed by its ancillary data, both with the room they left."""
+        """Return the memory of the received messages.
+
+        Each is followed by its ancillary data; both with unused space.
+        """
         return self._room[: self._got * self._record]
 
     def payload(self, number: int, length: int) -> bytes:
-        """A copy of the message of this number."""
+        """Return a copy of the first ``length`` bytes of a message."""
         at = number * self._record
         return bytes(self._room[at : at + length])
 
     def control(self, number: int, length: int) -> bytes:
-        """A copy of its ancillary data."""
+        """Return a copy of the first ``length`` bytes of a message's ancillary data."""
         at = number * self._record + self._size
         return bytes(self._room[at : at + length])
 

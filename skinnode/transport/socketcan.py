@@ -1,8 +1,8 @@
-"""Reads a raw SocketCAN socket in batches, with the kernel's times and its count of what it dropped.
+"""Read a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
 
-python-can opens and configures the socket, and sends; its way of receiving costs a ``select``, a ``recvmsg``
-and a ``Message`` a frame and does not see the drop counter. Structures and constants: <linux/can.h>,
-<linux/can/raw.h>, <asm-generic/socket.h>, <linux/net_tstamp.h>.
+Why by hand: python-can opens and configures the socket, and sends; but its way of receiving costs a
+``select``, a ``recvmsg`` and a ``Message`` for each frame, and ignores the drop counter. Structures and
+constants: <linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h>, <linux/net_tstamp.h>.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1
 
 HEADER: Final = struct.Struct("<IBB2x")  # identifier with flags, length, FD flags; 8 or 64 bytes follow
 FD_MTU: Final = 72
-"""Bytes of struct canfd_frame, which tell it from a classic one."""
+"""Size of struct canfd_frame, bytes; a classic frame is shorter."""
 _STAMPS: Final = struct.Struct("@qqqqqq")  # seconds and nanoseconds: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head, level, type
@@ -36,28 +36,29 @@ _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
 _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that is a time and nothing else
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
-"""A frame and its time as they usually are: identifier, length, 8 bytes, software and hardware time."""
+"""A frame and its time in their usual form: identifier, length, 8 bytes, software and hardware time."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _FLAGS: Final = _EXTENDED | _REMOTE | _ERROR
 
 _OLDEST_NS: Final = 10_000_000_000
-"""A frame that claims to be older was stamped before the wall clock was set: the time of reading counts."""
+"""Maximum age of a frame. An older stamp was taken before the wall clock was set, so the time of reading is
+used."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Frames may come in after a batch was begun, but not by more than that."""
+"""Maximum time by which a frame may arrive after the reading of its batch began."""
 
 _IP_S: Final = 5.0
-"""Longest an ``ip link`` may take."""
+"""Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Most frames of one call: 30 ms of a full bus at 1 Mbit/s, after which the reader looks up."""
+"""Maximum number of frames in one call: 30 ms of a full bus at 1 Mbit/s."""
 
 
 class SocketReader:
-    """Batches of frames from ``sock``, which must be bound. Owned by the thread that reads.
+    """Reads batches of frames from a bound socket. Owned by the receiving thread.
 
-    Hardware stamps are used where the driver offers them: see :class:`HardwareDelay`.
+    Hardware timestamps are used if the driver offers them: see :class:`HardwareDelay`.
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -65,10 +66,10 @@ class SocketReader:
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
-        """Frames that the kernel had no room for in the socket's buffer."""
+        """Frames for which the socket's buffer in the kernel had no room."""
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
-        """Whether the newest frame bore one."""
+        """Whether the newest frame had a hardware timestamp."""
         self._delay = HardwareDelay()
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0)  # python-can's choice; a socket has one kind
         sock.setsockopt(
@@ -77,12 +78,19 @@ class SocketReader:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     def fileno(self) -> int:
-        """Of the socket; -1 when it was closed."""
+        """Return the socket's file descriptor; -1 once it is closed."""
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Frames that wait, at most ``most`` or a batch; waits up to ``timeout_s`` for the first. Raises
-        OSError if the interface fails."""
+        """Return the waiting frames; wait for the first if there is none.
+
+        Args:
+            timeout_s: Longest wait for the first frame, s.
+            most: Maximum number of frames; never more than :data:`BATCH_FRAMES`.
+
+        Raises:
+            OSError: if the interface fails.
+        """
         batch = self._batch
         if not batch.receive(self._sock, most) and (
             timeout_s <= 0.0
@@ -118,7 +126,7 @@ class SocketReader:
         return frames
 
     def _arrival(self, control: bytes, now_ns: int, wall_to_mono_ns: int) -> int:
-        """When the frame with this ancillary data came in, by the monotonic clock."""
+        """Return the monotonic time at which the frame with this ancillary data arrived."""
         t_ns, at = now_ns, 0
         while at < len(control):
             length, _, kind = _CONTROL.unpack_from(control, at)
@@ -139,8 +147,11 @@ class SocketReader:
 
 
 def set_link_bitrate(config: BusConfig) -> None:
-    """Let the kernel take the interface of ``config`` down, set its bit rate and take it up again. Raises
-    BusError with what ``ip`` says."""
+    """Take the interface down, set its bit rates and bring it up again, by ``ip link``.
+
+    Raises:
+        BusError: with the message of ``ip``, if a command fails.
+    """
     rates = ["bitrate", str(config.bitrate_bps)]
     if config.fd:
         rates += ["dbitrate", str(config.data_bitrate_bps), "fd", "on"]
@@ -164,11 +175,11 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 
 
 class HardwareDelay:
-    """Times of a controller's own clock as times of this machine, so that a frame that the kernel was late to
-    stamp keeps the time it came in.
+    """Converts times of a controller's own clock to the monotonic clock.
 
-    The difference of the two clocks is known from above only: a stamp of the kernel is never early. Its lower
-    envelope is followed, and let rise by what two crystals may drift apart.
+    A frame that the kernel stamped late thus keeps the time at which it arrived. The kernel's stamp is never
+    early, so the difference of the clocks is known as an upper bound: its lower envelope is tracked, and may
+    rise as fast as two crystals drift apart. Owned by one thread.
     """
 
     DRIFT: Final = 200e-6  # two oscillators of 100 ppm each
@@ -178,8 +189,12 @@ class HardwareDelay:
         self._last_ns = 0
 
     def arrival_ns(self, hardware_ns: int, kernel_ns: int) -> int:
-        """When a frame came in that the controller stamped at ``hardware_ns`` and the kernel, monotonic, at
-        ``kernel_ns``."""
+        """Return the monotonic arrival time of a frame.
+
+        Args:
+            hardware_ns: Time stamped by the controller.
+            kernel_ns: Monotonic time stamped by the kernel.
+        """
         offset_ns = kernel_ns - hardware_ns
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) < _OLDEST_NS:
             risen_ns = self._offset_ns + int(self.DRIFT * max(0, hardware_ns - self._last_ns))

@@ -13,7 +13,7 @@ import pytest
 import skinnode.diagnose
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.diagnose.root_causes import RULES
-from skinnode.host import events
+from skinnode.host import health_watch
 from skinnode.host.code_watch import WireState
 from skinnode.host.health import BusHealth, Condition, PatchHealth
 
@@ -103,12 +103,14 @@ def test_every_emergency_is_on_the_page(code: EmcyCode) -> None:
 def test_every_event_is_on_the_page() -> None:
     told = {
         text
-        for call in ast.walk(ast.parse(Path(events.__file__).read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr == "_tell"
+        for call in ast.walk(ast.parse(Path(health_watch.__file__).read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Attribute)
+        and call.func.attr == "_publish"
         for text in re.findall(r"'([^']+)'", ast.unparse(call.args[1]))
     }
     assert {"away", "back", "restarts in a loop", "duplicate node-ID", "well"} <= told
-    counters = {*events._PATCH_COUNTERS, *events._BUS_COUNTERS}
+    counters = {*health_watch._PATCH_COUNTERS, *health_watch._BUS_COUNTERS}
     assert counters <= {field.name for kind in (PatchHealth, BusHealth) for field in fields(kind)}
     for name in [*told, *counters, *(state.value for state in WireState)]:
         assert f"`{name}`" in PAGE, name

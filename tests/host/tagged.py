@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from skinnode.host.patch_stream import Solver
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp
 from skinnode.model.layout import Float
 from skinnode.protocol.scan import Scan
@@ -29,13 +29,13 @@ class Tags:
         self.seen = 0
         self._sources: dict[int, _Tagged] = {}
         self._looking = threading.Lock()
-        solve = Solver.solve
+        solve = ScanSolver.solve
 
-        def look(solver: Solver, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+        def look(solver: ScanSolver, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
             self._look(solver.decode(scan, stamp), solver.facts.baseline_ohm)
             return solve(solver, scan, stamp)
 
-        monkeypatch.setattr(Solver, "solve", look)
+        monkeypatch.setattr(ScanSolver, "solve", look)
 
     def wire_up(self, patch: SimulatedPatch) -> _Tagged:
         """A source for the fleet in place of the simulated patch."""

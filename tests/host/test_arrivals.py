@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from skinnode.config import HandConfig
 from skinnode.host.arrivals import APART_NS, MOST, REMEMBERED, ArrivalPredictor
 from skinnode.host.dispatcher import Dispatcher
+from skinnode.host.patch_stream import StreamOutput
 from skinnode.host.publish import Publisher
 from skinnode.host.reception import receive_patch
 from skinnode.host.sync import Ticks
@@ -83,6 +84,7 @@ def test_the_first_scan_of_a_patch_may_come_at_any_time(hand: HandConfig) -> Non
     """However well those of the others are known."""
     dispatcher = Told(hand.buses[0], {}, 0)
     names = [patch.name for patch in hand.patches]
+    output = StreamOutput(Inline(), Publisher(tuple(names)))
     for patch in hand.patches:
-        receive_patch(patch, hand, dispatcher, Ticks(240), Inline(), Publisher(tuple(names)))
+        receive_patch(patch, hand, dispatcher, Ticks(240), output)
     assert dispatcher.expected == dict.fromkeys(names, ())

@@ -19,10 +19,10 @@ from skinnode.errors import SkinError
 from skinnode.host import Condition, Host, containment
 from skinnode.host.code_watch import CodeWatch
 from skinnode.host.containment import Defects, Pause, keep_on
-from skinnode.host.events import HealthWatch
-from skinnode.host.health import NodeMonitor
-from skinnode.host.patch_stream import Solver
+from skinnode.host.health_watch import HealthWatch
+from skinnode.host.node_monitor import NodeMonitor
 from skinnode.host.remote_node import RemoteNode
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.supervisor import Supervisor
 from skinnode.protocol.assembler import ScanAssembler
 from skinnode.record import Recorder
@@ -136,7 +136,7 @@ def test_a_lost_start_command(hand: HandConfig, rack: Rack) -> None:
 
 
 OF_PATCH: list[tuple[type, str, Callable[[Any], bool], str]] = [
-    (Solver, "solve", lambda this: this.facts.config.name == "p0", "solving"),
+    (ScanSolver, "solve", lambda this: this.facts.config.name == "p0", "solving"),
     (ScanAssembler, "on_chunk", lambda this: this._node_id == 5, "frame 0x185"),
     (ScanAssembler, "on_summary", lambda this: this._node_id == 5, "frame 0x285"),
     (NodeMonitor, "on_heartbeat", lambda this: this.node_id == 5, "frame 0x705"),
@@ -221,7 +221,7 @@ def test_a_patch_that_cannot_be_solved_is_brought_up_anew_ever_more_seldom(
         return taken
 
     monkeypatch.setattr(Pause, "next_s", next_s)
-    broken = Broken(monkeypatch, Solver, "solve", lambda this: this.facts.config.name == "p0")
+    broken = Broken(monkeypatch, ScanSolver, "solve", lambda this: this.facts.config.name == "p0")
     with Host.from_config(hand) as host:
         assert streams(host, "p0")
         broken.on = True

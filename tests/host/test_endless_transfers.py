@@ -79,7 +79,7 @@ def test_an_abandoned_transfer_ends_at_the_next_segment() -> None:
     server = Endless(None, slowly)
     remote = RemoteOd(network, 5)
     end_s = time.monotonic() + 0.1
-    with remote.until(lambda: time.monotonic() > end_s), pytest.raises(Abandoned):
+    with remote.abort_if(lambda: time.monotonic() > end_s), pytest.raises(Abandoned):
         remote.read_bytes(0x1008, 0)
     assert time.monotonic() < end_s + 1.0
     assert len(server.aborted) == 1

@@ -12,10 +12,12 @@ from typing import Any
 import pytest
 
 from skinnode.host import events as events_module
+from skinnode.host import health_watch as watch_module
 from skinnode.host.code_watch import WireFault, WireState
 from skinnode.host.containment import Defects
-from skinnode.host.events import Events, EventSubscription, HealthEvent, HealthWatch
+from skinnode.host.events import Events, EventSubscription, HealthEvent
 from skinnode.host.health import BusHealth, Condition, PatchHealth
+from skinnode.host.health_watch import HealthWatch
 from skinnode.transport.bus_state import BusState
 
 PATCH = PatchHealth(
@@ -145,8 +147,8 @@ def test_a_counter_that_keeps_growing_is_reported_once_a_second(
 ) -> None:
     """By all that it grew meanwhile."""
     now_ns, looked = [10**12], threading.Event()
-    monkeypatch.setattr(events_module, "time", SimpleNamespace(monotonic_ns=lambda: now_ns[0]))
-    monkeypatch.setattr(events_module, "_LOOK_S", 0.001)
+    monkeypatch.setattr(watch_module, "time", SimpleNamespace(monotonic_ns=lambda: now_ns[0]))
+    monkeypatch.setattr(watch_module, "_CHECK_S", 0.001)
 
     def look() -> None:
         """Wait for a check that begins from now on, and for its end."""
@@ -173,7 +175,7 @@ def test_a_subscriber_that_lags_loses_the_oldest_events() -> None:
     events = Events()
     slow, quick = events.subscribe(2), events.subscribe(100)
     for number in range(5):
-        events.tell(HealthEvent(number, "thumb", "rejoins", f"{number}"))
+        events.publish(HealthEvent(number, "thumb", "rejoins", f"{number}"))
     assert [text for _, _, text in reported(slow)] == ["3", "4"]
     assert (slow.dropped, quick.dropped) == (3, 0)
     events.end()
@@ -192,7 +194,7 @@ def test_an_event_that_cannot_be_logged_reaches_its_subscribers() -> None:
     log.addHandler(broken)
     log.setLevel(logging.INFO)
     try:
-        events.tell(HealthEvent(0, "thumb", "rejoins", "1 rejoin"))
+        events.publish(HealthEvent(0, "thumb", "rejoins", "1 rejoin"))
     finally:
         log.removeHandler(broken)
         log.setLevel(level)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from skinnode.host.health import Condition, NodeMonitor
+from skinnode.host.health import Condition
+from skinnode.host.node_monitor import NodeMonitor
 
 MS = 1_000_000
 

@@ -13,10 +13,11 @@ import pytest
 
 from skinnode.config import HandConfig
 from skinnode.errors import SkinError
-from skinnode.host.configurator import NodeFacts
 from skinnode.host.containment import Defects
-from skinnode.host.patch_stream import PatchStream, Solver, StreamStats
+from skinnode.host.node_facts import NodeFacts
+from skinnode.host.patch_stream import PatchStream, StreamOptions, StreamOutput, StreamStats
 from skinnode.host.publish import Publisher
+from skinnode.host.scan_solver import ScanSolver
 from skinnode.host.sync import Ticks
 from skinnode.host.workers import Inline, Job, OnError, Workers
 from skinnode.model.forward import resistance_ohm
@@ -78,7 +79,7 @@ def ticks() -> Ticks:
 def stream(stub: Stub, publisher: Publisher, ticks: Ticks) -> Iterator[PatchStream]:
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(2, "solve") as workers:
-        stream = PatchStream("thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None)
+        stream = PatchStream("thumb", assembler, StreamOutput(workers, publisher), StreamOptions(ticks.find))
         stream.resume(stub, 0, anew=True)
         yield stream
         stub.go.set()
@@ -160,7 +161,10 @@ def test_scan_with_a_chunk_missing_is_withheld_by_policy(
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
     with Workers(1, "solve") as workers:
         stream = PatchStream(
-            "thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, "withhold"
+            "thumb",
+            assembler,
+            StreamOutput(workers, publisher),
+            StreamOptions(ticks.find, partial="withhold"),
         )
         stream.resume(stub, 0, anew=True)
         chunks = pack_scan(encode(REST_OHM, REST_OHM, CodeScale()), 1, PROFILE)
@@ -254,7 +258,7 @@ def stream_of(
 ) -> PatchStream:
     assembler = ScanAssembler(PROFILE, counter_overflow=240)
     stream = PatchStream(
-        "thumb", assembler, workers, publisher, ticks.find, lambda t_ns: None, defects=defects
+        "thumb", assembler, StreamOutput(workers, publisher, defects), StreamOptions(ticks.find)
     )
     stream.resume(solver, 0, anew=True)
     return stream
@@ -305,16 +309,14 @@ def test_a_field_is_what_the_method_of_the_hand_makes_of_the_codes(
     """Against the tracker of that method, given the resistances that were encoded."""
     hand = make_hand(1, solver={"method": method})
     facts = NodeFacts(hand.patches[0], LAYOUT, PROFILE, CodeScale(), REST_OHM, None, 0.25)
-    solver = Solver(facts, hand.solver, lambda: 7 * MS)
+    solver = ScanSolver(facts, hand.solver, lambda: 7 * MS)
     pressed_m = LAYOUT.upper_m - [0.0, 0.0, 0.05e-3]
     pressed_ohm = resistance_ohm(LAYOUT, pressed_m)
     stream = PatchStream(
         "thumb",
         ScanAssembler(PROFILE, counter_overflow=240),
-        Inline(),
-        publisher,
-        ticks.find,
-        lambda t_ns: None,
+        StreamOutput(Inline(), publisher),
+        StreamOptions(ticks.find),
     )
     stream.resume(solver, 0, anew=True)
     fields = publisher.subscribe(10, 10.0, None)

@@ -10,8 +10,8 @@ import pytest
 from skinnode.config import BringUpConfig, HandConfig, Missing
 from skinnode.errors import NodeError, NodeTimeout
 from skinnode.host import Host, start
-from skinnode.host.patch_stream import Solver
 from skinnode.host.remote_node import RemoteNode
+from skinnode.host.scan_solver import ScanSolver
 
 from .conftest import Rack, eventually
 
@@ -59,7 +59,7 @@ def test_a_defect_at_every_bring_up_of_a_node_ends_the_start_unless_nodes_may_be
     """Nobody is handed a hand that lacks a patch without having said that it may."""
     configure, tried = RemoteNode.configure, list[str]()
 
-    def broken(node: RemoteNode, *args: Any, **options: Any) -> Solver:
+    def broken(node: RemoteNode, *args: Any, **options: Any) -> ScanSolver:
         if node.patch.name == "p0" and len(tried) < 3:
             tried.append(node.patch.name)
             raise ZeroDivisionError("of ours")

@@ -116,7 +116,7 @@ def test_a_tare_returns_when_the_new_baseline_is_in_use(hand: HandConfig, rack: 
 def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
     hand: HandConfig, rack: Rack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read, calls = Configurator._settle_baseline, []
+    read, calls = Configurator.settle_baseline, []
 
     def fails_once(*arguments: Any) -> Any:
         calls.append(arguments)
@@ -125,7 +125,7 @@ def test_a_tare_whose_baseline_is_read_at_the_second_attempt_is_done(
         return read(*arguments)
 
     with Host.from_config(hand) as host:
-        monkeypatch.setattr(Configurator, "_settle_baseline", fails_once)
+        monkeypatch.setattr(Configurator, "settle_baseline", fails_once)
         host.tare("p0")  # the patch is faulty meanwhile, and brought up again
         assert len(calls) == 2
         assert host.health("p0").baselines == 1

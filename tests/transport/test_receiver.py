@@ -199,7 +199,7 @@ def test_a_port_that_is_opened_again_before_its_thread_has_ended_is_received_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As on a machine where threads wait long for their turn."""
-    port, failed, tell = Script(3, BusError("script: gone")), threading.Event(), Receiver._tell
+    port, failed, tell = Script(3, BusError("script: gone")), threading.Event(), Receiver._notify
 
     def slowly(receiver: Receiver) -> None:
         tell(receiver)
@@ -207,7 +207,7 @@ def test_a_port_that_is_opened_again_before_its_thread_has_ended_is_received_on(
             failed.set()
             time.sleep(0.2)
 
-    monkeypatch.setattr(Receiver, "_tell", slowly)
+    monkeypatch.setattr(Receiver, "_notify", slowly)
     intake = Intake(port)
     with Receiver([intake]) as receiver:
         assert failed.wait(5)

@@ -1,0 +1,110 @@
+"""Reads the baseline and the error register of running nodes again when they may have changed."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Final
+
+import numpy as np
+
+from skinnode.errors import BusError, ConfigError
+from skinnode.host.sdo_client import Abandoned
+from skinnode.host.supervised import JOIN_DEADLINE_S, LEAST_NS, Joined, Supervised
+
+_log = logging.getLogger(__name__)
+
+_DOUBT_NS: Final = 2_000_000_000
+"""Minimum time between two readings of a baseline that may have changed unnoticed, ns."""
+
+_REGISTER_NS: Final = 500_000_000
+"""Minimum time between two readings of an error register that is not zero, ns. The emergency that clears an
+error may be lost, and the patch must be operational within a second of it. Costs four SDO frames a second."""
+
+
+class BaselineWatch:
+    """Reads baselines and error registers of running nodes. Owned by the supervisor's thread.
+
+    Transfers run on ``pool``, one job a node at a time.
+    """
+
+    def __init__(self, pool: ThreadPoolExecutor) -> None:
+        self._pool = pool
+
+    def look(self, node: Supervised, now_ns: int) -> None:
+        """Read it again where the node said that it changed, or may have said so in a summary that was
+        lost. In the first case scans are withheld until then."""
+        remote, stream, job = node.remote, node.remote.stream, node.job
+        if job is not None:
+            if job.done():
+                node.job = None
+                self._take_baseline(node, job, now_ns)
+            return
+        changed = stream.withholding
+        node.announced |= changed
+        if not (changed or stream.doubtful) or now_ns < node.read_ns:
+            self._watch_register(node, now_ns)
+            return
+        if remote.listen_only:
+            if changed:
+                remote.monitor.refusal = "its baseline changed; a guest that sends nothing cannot read it"
+            return
+        stream.doubtful = False
+        abandon = node.abandon = threading.Event()
+
+        def read() -> Joined | None:
+            withholdings = remote.withhold() if changed else stream.withholdings
+            return Joined(remote.renew_baseline(JOIN_DEADLINE_S, abandon.is_set), withholdings)
+
+        node.job = self._pool.submit(read)
+
+    def _watch_register(self, node: Supervised, now_ns: int) -> None:
+        """Ask a node with an error for its error register: the emergency that ended it may have been lost."""
+        remote = node.remote
+        if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
+            return
+
+        def read() -> Joined | None:
+            with contextlib.suppress(BusError, ConfigError):  # asked again
+                remote.renew_register()
+            return None
+
+        node.register_ns = now_ns + _REGISTER_NS
+        node.job = self._pool.submit(read)
+
+    def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
+        if job.exception() is None and job.result() is None:  # it was the error register
+            return
+        remote, stream = node.remote, node.remote.stream
+        node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
+        try:
+            read = job.result()
+        except (BusError, ConfigError) as error:  # if the node is gone, its silence will show
+            stream.doubtful = True
+            _log.warning("%s; its baseline is read again", error)
+            return
+        except Abandoned:
+            return
+        except Exception as error:
+            remote.defects.report("reading the baseline or the error register", error)
+            return
+        assert read is not None  # see above
+        solver = read.solver
+        if solver is not None:
+            remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
+            node.announced = True  # or found after a lost summary
+            note_baseline(node)
+
+
+def note_baseline(node: Supervised) -> None:
+    """Note with which baseline the scans are solved now. A bring-up finds a new one too: after a reading that
+    failed, or if it changed while the node was away."""
+    facts, before = node.remote.facts, node.baseline_ohm
+    assert facts is not None  # of a node that was brought up
+    node.baseline_ohm = facts.baseline_ohm
+    if node.announced or (before is not None and not np.array_equal(before, facts.baseline_ohm)):
+        node.announced = False
+        node.baselines += 1
+        node.remote.monitor.baselines = node.baselines

@@ -1,0 +1,68 @@
+"""A bounded queue for a subscriber: a slow reader loses its own oldest items and never delays the host.
+
+``queue.Queue`` blocks or refuses a new item instead; ``collections.deque(maxlen=…)`` drops without counting,
+and a reader cannot wait for it.
+"""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from skinnode.errors import SkinError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Last item of a queue: the host has closed, or ``error`` stopped it."""
+
+    error: SkinError | None = None
+
+
+class DropOldestQueue(Generic[T]):
+    """A queue of up to ``capacity`` items that ends with an :class:`End`. Thread-safe; writing never blocks.
+
+    An end is never dropped, and every reader gets it: :meth:`get` puts it back.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._items: queue.SimpleQueue[T | End] = queue.SimpleQueue()
+        self._capacity = capacity
+
+    def put(self, item: T | End) -> int:
+        """Append an item and drop the oldest ones beyond the capacity.
+
+        Returns:
+            Number of items dropped.
+        """
+        self._items.put(item)
+        dropped, end = 0, None
+        while self._items.qsize() > self._capacity:
+            try:
+                oldest = self._items.get_nowait()
+            except queue.Empty:  # the reader was faster
+                break
+            if isinstance(oldest, End):
+                end = oldest
+            else:
+                dropped += 1
+        if end is not None:  # may exceed the capacity by one
+            self._items.put(end)
+        return dropped
+
+    def get(self, timeout_s: float | None = None) -> T | End:
+        """Remove and return the oldest item; an end stays in the queue.
+
+        Args:
+            timeout_s: Longest wait, s; None waits without limit, 0 does not wait.
+
+        Raises:
+            queue.Empty: if no item came in time.
+        """
+        item = self._items.get(timeout=timeout_s)
+        if isinstance(item, End):
+            self.put(item)
+        return item

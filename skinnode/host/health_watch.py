@@ -1,0 +1,157 @@
+"""Watches the health of a running host and publishes what changed as events."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Final, Self
+
+from skinnode.host.containment import Defects, DefectStats, keep_on
+from skinnode.host.events import Events, HealthEvent
+from skinnode.host.health import BusHealth, PatchHealth
+from skinnode.text.words import counted
+
+_CHECK_S: Final = 0.05
+"""How often the watch looks: what is over sooner shows in counters alone."""
+
+_QUIET_NS: Final = 1_000_000_000
+"""A counter that keeps growing is told of this often."""
+
+
+_PATCH_COUNTERS: Final = {
+    "boot_ups": ("boot-up", ""),
+    "emergencies": ("emergency", "emergencies"),
+    "rejoins": ("rejoin", ""),
+    "baselines": ("new baseline in use", "new baselines in use"),
+    "conflicts": ("conflict", ""),
+}
+"""Counters, and what is counted: one, and several where that is not one and an s."""
+_BUS_COUNTERS: Final = {
+    "bus_offs": ("bus-off", ""),
+    "error_frames": ("error frame", ""),
+    "foreign": ("foreign frame", ""),
+    "kernel_dropped": ("frame dropped by the kernel", "frames dropped by the kernel"),
+    "dropped": ("frame dropped", "frames dropped"),
+    "malformed": ("malformed frame", ""),
+    "outages": ("outage", ""),
+    "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
+    "other_masters": ("command of another master", "commands of another master"),
+}
+
+
+class HealthWatch:
+    """Looks at the health of all patches and buses, on a thread of its own from construction to
+    :meth:`close`, and tells what changed."""
+
+    def __init__(
+        self,
+        patches: Callable[[], Mapping[str, PatchHealth]],
+        buses: Callable[[], Mapping[str, BusHealth]],
+        events: Events,
+        defects: Defects | None = None,
+        all_defects: Callable[[], Mapping[str, DefectStats]] = dict,
+    ) -> None:
+        self._patches, self._buses, self._events = patches, buses, events
+        self._defects = Defects("host") if defects is None else defects
+        self._all_defects = all_defects
+        self._ended = False
+        self._patch_before, self._bus_before = dict(patches()), dict(buses())
+        self._reported: dict[tuple[str, str], tuple[int, int]] = {}  # when, and how many
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End and join the thread, after a last look."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        keep_on(self._turn, self._defects, "watching the health")
+
+    def _turn(self) -> bool:
+        """Wait, then compare the health with the last check. Returns False after the last check. A check that
+        raised is repeated: an event may come twice, but none is missed."""
+        if self._ended:
+            return False
+        self._ended = self._stop.wait(_CHECK_S)
+        for check in (self._check_patches, self._check_buses, self._check_defects):
+            try:
+                check()
+            except Exception as error:
+                self._defects.report("watching the health", error)
+        return True
+
+    def _check_patches(self) -> None:
+        for name, health in self._patches().items():
+            self._compare_patch(name, self._patch_before[name], health)
+            self._patch_before[name] = health
+
+    def _check_buses(self) -> None:
+        for name, bus in self._buses().items():
+            self._compare_bus(name, self._bus_before[name], bus)
+            self._bus_before[name] = bus
+
+    def _check_defects(self) -> None:
+        words = ("defect of the host", "defects of the host")
+        for name, stats in self._all_defects().items():
+            self._compare_count(name, "defects", (0, stats.count), words, f", last {stats.newest}")
+
+    def _compare_bus(self, name: str, before: BusHealth, now: BusHealth) -> None:
+        if now.away != before.away:
+            self._publish(name, "away" if now.away else "back", now.away or "the bus is back")
+        if now.no_sync != before.no_sync:
+            text = "no SYNC of its master is heard" if now.no_sync else "SYNC is heard"
+            self._publish(name, "no SYNC" if now.no_sync else "SYNC", text)
+        if now.controller is not before.controller and now.controller is not None:
+            self._publish(name, now.controller.value, f"the controller is {now.controller}")
+        self._compare_counters(name, before, now, _BUS_COUNTERS)
+
+    def _compare_patch(self, name: str, before: PatchHealth, now: PatchHealth) -> None:
+        if now.condition is not before.condition:
+            why = f" ({now.reason})" if now.reason else ""
+            self._publish(name, now.condition.value, f"{before.condition}, now {now.condition}{why}")
+        if now.restarts_in_a_loop and not before.restarts_in_a_loop:
+            self._publish(name, "restarts in a loop", "restarts in a loop: supply, or watchdog?")
+        if now.duplicate_id and not before.duplicate_id:
+            self._publish(name, "duplicate node-ID", f"two nodes have node-ID {now.node_id}")
+        for fault in sorted({*now.wires} - {*before.wires}):
+            self._publish(name, fault.state.value, f"{fault.side} wire {fault.number} is {fault.state}")
+        for fault in sorted({*before.wires} - {*now.wires}):
+            self._publish(name, "well", f"{fault.side} wire {fault.number} is not {fault.state} any more")
+        self._compare_counters(name, before, now, _PATCH_COUNTERS)
+
+    def _compare_counters(
+        self, name: str, before: object, now: object, counters: Mapping[str, tuple[str, str]]
+    ) -> None:
+        for counter, words in counters.items():
+            detail = ""
+            if isinstance(now, BusHealth) and counter == "foreign":
+                detail = ": " + ", ".join(f"0x{cob_id:03X}" for cob_id in now.foreign_ids)
+            elif isinstance(now, PatchHealth) and counter == "emergencies":
+                detail = f", last 0x{now.last_emergency or 0:04X} {now.emergency_text}"
+            counts = (getattr(before, counter), getattr(now, counter))
+            self._compare_count(name, counter, counts, words, detail)
+
+    def _compare_count(
+        self, name: str, counter: str, counts: tuple[int, int], words: tuple[str, str], detail: str
+    ) -> None:
+        before, count = counts
+        when_ns, reported = self._reported.get((name, counter), (0, before))
+        t_ns = time.monotonic_ns()
+        if count > reported and t_ns - when_ns > _QUIET_NS:
+            self._reported[name, counter] = t_ns, count
+            self._publish(name, counter, f"{counted(count - reported, *words)}{detail}")
+
+    def _publish(self, subject: str, what: str, text: str) -> None:
+        self._events.publish(HealthEvent(time.monotonic_ns(), subject, what, text))

@@ -1,0 +1,221 @@
+"""Collects what a node sends besides scans, and derives the health of its patch from it."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from skinnode.canopen.emergency import error_text, says_too_slow
+from skinnode.canopen.indices import emcy_cob_id, heartbeat_cob_id
+from skinnode.canopen.nmt import STATE_MASK, NmtState
+from skinnode.errors import CodecError
+from skinnode.host.code_watch import CodeWatch
+from skinnode.host.health import (
+    HEARTBEATS_MISSED,
+    SCANS_MISSED,
+    Condition,
+    Evidence,
+    PatchHealth,
+    condition_of,
+)
+
+_log = logging.getLogger(__name__)
+
+RESTART_MEMORY_NS: Final = 5_000_000_000
+"""How long after the last of its restarts a node that restarts in a loop is said to do so."""
+
+SETTLED_NS: Final = 500_000_000
+"""Time after the last restart in a loop during which a node counts as restarting although it is operational
+again, ns."""
+
+LOOP_RESTARTS: Final = 3
+LOOP_NS: Final = 10_000_000_000
+"""A node that restarted by itself this often within this time does so in a loop."""
+
+BEATS: Final = 12
+BEATS_TOO_OFTEN: Final = 0.7
+"""Two nodes with one node-ID send a heartbeat every half period on average; over a dozen, a single one that
+was held up and makes up for it does not come near."""
+
+
+class NodeMonitor:
+    """Facts about one node, written by the mainline only."""
+
+    def __init__(
+        self,
+        patch: str,
+        node_id: int,
+        on_reject: Callable[[CodecError], None] = lambda error: None,
+        watch: CodeWatch | None = None,
+    ) -> None:
+        self.patch, self.node_id = patch, node_id
+        self._watch = watch
+        self._beats: deque[int] = deque(maxlen=BEATS)
+        self._restarts: deque[int] = deque(maxlen=LOOP_RESTARTS)
+        self.on_reject = on_reject
+        """Told of each heartbeat and EMCY of a length that they do not have."""
+        self.nmt_state: int | None = None
+        self._t_heartbeat_ns: int | None = None
+        self._t_scan_ns: int | None = None
+        self._boot_ups = self._emergencies = self._slow_overruns = self._error_register = 0
+        self._registers_said = 0
+        self._last_emergency: tuple[int, bytes] | None = None  # code and detail
+        self.running = False
+        """Set once the node was started: from then on a boot-up is a restart."""
+        self.rejoins = self.baselines = 0
+        self.refusal: str | None = None
+        self.defect: str | None = None
+        self.complaint: str | None = None
+        """All three set by the supervisor."""
+
+    @property
+    def boot_ups(self) -> int:
+        """Boot-up messages so far."""
+        return self._boot_ups
+
+    @property
+    def t_heartbeat_ns(self) -> int | None:
+        """When the newest heartbeat or boot-up was received."""
+        return self._t_heartbeat_ns
+
+    @property
+    def t_scan_ns(self) -> int | None:
+        """When the last frame of the newest scan was received."""
+        return self._t_scan_ns
+
+    def on_heartbeat(self, data: bytes, t_ns: int) -> None:
+        """Heartbeat or boot-up. One of another length than a byte is rejected."""
+        if len(data) != 1:
+            self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
+            return
+        state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
+        if state == NmtState.INITIALISING:
+            self._boot_ups += 1
+            self._on_register(0)  # as after any reset; an error that is still there is told anew
+            if self.running:
+                self._restarts.append(t_ns)
+                _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
+        else:
+            self._beats.append(t_ns)
+        self.nmt_state = state
+        self._t_heartbeat_ns = t_ns
+
+    def on_emergency(self, data: bytes, t_ns: int) -> None:
+        """EMCY: u16 code, u8 error register, five bytes of the maker. Code 0 says that the error is gone."""
+        if len(data) != 8:
+            self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
+            return
+        code = int.from_bytes(data[:2], "little")
+        self._on_register(data[2])
+        if code:
+            self._emergencies += 1
+            self._last_emergency = code, data[3:]
+            self._slow_overruns += says_too_slow(code, data[3:])
+
+    @property
+    def error_register(self) -> int:
+        """As the node said last."""
+        return self._error_register
+
+    @property
+    def registers_said(self) -> int:
+        """How often it said so."""
+        return self._registers_said
+
+    def on_register_read(self, register: int, said: int) -> None:
+        """The answer to who asked for the error register when it had been said ``said`` times: void if an
+        emergency or a boot-up came since, which may be newer."""
+        if said == self._registers_said:
+            self._on_register(register)
+
+    def _on_register(self, register: int) -> None:
+        self._error_register = register
+        self._registers_said += 1
+
+    def said_since(self, state: int, t_ns: int) -> bool:
+        """Whether the newest heartbeat came after ``t_ns`` and carried ``state``."""
+        heard_ns = self._t_heartbeat_ns
+        return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
+
+    def on_scan(self, t_ns: int) -> None:
+        self._t_scan_ns = t_ns
+
+    def health(
+        self,
+        now_ns: int,
+        heartbeat_s: float,
+        scan_s: float,
+        conflicts: int = 0,
+        t_passed_ns: int | None = None,
+    ) -> PatchHealth:
+        """Return the health at ``now_ns`` of a node with these heartbeat and scan periods.
+        ``t_passed_ns``: monotonic time at which the newest scan that was not withheld was received; 0 before
+        the first, None if scans are never withheld."""
+
+        def age_s(t_ns: int | None) -> float | None:
+            return None if t_ns is None else max(0, now_ns - t_ns) * 1e-9
+
+        heartbeat_age_s, scan_age_s = age_s(self._t_heartbeat_ns), age_s(self._t_scan_ns)
+        passed_age_s = scan_age_s if t_passed_ns is None else age_s(t_passed_ns or None)
+        late_scans = None if passed_age_s is None else passed_age_s / scan_s
+        in_a_loop = self._in_a_loop(now_ns)
+        settled = (
+            in_a_loop and self.nmt_state == NmtState.OPERATIONAL and now_ns - self._restarts[-1] > SETTLED_NS
+        )
+        facts = Evidence(
+            nmt_state=self.nmt_state,
+            late_heartbeats=None if heartbeat_age_s is None else heartbeat_age_s / heartbeat_s,
+            late_scans=late_scans,
+            restarting=in_a_loop and not settled,
+            error_register=self._error_register,
+            refused=self.refusal is not None,
+            frozen=self._watch is not None and self._watch.frozen,
+            defective=self.defect is not None,
+        )
+        condition = condition_of(facts)
+        return PatchHealth(
+            patch=self.patch,
+            node_id=self.node_id,
+            condition=condition,
+            nmt_state=self.nmt_state,
+            heartbeat_age_s=heartbeat_age_s,
+            scan_age_s=scan_age_s,
+            boot_ups=self._boot_ups,
+            emergencies=self._emergencies,
+            last_emergency=None if self._last_emergency is None else self._last_emergency[0],
+            emergency_text="" if self._last_emergency is None else self._told(*self._last_emergency),
+            error_register=self._error_register,
+            rejoins=self.rejoins,
+            slow_overruns=self._slow_overruns,
+            baselines=self.baselines,
+            refusal=self.refusal,
+            restarts_in_a_loop=in_a_loop,
+            duplicate_id=self._beats_too_often(now_ns, heartbeat_s),
+            conflicts=conflicts,
+            wires=() if self._watch is None else self._watch.wires,
+            defect=self.defect,
+            complaint=self.complaint,
+            withheld=condition is Condition.STALE
+            and scan_age_s is not None
+            and scan_age_s <= SCANS_MISSED * scan_s,
+        )
+
+    def _told(self, code: int, detail: bytes) -> str:
+        """Return the text of an emergency: that of a skinnode patch, unless the node is refused, because it
+        may be another device."""
+        return error_text(code, detail, ours=self.refusal is None)
+
+    def _in_a_loop(self, now_ns: int) -> bool:
+        restarts = list(self._restarts)
+        if len(restarts) < LOOP_RESTARTS or now_ns - restarts[-1] > RESTART_MEMORY_NS:
+            return False
+        return restarts[-1] - restarts[0] < LOOP_NS
+
+    def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
+        """Two nodes send twice as many heartbeats as one."""
+        beats, period_ns = list(self._beats), heartbeat_s * 1e9
+        if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
+            return False
+        return beats[-1] - beats[0] < BEATS_TOO_OFTEN * (BEATS - 1) * period_ns

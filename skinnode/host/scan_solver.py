@@ -1,0 +1,87 @@
+"""Decodes and solves the scans of a patch: codes to resistances to a field."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from skinnode.config import PatchConfig, SolverConfig
+from skinnode.errors import ConfigError
+from skinnode.host.node_facts import NodeFacts
+from skinnode.model.forward import resistance_ohm
+from skinnode.model.frames import FieldFrame, ResistanceFrame, ScanStamp, sealed
+from skinnode.protocol.codes import Decoder, as_baseline
+from skinnode.protocol.scan import Scan
+from skinnode.solve.inputs import CodeMap
+from skinnode.solve.tracker import Tracker
+
+
+class ScanSolver:
+    """Scans of one patch to fields. Owned by one thread at a time. ``clock`` says when a field is ready."""
+
+    def __init__(
+        self, facts: NodeFacts, config: SolverConfig, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self.facts = facts
+        self._clock = clock
+        calibration = facts.config.calibration
+        gain = None if calibration.upper_gain is None else np.array(calibration.upper_gain)[:, None]
+        scale = facts.scale
+        self._codes = CodeMap(
+            baseline_ohm=as_baseline(facts.baseline_ohm),
+            lo=scale.lo,
+            step=scale.step,
+            steps=scale.steps,
+            rounding_ohm=scale.relative_std * facts.baseline_ohm,
+            relative_noise=facts.config.relative_noise,
+            gain=gain,
+        )
+        self._tracker = Tracker(
+            facts.layout,
+            method=config.method,
+            operator=config.operator,
+            relative_noise=facts.config.relative_noise,
+            baseline_ohm=facts.baseline_ohm,
+            stiffness_n_per_m=calibration.stiffness_n_per_m or config.stiffness_n_per_m,
+            rubber=calibration.rubber,
+            deadline_us=config.deadline_us,
+            estimate_noise=config.estimate_noise,
+            drift=config.drift,
+            normal_only=config.normal_only,
+            codes=self._codes,
+        )
+        self._decoder = Decoder(facts.baseline_ohm, scale)
+
+    def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
+        """Resistances of a scan, NaN where there is none."""
+        resistance_ohm, valid = self._decoder.decode(scan.codes)
+        if self._codes.gain is not None:
+            resistance_ohm *= self._codes.gain
+        return ResistanceFrame(resistance_ohm, valid, stamp)
+
+    def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
+        """Field of a scan, stamped, its arrays read-only, and how many codes were no measurement. The noise
+        is that of the front end and of the codes together."""
+        if self._tracker.method == "posterior":
+            frame, codes = self.decode(scan, stamp), self._codes
+            noise = np.hypot(codes.relative_noise, codes.rounding_ohm / frame.resistance_ohm)
+            field = self._tracker.update(frame.resistance_ohm, frame.valid, noise)
+            invalid = frame.valid.size - int(np.count_nonzero(frame.valid))
+        else:
+            field, invalid = self._tracker.update_codes(scan.codes)
+        contacts = tuple(sealed(contact) for contact in field.contacts)
+        return sealed(field, contacts=contacts, stamp=stamp.solved_at(self._clock())), invalid
+
+
+def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
+    """Raise ConfigError for a layout that can be sensed but not solved. The first call compiles the kernels,
+    or reads them from the cache: not while a node waits."""
+    layout = patch.layout.build()
+    try:
+        Tracker(layout, method=config.method, operator=config.operator).update(
+            resistance_ohm(layout, layout.upper_m)
+        )
+    except ValueError as error:
+        raise ConfigError(f"patch {patch.name!r}", layout.name, str(error)) from None

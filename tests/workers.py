@@ -72,9 +72,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if not is_whole(config):
         return
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads that spin while others work slow all down
-    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-        # Hundreds of processes would each compile all modules; this keeps the files out of the sources.
-        os.environ["PYTHONPYCACHEPREFIX"] = str(Path(sys.prefix) / "bytecode")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or hundreds of processes would each compile all modules
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -1,8 +1,11 @@
-"""A conformance suite for CANopen nodes: 127 cases in raw frames, against any node on any interface.
+"""A conformance suite for CANopen nodes: 127 cases in raw frames, for any node on any interface.
 
-Knows a node by its EDS and by what it says on the bus, and shares no code with the node of this project: the
-tester, its SDO client and its reader of EDS files are its own. The suite deliberately keeps its own CiA
-constants, so that a wrong number in :mod:`skinnode.canopen` fails a case.
+Data flows from ``eds_reader`` (what the device promises) and ``tester`` (frames, one case at a time) through
+``sdo`` and ``dut`` (the device under test) to the cases, and from ``run`` (each case after a reset,
+configuration put back) to ``report`` and ``html_report``.
+
+The suite knows a node by its EDS and by its frames. Its tester, SDO client, EDS reader and constants are its
+own on purpose: code shared with the node would repeat the node's errors.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

@@ -1,4 +1,4 @@
-"""What a conformance case is, and what comes out of it."""
+"""A conformance case and its result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Verdict(StrEnum):
-    """What a case found."""
+    """Result of a case in one word."""
 
     PASSED = "passed"
     WARNING = "warning"
@@ -24,8 +24,9 @@ class Verdict(StrEnum):
 
 
 class NotApplicable(Exception):
-    """The device does not offer what the case is about. The text names the object, the entry of the EDS or
-    the answer on the bus that says so.
+    """The device does not offer what the case checks.
+
+    The text names the object, the EDS entry or the answer on the bus that shows it.
     """
 
 
@@ -35,35 +36,38 @@ class Warned(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One case. ``run`` returns if the device passes; otherwise it raises Failed, NotApplicable or Warned."""
+    """One case.
+
+    ``run`` returns if the device passes; otherwise it raises Failed, NotApplicable or Warned.
+    """
 
     id: str
     """Area and number: "SDO-07"."""
     title: str
     clause: str
-    """Where CiA 301 v4.2.0 (or the document named) asks for it."""
+    """Clause of CiA 301 v4.2.0, or of the document named, that the case checks."""
     run: Callable[[Dut], None]
 
     @property
     def area(self) -> str:
-        """What comes before the number."""
+        """Area of the case: the part of ``id`` before the number."""
         return self.id.rpartition("-")[0]
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A case and what it found."""
+    """A case and its result."""
 
     case: Case
     verdict: Verdict
     why: str = ""
-    """What was expected and what was received, what is doubtful, or why the case does not apply; empty if
-    the device passed."""
+    """What was expected and received, what is doubtful, or why the case does not apply; empty if the
+    device passed."""
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
     """The frames of the case."""
 
 
 def case(id: str, title: str, clause: str) -> Callable[[Callable[[Dut], None]], Case]:
-    """Make a case of the function below."""
+    """Return a decorator that makes a case of a function."""
     return lambda run: Case(id, title, clause, run)

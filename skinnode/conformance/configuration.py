@@ -1,6 +1,4 @@
-"""What the tests must not leave behind: the configuration of the device, read before and written back
-after.
-"""
+"""Saves the configuration of the device before the tests and restores it afterwards."""
 
 from __future__ import annotations
 
@@ -18,12 +16,12 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Order among others: the counter needs a period of 0, the producer starts last, and each write of another
-object clears the date of configuration."""
+"""Order of writing: the counter needs a period of 0, the producer starts last, and each write of another
+object clears the configuration date."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """All values that can be read and written, but for commands and domains."""
+    """Read all values that can be read and written, except commands and domains."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -31,13 +29,21 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # for the OD cases to find
+            continue  # the OD cases report it
     return values
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Undo what was stored or restored: defaults first, then ``before`` where it differs from them, stored
-    again. The node has been reset. Returns what could not be written, a line each.
+    """Undo what was stored or restored, after a reset.
+
+    Restores the defaults, writes the values of ``before`` that differ, and stores.
+
+    Args:
+        dut: The device.
+        before: Values to restore.
+
+    Returns:
+        One line for each value that could not be written.
     """
     problems: list[str] = []
     if dut.eds.find(RESTORE, 1) is not None:
@@ -65,7 +71,7 @@ def write_back(dut: Dut, before: Values) -> list[str]:
 
 
 def _parameter_of(index: int) -> int:
-    """The communication parameter of the PDO that ``index`` belongs to; 0 for other objects."""
+    """Return the communication parameter of the PDO to which ``index`` belongs; 0 for other objects."""
     if index in _MAPPINGS:
         return index - 0x200
     return index if index in _PDO_PARAMETERS else 0

@@ -1,4 +1,4 @@
-"""The device under test, as far as a bus lets one see it."""
+"""The device under test, controlled over the bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STATES: Final = {0: "initialising", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OP
 _HEARTBEATS: Final = tuple(bytes((state,)) for state in STATES if state)
 
 BOOT_S: Final = 5.0
-"""How long a device may take to start up."""
+"""Maximum start-up time of a device."""
 
 _ASK_EACH_S: Final = 0.25
 
@@ -32,48 +32,54 @@ _ABSENT: Final = (0x0602_0000, 0x0609_0011)
 
 
 class Dut:
-    """Node ``node_id`` and what its EDS promises."""
+    """Node ``node_id`` with its EDS."""
 
     def __init__(self, bus: Tester, node_id: int, eds: Eds) -> None:
         self.bus, self.node_id, self.eds = bus, node_id, eds
         self.sdo = SdoClient(bus, node_id)
         self.stored = False
-        """Whether parameters were stored or restored since this was last looked at."""
+        """Whether parameters were stored or restored since the configuration was last put back."""
         self.up = False
         """Whether the node came up after the last reset."""
 
     @property
     def error_control_id(self) -> int:
+        """COB-ID of heartbeats and guarding."""
         return 0x700 + self.node_id
 
     @property
     def emcy_id(self) -> int:
+        """COB-ID of emergency messages."""
         return 0x80 + self.node_id
 
     # --- network management
 
     def nmt(self, command: int) -> None:
-        """Command this node alone."""
+        """Send an NMT command to this node only."""
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset and await the boot-up message. Raises Failed where none comes, or another than it should."""
+        """Reset the node and await its boot-up message. Raises Failed if it is missing or wrong."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(
             self.error_control_id,
             "the boot-up message",
             BOOT_S,
-            lambda frame: frame.data not in _HEARTBEATS,  # of before the reset
+            lambda frame: frame.data not in _HEARTBEATS,  # from before the reset
         )
         self.bus.forget()
         if frame.data != b"\0":
             raise Failed(f"the boot-up message 0x{self.error_control_id:03X} [1] 00", describe(frame))
 
     def prepare(self) -> None:
-        """Reset the node and bring it to PRE-OPERATIONAL. Another case (STATE-01) checks the boot-up message
-        and whether the node starts by itself; here a node that answers is ready, and is commanded to enter
-        PRE-OPERATIONAL. Raises NodeTimeout if the node stays silent.
+        """Reset the node and bring it to PRE-OPERATIONAL.
+
+        Case STATE-01 checks the boot-up message and whether the node starts by itself. Here a node that
+        answers is ready, and is commanded to enter PRE-OPERATIONAL.
+
+        Raises:
+            NodeTimeout: The node stays silent.
         """
         self._await_reset()
         self.nmt(PRE_OPERATIONAL)
@@ -96,13 +102,16 @@ class Dut:
         raise NodeTimeout(self.node_id, f"no boot-up message and no answer within {BOOT_S:g} s of a reset")
 
     def operational(self) -> None:
+        """Start the node."""
         self.nmt(START)
 
     # --- error control
 
     def start_heartbeat(self, period_ms: int = 20) -> None:
-        """Have the node say its state; nothing is done where it has guarding alone. NotApplicable where it
-        has neither.
+        """Start the heartbeat of the node, unless it supports only guarding.
+
+        Raises:
+            NotApplicable: The node supports neither.
         """
         if self.eds.find(HEARTBEAT) is not None:
             self.sdo.write_integer(HEARTBEAT, 0, period_ms, 2)
@@ -110,8 +119,10 @@ class Dut:
             self.need(GUARD_TIME)
 
     def state(self, what: str) -> int:
-        """The state by the next heartbeat, :meth:`start_heartbeat` comes before; by a remote frame where
-        there are none. The second heartbeat counts: the first may have been on its way.
+        """Return the NMT state from a heartbeat, or from guarding if the node has no heartbeat.
+
+        The second heartbeat counts, because the first may have been under way. Call :meth:`start_heartbeat`
+        before.
         """
         if self.eds.find(HEARTBEAT) is None:
             return (self.guard(what) or 0) & 0x7F
@@ -123,13 +134,13 @@ class Dut:
         return frame.data[0]
 
     def expect_state(self, state: int, what: str) -> None:
-        """Heartbeats must carry ``state``."""
+        """Raise Failed unless heartbeats carry ``state``."""
         got = self.state(what)
         if got != state:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Ask for the state by a remote frame; the byte of the answer, None for none."""
+        """Send a remote frame for the state and return the byte of the answer; None without an answer."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -140,15 +151,16 @@ class Dut:
     # --- object dictionary
 
     def need(self, index: int, subindex: int = 0) -> EdsEntry:
-        """The entry of the EDS; NotApplicable where it has none."""
+        """Return an entry of the EDS. Raises NotApplicable if there is none."""
         entry = self.eds.find(index, subindex)
         if entry is None:
             raise NotApplicable(f"the EDS has no object 0x{index:04X}:{subindex:02X}")
         return entry
 
     def need_storage(self, index: int, subindex: int) -> None:
-        """NotApplicable where the device does not store (0x1010) or restore (0x1011) on command: bit 0 of the
-        value (CiA 301, 7.5.2.13 and 7.5.2.14).
+        """Raise NotApplicable if the device does not store (0x1010) or restore (0x1011) on command.
+
+        Bit 0 of the value says so (CiA 301, 7.5.2.13 and 7.5.2.14).
         """
         self.need(index, subindex)
         try:
@@ -163,18 +175,18 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Reset, with defaults restored where the device does that on command."""
+        """Reset the node after restoring its defaults, if it restores on command."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)
         self.reset()
 
     def store(self, subindex: int, signature: bytes = b"save") -> None:
-        """Store parameters (0x1010). What is stored is made good after the case."""
+        """Store parameters (0x1010). They are put back after the case."""
         self.stored = True
         self.sdo.write(STORE, subindex, signature)
 
     def restore(self, subindex: int) -> None:
-        """Restore default parameters (0x1011), valid from the next reset on."""
+        """Restore default parameters (0x1011), valid from the next reset."""
         self.stored = True
         self.sdo.write(RESTORE, subindex, b"load")

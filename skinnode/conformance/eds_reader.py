@@ -1,8 +1,8 @@
-"""What the electronic data sheet of a device (CiA 306) promises: a reader for testing.
+"""Reads the electronic data sheet of a device (CiA 306), for testing.
 
-Reads with :mod:`configparser` alone, so that what it finds owes nothing to the writer of this project nor to
-the canopen library. What contradicts itself is kept for case EDS-01 to report (:func:`contradictions`); what
-cannot be read at all raises ProfileError.
+The reader uses :mod:`configparser` only, so that its result depends neither on the EDS writer of this project
+nor on the canopen library. Contradictions within the file are kept for case EDS-01 (:func:`parse_eds`); a
+file that cannot be read raises ProfileError.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Bytes of a value by its data type (CiA 301 v4.2.0, table 44); types not listed vary in length."""
+"""Bytes of a value by data type (CiA 301 v4.2.0, table 44); types not listed have variable length."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -52,7 +52,7 @@ class EdsEntry:
     data_type: int
     access: str
     default: str
-    """As the file has it; empty for none."""
+    """Default as written in the file; empty if there is none."""
     low: int | None
     high: int | None
     mappable: bool
@@ -63,35 +63,46 @@ class EdsEntry:
 
     @property
     def size(self) -> int:
-        """Bytes of a value; 0 where it varies."""
+        """Bytes of a value; 0 if its length is variable."""
         return SIZES.get(self.data_type, 0)
 
     @property
     def readable(self) -> bool:
+        """Whether it can be read."""
         return self.access in _READABLE
 
     @property
     def writable(self) -> bool:
+        """Whether it can be written."""
         return self.access in _WRITABLE
 
     @property
     def into_rpdo(self) -> bool:
-        """May be received: written, and not declared as process input."""
+        """Whether an RPDO may map it: writable, and not declared as process input."""
         return self.mappable and self.access in ("wo", "rww", "rw")
 
     @property
     def into_tpdo(self) -> bool:
-        """May be transmitted: read, and not declared as process output."""
+        """Whether a TPDO may map it: readable, and not declared as process output."""
         return self.mappable and self.access in ("ro", "rwr", "rw", "const")
 
     @property
     def mapping(self) -> int:
-        """As a PDO mapping parameter names it."""
+        """The entry of a PDO mapping parameter that maps it."""
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def default_bytes(self, node_id: int) -> bytes | None:
-        """Return the default as transferred by SDO; None if the file has none, or none known to fit the type.
-        A string is transferred as the bytes in the file. Raises ValueError if a number is malformed.
+        """Return the default as transferred by SDO.
+
+        Args:
+            node_id: Replaces $NODEID.
+
+        Returns:
+            The bytes; a string is transferred as in the file. None if the file has no default, or none known
+            to fit the type.
+
+        Raises:
+            ValueError: A number is malformed.
         """
         if self.given is not None or not self.default:
             return self.given
@@ -114,36 +125,37 @@ class EdsEntry:
 
 @dataclass(frozen=True, slots=True)
 class Eds:
-    """An EDS: head, and entries by index and sub-index in ascending order."""
+    """An EDS: its head, and its entries in ascending order of index and sub-index."""
 
     source: str
-    """Where it comes from, for messages."""
+    """Origin of the EDS, for messages."""
     device: Mapping[str, str]
-    """Section DeviceInfo, keys in lower case."""
+    """Section DeviceInfo; keys in lower case."""
     dummies: frozenset[int]
     """Data types that may be mapped as dummy entries."""
     entries: Mapping[tuple[int, int], EdsEntry]
     contradictions: tuple[str, ...]
-    """What the file says against itself."""
+    """Contradictions within the file."""
 
     def find(self, index: int, subindex: int = 0) -> EdsEntry | None:
+        """Return an entry; None if the EDS has none."""
         return self.entries.get((index, subindex))
 
     def has(self, index: int) -> bool:
-        """Whether there is an object of that index."""
+        """Return whether the EDS describes an object."""
         return any(key[0] == index for key in self.entries)
 
     def between(self, first: int, last: int) -> Iterator[EdsEntry]:
-        """Entries of the indices from ``first`` to ``last``."""
+        """Return the entries from index ``first`` to ``last``."""
         return (entry for key, entry in self.entries.items() if first <= key[0] <= last)
 
     def indices(self, first: int, last: int) -> list[int]:
-        """Objects from ``first`` to ``last``."""
+        """Return the indices of all objects from ``first`` to ``last``."""
         return sorted({index for index, _ in self.entries if first <= index <= last})
 
 
 def number(text: str, node_id: int = 0) -> int:
-    """A number of an EDS: decimal, 0x…, octal with a leading zero, or $NODEID+…. Raises ValueError."""
+    """Parse a number: decimal, 0x…, octal with a leading zero, or $NODEID+…. Raises ValueError."""
     total = 0
     for part in text.replace(" ", "").split("+"):
         if part.upper() == "$NODEID":
@@ -164,9 +176,18 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; if that is not ASCII, the source of the Eds says so. Returns the
-    EDS and its text. Raises ConfigError, naming ``key``, if the file cannot be read, and ProfileError if it
-    is not an EDS.
+    """Read an EDS or DCF in any encoding; the source of the Eds names an encoding that is not ASCII.
+
+    Args:
+        path: The file.
+        key: Option or key that named the file, for messages.
+
+    Returns:
+        The EDS and its text.
+
+    Raises:
+        ConfigError: The file cannot be read.
+        ProfileError: The file is not an EDS.
     """
     name, data = str(path), read_input(key, path, MOST_EDS_BYTES)
     try:
@@ -178,7 +199,16 @@ def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
 
 
 def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
-    """Parse an EDS or DCF. ``codec``: codec of its non-ASCII names. Raises ProfileError if it is not one."""
+    """Parse an EDS or DCF.
+
+    Args:
+        text: Content of the file.
+        source: Name of the file, for messages.
+        codec: Codec of non-ASCII names.
+
+    Raises:
+        ProfileError: The text is not an EDS.
+    """
     parser = configparser.ConfigParser(
         interpolation=None, strict=False, comment_prefixes=(";",), delimiters=("=",), allow_no_value=True
     )
@@ -195,23 +225,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
         raise ProfileError(
             "EDS", Shown("no section DeviceInfo or 1000"), "a file as in CiA 306", where=source
         )
-    found: list[str] = []
-    entries: dict[tuple[int, int], EdsEntry] = {}
-    for title in sorted(sections, key=_order):
-        match = _SECTION.fullmatch(title)
-        if match is None:
-            continue
-        index, subindex = int(match[1], 16), match[2]
-        try:
-            if subindex is not None:
-                _add(entries, index, int(subindex, 16), sections[title])
-            else:
-                _object(entries, index, sections[title], found)
-        except (ValueError, KeyError) as error:
-            found.append(f"[{title}]: {error}")
-        if len(entries) > _MOST_ENTRIES:  # a compact array of 60 characters has 255
-            got = Shown(f"more than {_MOST_ENTRIES} values, up to section {title}")
-            raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
+    entries, found = _entries(sections, source)
     dummies = sections.get("dummyusage", {})
     try:
         found += _listed(sections, {index for index, _ in entries})
@@ -228,8 +242,32 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
     )
 
 
+def _entries(
+    sections: Mapping[str, Mapping[str, str]], source: str
+) -> tuple[dict[tuple[int, int], EdsEntry], list[str]]:
+    """Return the entries of all sections, and a line for each section that contradicts itself."""
+    found: list[str] = []
+    entries: dict[tuple[int, int], EdsEntry] = {}
+    for title in sorted(sections, key=_order):
+        match = _SECTION.fullmatch(title)
+        if match is None:
+            continue
+        index, subindex = int(match[1], 16), match[2]
+        try:
+            if subindex is not None:
+                _add(entries, index, int(subindex, 16), sections[title])
+            else:
+                _object(entries, index, sections[title], found)
+        except (ValueError, KeyError) as error:
+            found.append(f"[{title}]: {error}")
+        if len(entries) > _MOST_ENTRIES:  # a compact array expands 60 characters to 255 entries
+            got = Shown(f"more than {_MOST_ENTRIES} values, up to section {title}")
+            raise ProfileError("EDS", got, f"at most {_MOST_ENTRIES}", where=source)
+    return entries, found
+
+
 def _order(title: str) -> tuple[int, str]:
-    """Objects before their sub-objects."""
+    """Sort objects before their sub-objects."""
     return len(title), title
 
 
@@ -246,7 +284,7 @@ def _object(
     if compact > 254:
         found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
         compact = 0
-    if compact:  # sub-objects alike, not written one by one
+    if compact:  # identical sub-objects, not described one by one
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
         for subindex in range(1, compact + 1):
@@ -273,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Objects listed but not described, described but not listed, and lists that are miscounted."""
+    """Yield objects that are listed or described only, and lists with a wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

@@ -1,7 +1,7 @@
-"""Distances between frames, held against a period.
+"""Checks the intervals of frames against a period.
 
-A shared machine delays single frames; what is checked is the mean, which nobody may undercut, and the median,
-which few late frames do not move.
+A shared machine delays single frames. The mean and the median are checked: the mean because it cannot be
+undercut, the median because a few late frames do not move it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,18 @@ from skinnode.transport import Frame
 
 
 def gaps_ms(frames: Sequence[Frame]) -> list[float]:
-    """Distances of neighbours."""
+    """Return the intervals between successive frames, ms."""
     return [(after.t_ns - before.t_ns) * 1e-6 for before, after in itertools.pairwise(frames)]
 
 
 def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_sooner: bool = False) -> None:
-    """Raises Failed where frames do not come each ``period_ms``; ``or_sooner`` allows for events in
-    between.
+    """Raise Failed unless frames have the period ``period_ms``.
+
+    Args:
+        frames: At least two frames.
+        period_ms: Expected period.
+        what: Name of the frames, for the message.
+        or_sooner: Whether events may send frames in between.
     """
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms

@@ -1,4 +1,4 @@
-"""A run as one HTML file that needs nothing beside it: verdicts by area, and the frames of every case."""
+"""Writes a run as one self-contained HTML file: verdicts by area, and the frames of every case."""
 
 from __future__ import annotations
 
@@ -72,7 +72,13 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 
 
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
-    """The report. ``title`` says which node on which bus; cases that failed are unfolded."""
+    """Return the report; failed cases are unfolded.
+
+    Args:
+        report: Results of the run.
+        title: Node and bus.
+        when: Time of the run.
+    """
     areas: dict[str, list[Result]] = {}
     for result in report.results:
         areas.setdefault(result.case.area, []).append(result)

@@ -1,4 +1,4 @@
-"""PDOs of a device under test: which there are, how to set one up, what it then sends."""
+"""PDOs of the device under test: list them, set one up, await its frames."""
 
 from __future__ import annotations
 
@@ -28,16 +28,18 @@ _PAUSE_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """A PDO by its communication parameter, 0x1400 or 0x1800 and above."""
+    """A PDO, named by its communication parameter (0x1400 or 0x1800 and above)."""
 
     parameter: int
 
     @property
     def mapping(self) -> int:
+        """Index of the mapping parameter."""
         return self.parameter + 0x200
 
     @property
     def transmits(self) -> bool:
+        """Whether it is a TPDO."""
         return self.parameter >= 0x1800
 
     def __str__(self) -> str:
@@ -45,63 +47,85 @@ class Pdo:
 
 
 class Unsupported(Exception):
-    """A PDO does not take a transmission type, or has no such sub-index; that is its right."""
+    """A PDO rejects a transmission type, or lacks a sub-index; the standard permits both."""
 
 
 def rpdos(dut: Dut) -> list[Pdo]:
+    """Return the RPDOs of the EDS."""
     return [Pdo(index) for index in dut.eds.indices(0x1400, 0x15FF)]
 
 
 def tpdos(dut: Dut) -> list[Pdo]:
+    """Return the TPDOs of the EDS."""
     return [Pdo(index) for index in dut.eds.indices(0x1800, 0x19FF)]
 
 
 def sync(dut: Dut, counter: int | None = None) -> int:
-    """Send a SYNC; returns its time in ns."""
+    """Send a SYNC and return its time, ns."""
     return dut.bus.send(SYNC_ID, b"" if counter is None else bytes((counter,)))
 
 
 def disable(dut: Dut, pdo: Pdo) -> int:
-    """Set bit 31 of the COB-ID; returns the COB-ID from before."""
+    """Disable a PDO by bit 31 of its COB-ID; return the COB-ID from before."""
     cob_id = dut.sdo.integer(pdo.parameter, COB_ID)
     dut.sdo.write_integer(pdo.parameter, COB_ID, cob_id | INVALID, 4)
     return cob_id
 
 
 def mapped(dut: Dut, pdo: Pdo) -> list[int]:
-    """The entries of the mapping parameter."""
+    """Read the entries of the mapping parameter."""
     count = dut.sdo.integer(pdo.mapping, 0)
     return [dut.sdo.integer(pdo.mapping, subindex) for subindex in range(1, count + 1)]
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Length of a PDO with these mapping entries."""
+    """Return the length, bytes, of a PDO with these mapping entries."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 
-def set_up(
-    dut: Dut,
-    pdo: Pdo,
-    kind: int,
-    *,
-    event_ms: int = 0,
-    inhibit: int = 0,
-    start: int = 0,
-    remote: bool = False,
-) -> int:
-    """Disable the PDO, write its parameters (inhibit time in 100 µs), enable it. Returns its CAN-ID. Discards
-    frames that the PDO sent before, as from a node that starts by itself. Raises Unsupported if the node
-    rejects the parameters.
+@dataclass(frozen=True, slots=True)
+class PdoSetup:
+    """Communication parameters of a PDO."""
+
+    kind: int
+    """Transmission type."""
+    event_ms: int = 0
+    inhibit_100us: int = 0
+    start: int = 0
+    """SYNC start value."""
+    remote: bool = False
+    """Whether remote frames are permitted (bit 30 of the COB-ID)."""
+
+
+def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
+    """Disable the PDO, write its parameters and enable it.
+
+    Frames that the PDO sent before, as from a node that starts by itself, are discarded.
+
+    Args:
+        dut: The device.
+        pdo: The PDO.
+        parameters: Its new communication parameters.
+
+    Returns:
+        The CAN-ID of the PDO.
+
+    Raises:
+        Unsupported: The node rejects the parameters.
     """
     cob_id = disable(dut, pdo)
-    _set(dut, pdo, KIND, kind, 1)
-    for subindex, value, size in ((INHIBIT, inhibit, 2), (EVENT_TIMER, event_ms, 2), (SYNC_START, start, 1)):
+    _set(dut, pdo, KIND, parameters.kind, 1)
+    for subindex, value, size in (
+        (INHIBIT, parameters.inhibit_100us, 2),
+        (EVENT_TIMER, parameters.event_ms, 2),
+        (SYNC_START, parameters.start, 1),
+    ):
         if dut.eds.find(pdo.parameter, subindex) is not None:
             _set(dut, pdo, subindex, value, size)
         elif value:
             raise Unsupported(f"{pdo} has no sub-index {subindex}")
     valid = cob_id & ~INVALID
-    _set(dut, pdo, COB_ID, valid & ~NO_REMOTE if remote else valid, 4)
+    _set(dut, pdo, COB_ID, valid & ~NO_REMOTE if parameters.remote else valid, 4)
     dut.bus.pending(cob_id & CAN_ID)
     return cob_id & CAN_ID
 
@@ -121,8 +145,10 @@ Trial = Callable[[Dut, Pdo], None]
 
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
-    """Run ``trial`` on every TPDO that maps something, all others disabled, each from a fresh reset.
-    NotApplicable where none of them supports it.
+    """Run ``trial`` on every TPDO that maps something, with all others disabled, each after a reset.
+
+    Raises:
+        NotApplicable: No TPDO supports the trial.
     """
     found = tpdos(dut)
     if not found:
@@ -147,7 +173,7 @@ def each_tpdo(dut: Dut, trial: Trial) -> None:
 
 
 def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
-    """The next frame of a PDO, which must have the length of its mapping."""
+    """Return the next frame of a PDO. Raises Failed if its length is not that of the mapping."""
     frame = dut.bus.expect(can_id, what)
     if len(frame.data) != length:
         raise Failed(f"{counted(length, 'byte')} as mapped, {what}", describe(frame))
@@ -155,7 +181,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Take frames until none comes for a while, or for half a second."""
+    """Discard frames until none arrives for a while, at most for half a second."""
     end_s = time.monotonic() + 0.5
     while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

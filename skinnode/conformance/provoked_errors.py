@@ -1,4 +1,4 @@
-"""Errors that can be provoked over the bus: a PDO too short, a heartbeat or a guarding that fails to come."""
+"""Provokes errors over the bus: a PDO that is too short, a missing heartbeat, missing guarding."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ CONSUMER: Final = 0x1016
 
 
 def emcy_code(frame: Frame) -> int:
-    """The error code of an emergency message. Raises Failed where it has no eight bytes."""
+    """Return the error code of an emergency message. Raises Failed unless it has 8 bytes."""
     if len(frame.data) != 8:
         raise Failed("an emergency message of 8 bytes", describe(frame))
     return int.from_bytes(frame.data[:2], "little")
 
 
 def expect_emcy(dut: Dut, code: int, what: str) -> Frame:
-    """The next emergency message with ``code``."""
+    """Await and return the next emergency message with ``code``."""
     return dut.bus.expect(
         dut.emcy_id, f"EMCY 0x{code:04X} {what}", match=lambda frame: emcy_code(frame) == code
     )
 
 
 def expect_no_emcy(dut: Dut, code: int, what: str) -> None:
-    """None with ``code`` has come."""
+    """Raise Failed if an emergency message with ``code`` has arrived."""
     for frame in dut.bus.pending(dut.emcy_id):
         if emcy_code(frame) == code:
             raise Failed(f"no EMCY 0x{code:04X} {what}", describe(frame))
 
 
 def short_pdo(dut: Dut) -> Frame:
-    """Send an RPDO without a byte in OPERATIONAL; the emergency message that follows."""
+    """Send an RPDO without data in OPERATIONAL and return the emergency message that follows."""
     for pdo in rpdos(dut):
         cob_id = dut.sdo.integer(pdo.parameter, 1)
         if cob_id & INVALID or not mapped(dut, pdo):
@@ -49,18 +49,18 @@ def short_pdo(dut: Dut) -> Frame:
 
 
 def foreign_id(dut: Dut) -> int:
-    """A node-ID that is not the device's own."""
+    """Return a node-ID that is not that of the device."""
     return 0x55 if dut.node_id != 0x55 else 0x56
 
 
 def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
-    """Have the device expect heartbeats of ``node_id``."""
+    """Make the device expect heartbeats of ``node_id``."""
     dut.need(CONSUMER, subindex)
     dut.sdo.write_integer(CONSUMER, subindex, node_id << 16 | within_ms, 4)
 
 
 def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int = 5) -> int:
-    """Send heartbeats of another node; returns when the last one was sent, ns."""
+    """Send heartbeats of another node; return the time of the last one, ns."""
     sent_ns = 0
     for number in range(times):
         if number:
@@ -70,8 +70,10 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
-    """Let the device miss a heartbeat or, where it consumes none, its guarding. NotApplicable where it has
-    neither.
+    """Let the device miss a heartbeat or, without a consumer, its guarding.
+
+    Raises:
+        NotApplicable: The device has neither.
     """
     if dut.eds.find(CONSUMER, 1) is not None:
         partner = foreign_id(dut)
@@ -86,7 +88,7 @@ def lose_partner(dut: Dut, within_ms: int = 100) -> None:
 
 
 def not_before(frame: Frame, since_ns: int, least_ms: int, what: str) -> None:
-    """``frame`` must not come sooner than ``least_ms`` after ``since_ns``."""
+    """Raise Failed if ``frame`` arrived less than ``least_ms`` after ``since_ns``."""
     elapsed_ms = (frame.t_ns - since_ns) * 1e-6
     if elapsed_ms < least_ms - 1:  # a millisecond for the time stamps of two clocks
         raise Failed(f"{what} not before {least_ms} ms", f"after {elapsed_ms:.1f} ms")

@@ -1,4 +1,4 @@
-"""A run as text, JSON and JUnit XML. HTML is in :mod:`skinnode.conformance.html_report`."""
+"""Writes a run as text, JSON and JUnit XML; :mod:`skinnode.conformance.html_report` writes HTML."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _VERDICT_WIDTH = 15
 
 
 def result_line(result: Result) -> str:
-    """One line: id, verdict, title, and why where there is something to say."""
+    """Return id, verdict and title on one line, with the reason if there is one."""
     head = f"{result.case.id:{_ID_WIDTH}} {result.verdict:{_VERDICT_WIDTH}}{result.case.title}"
     return _one_line(f"{head}: {result.why}" if result.why else head)
 
 
 def list_lines(cases: Iterable[Case]) -> list[str]:
-    """Ids, titles and clauses, a line a case."""
+    """Return id, title and clause of each case, one case per line."""
     listed = list(cases)
     width = max((len(case.title) for case in listed), default=0)
     return [f"{case.id:{_ID_WIDTH}} {case.title:{width}}  {case.clause}" for case in listed]
 
 
 def summary_line(report: Report) -> str:
-    """How many cases there were and what they found."""
+    """Return the number of cases by verdict, in one line."""
     not_applicable = report.count(Verdict.NOT_APPLICABLE)
     applicable = len(report.results) - not_applicable
     seconds = sum(result.seconds for result in report.results)
@@ -41,8 +41,9 @@ def summary_line(report: Report) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """For programs. Frames are strings: seconds since the case began, Tx (the tester's) or Rx, COB-ID,
-    length, payload.
+    """Return the run for programs.
+
+    Frames are strings: seconds since the case began, Tx (sent by the tester) or Rx, COB-ID, length, data.
     """
     return {
         "eds": report.eds,
@@ -67,8 +68,9 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def as_junit(report: Report) -> str:
-    """Return JUnit XML with a suite for each area: failures carry the frames, cases that do not apply are
-    skipped, warnings are passed tests with the warning as their output.
+    """Return JUnit XML with one suite for each area.
+
+    Failures carry the frames, cases that do not apply are skipped, a warning is the output of a passed test.
     """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}

@@ -1,4 +1,4 @@
-"""Runs cases against a node: each from a fresh reset, each bounded in time, the configuration put back."""
+"""Runs cases against a node: each after a reset and bounded in time; puts the configuration back."""
 
 from __future__ import annotations
 
@@ -20,30 +20,39 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Cases in a row before which the node does not come up; the others are then not run."""
+"""Number of successive cases without a node, after which the remaining cases are not run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """All results of a run, and what it could not put back."""
+    """Results of a run, and what could not be put back."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]
     eds: str
-    """Where the EDS came from."""
+    """Origin of the EDS."""
 
     @property
     def failed(self) -> int:
+        """Number of failed cases."""
         return self.count(Verdict.FAILED)
 
     def count(self, verdict: Verdict) -> int:
+        """Return the number of cases with a verdict."""
         return sum(result.verdict is verdict for result in self.results)
 
 
 def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
-    """Reset the node and say what it is. Without an EDS it has to be a patch of this project, whose EDS
-    follows
-    from its descriptor (0x2000). Raises NodeTimeout where nobody answers, ConfigError without an EDS.
+    """Reset the node and return it as a device under test.
+
+    Args:
+        port: The bus.
+        node_id: The node.
+        eds: Its EDS. A patch of this project needs none: its EDS follows from its descriptor (0x2000).
+
+    Raises:
+        NodeTimeout: No node answers.
+        ConfigError: Another device, without an EDS.
     """
     bus = Tester(port)
     Dut(bus, node_id, _NO_EDS).prepare()
@@ -80,9 +89,17 @@ def _own_eds(sdo: SdoClient) -> Eds:
 
 
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
-    """Run ``cases`` one after the other and call ``say`` with each result. Raises BusError where the
-    interface fails; whatever the node does ends in a result. The node is left reset, with the configuration
-    it had.
+    """Run ``cases`` one after the other.
+
+    Whatever the node does ends in a result. The node is left reset, with the configuration it had.
+
+    Args:
+        dut: The device.
+        cases: Cases to run.
+        say: Receives each result.
+
+    Raises:
+        BusError: The interface failed.
     """
     results: list[Result] = []
     problems: list[str] = []
@@ -122,9 +139,7 @@ def run_case(dut: Dut, case: Case) -> Result:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:
         raise
-    except (
-        Exception
-    ) as error:  # an answer that a case did not reckon with: the node's fault, not the run's end
+    except Exception as error:  # an answer that no case expects fails the case, not the run
         verdict, why = Verdict.FAILED, f"answers that make no sense ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 

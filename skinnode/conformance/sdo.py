@@ -1,7 +1,7 @@
-"""An SDO client of raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
+"""An SDO client in raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
-Written for testing: it holds every answer against the protocol, byte by byte, and can be told to break the
-protocol itself. Shares no code with the server of this project.
+Written for testing: it checks every answer byte by byte and can break the protocol on request. It shares no
+code with the server of this project.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skinnode.text.words import counted
 from skinnode.transport import Frame
 
 GENERAL_ERROR: Final = 0x0800_0000
-"""A device may answer this in place of any more telling code."""
+"""A device may send this code instead of a more specific one."""
 
 MEANINGS: Final = {
     0x0503_0000: "toggle bit not alternated",
@@ -53,12 +53,12 @@ MEANINGS: Final = {
 """Abort codes of CiA 301 v4.2.0, table 22."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # an upload that does not end by then never does
+_MOST_BYTES: Final = 1 << 20  # a longer upload would never end
 _BLOCK_SIZE: Final = 20
 
 
 class Aborted(Failed):
-    """The device aborted a transfer that it should have served. ``code`` says with what."""
+    """The device aborted a transfer that it should have served; ``code`` is the abort code."""
 
     def __init__(self, what: str, code: int) -> None:
         self.code = code
@@ -66,12 +66,12 @@ class Aborted(Failed):
 
 
 def name(code: int) -> str:
-    """An abort code in hexadecimal and in words."""
+    """Return an abort code in hexadecimal and in words."""
     return f"0x{code:08X} ({MEANINGS.get(code, 'not a code of CiA 301')})"
 
 
 def crc16(data: bytes) -> int:
-    """CRC of a block transfer: x¹⁶ + x¹² + x⁵ + 1, start value 0 (7.2.4.3.16)."""
+    """Return the CRC of a block transfer: x¹⁶ + x¹² + x⁵ + 1, start value 0 (7.2.4.3.16)."""
     crc = 0
     for byte in data:
         crc ^= byte << 8
@@ -81,7 +81,7 @@ def crc16(data: bytes) -> int:
 
 
 def mux(index: int, subindex: int) -> bytes:
-    """Index and sub-index as they travel."""
+    """Return index and sub-index as transferred."""
     return struct.pack("<HB", index, subindex)
 
 
@@ -95,21 +95,21 @@ class SdoClient:
     # --- frames
 
     def send(self, request: bytes) -> None:
-        """Send a request, filled up to eight bytes."""
+        """Send a request, padded to eight bytes."""
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """The next answer, eight bytes. Raises Failed where none comes or it has another length."""
+        """Return the next answer, eight bytes. Raises Failed if there is none, or one of another length."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
-        """Send a request and return the answer, whatever it is. Answers that came before are forgotten."""
+        """Send a request and return the answer, whatever it is; earlier answers are discarded."""
         self._bus.pending(self.answer_id)
         self.send(request)
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """As :meth:`ask`; raises Aborted where the answer is an abort."""
+        """Send a request as :meth:`ask` does. Raises Aborted if the answer is an abort."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
@@ -124,15 +124,17 @@ class SdoClient:
         self.send(b"\x80" + mux(index, subindex) + struct.pack("<I", code))
 
     def aborts(self, request: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
-        """Send a request that must be aborted with one of ``codes`` or the general error, naming the object;
-        returns the code.
+        """Send a request that must be aborted; return the abort code.
+
+        The abort must name the object and carry one of ``codes`` or the general error.
         """
         return self.check_abort(self.ask(request, what), index, subindex, codes, what)
 
     @staticmethod
     def check_abort(answer: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
-        """The code of ``answer``, which must be an abort of that object with one of ``codes`` or the general
-        error.
+        """Return the abort code of ``answer``.
+
+        Raises Failed unless it is an abort of that object with one of ``codes`` or the general error.
         """
         allowed = " or ".join(f"0x{code:08X}" for code in sorted({*codes, GENERAL_ERROR}))
         expected = f"{what} aborted with {allowed}"
@@ -148,7 +150,7 @@ class SdoClient:
     # --- upload
 
     def read(self, index: int, subindex: int = 0) -> bytes:
-        """Upload, expedited or in segments as the device chooses."""
+        """Upload a value, expedited or in segments as the device chooses."""
         what = f"read of 0x{index:04X}:{subindex:02X}"
         answer = self.served(b"\x40" + mux(index, subindex), what)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != mux(index, subindex):
@@ -174,14 +176,21 @@ class SdoClient:
         raise Failed(f"a last segment within {_MOST_BYTES} bytes, {what}", "none")
 
     def integer(self, index: int, subindex: int = 0) -> int:
-        """Upload of an unsigned number."""
+        """Upload an unsigned number."""
         return int.from_bytes(self.read(index, subindex), "little")
 
     def read_block(
         self, index: int, subindex: int = 0, *, crc: bool = False, size: int = _BLOCK_SIZE
     ) -> bytes:
-        """Block upload with sub-blocks of ``size`` segments. Checks sequence numbers, announced length and,
-        if both sides have it, the CRC.
+        """Upload by block transfer.
+
+        Checks sequence numbers, the announced length and, if both sides support it, the CRC.
+
+        Args:
+            index: Index.
+            subindex: Sub-index.
+            crc: Whether the client asks for a CRC.
+            size: Segments of a sub-block.
         """
         what = f"block read of 0x{index:04X}:{subindex:02X}"
         start = bytes((0xA0 | crc << 2,)) + mux(index, subindex) + bytes((size, 0))
@@ -208,7 +217,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Bytes, number of segments, and whether the last of them was marked as the last of all."""
+        """Return the bytes, the number of segments, and whether the last segment of all was among them."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -222,7 +231,7 @@ class SdoClient:
     # --- download
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Download: expedited with its size up to four bytes, in segments above."""
+        """Download a value: expedited up to four bytes, in segments above."""
         if len(data) > 4 or not data:
             self.write_segments(index, subindex, data)
             return
@@ -231,11 +240,11 @@ class SdoClient:
         _check(answer, b"\x60" + mux(index, subindex) + bytes(4), what)
 
     def write_integer(self, index: int, subindex: int, value: int, size: int) -> None:
-        """Expedited download of an unsigned number of ``size`` bytes."""
+        """Download an unsigned number of ``size`` bytes, expedited."""
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:
-        """Segmented download, whatever the length."""
+        """Download in segments, whatever the length."""
         what = f"segmented write to 0x{index:04X}:{subindex:02X}"
         start = b"\x21" + mux(index, subindex) + struct.pack("<I", len(data))
         _check(self.served(start, what), b"\x60" + mux(index, subindex) + bytes(4), what)
@@ -251,7 +260,7 @@ class SdoClient:
     def write_block(
         self, index: int, subindex: int, data: bytes, *, crc: bool = False, wrong_crc: bool = False
     ) -> None:
-        """Block download of at most one sub-block. ``wrong_crc`` sends one that does not fit."""
+        """Download at most one sub-block by block transfer; ``wrong_crc`` sends a wrong CRC."""
         what = f"block write to 0x{index:04X}:{subindex:02X}"
         start = bytes((0xC2 | crc << 2,)) + mux(index, subindex) + struct.pack("<I", len(data))
         answer = self.served(start, what)
@@ -273,7 +282,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """The request of an expedited download that states its size, one to four bytes."""
+    """Return the request of an expedited download of one to four bytes that states its size."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

@@ -1,4 +1,4 @@
-"""All cases in their order, and how to choose among them."""
+"""All cases in their order, and how to select some."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ from skinnode.errors import ConfigError
 CASES: Final[tuple[Case, ...]] = tuple(
     item for area in AREAS for item in vars(area).values() if isinstance(item, Case)
 )
-"""127 in the order of the plan they can be held against."""
+"""All 127 cases, in the order of the test plan."""
 
 
 def select(names: Sequence[str]) -> tuple[Case, ...]:
-    """The cases of the areas and ids named, in their own order; all for no names. Raises ConfigError for a
-    name that is neither.
+    """Select cases by area or id.
+
+    Args:
+        names: Areas and ids; empty for all cases.
+
+    Returns:
+        The cases in the order of the suite.
+
+    Raises:
+        ConfigError: A name is neither an area nor an id.
     """
     if not names:
         return CASES

@@ -1,7 +1,7 @@
-"""Raw frames on a bus: send, await with a deadline, and keep what went to and fro.
+"""Sends and awaits raw frames on a bus, and keeps a trace of them.
 
-Frames that were received but not asked for yet wait in an inbox, in order of arrival, so that a PDO that
-comes before the SDO answer is not lost. Every wait is bounded.
+Received frames wait in an inbox, in order of arrival, until a case asks for them, so that a PDO that arrives
+before the SDO answer is not lost. Every wait is bounded.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Final, NamedTuple
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""How long an answer may take: far more than a device takes, so that a busy machine fails no case."""
+"""Maximum wait for an answer: far more than a device takes, so that a busy machine fails no case."""
 
 QUIET_S: Final = 0.06
-"""How long nothing must come before nothing is taken to come."""
+"""Time without a frame that counts as silence."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
@@ -32,12 +32,12 @@ class Failed(Exception):
 
 
 class TraceLine(NamedTuple):
-    """A frame of a case, in the order in which it was sent or received."""
+    """A sent or received frame of a case."""
 
     t_s: float
-    """Since the case began."""
+    """Time since the case began."""
     sent: bool
-    """By this program."""
+    """Whether the tester sent it."""
     can_id: int
     data: bytes
     remote: bool
@@ -48,14 +48,14 @@ class TraceLine(NamedTuple):
 
 
 def describe(frame: Frame | None) -> str:
-    """A frame, or the lack of one, in the words of a failure."""
+    """Describe a frame, or its absence, for a failure message."""
     if frame is None:
         return "nothing"
     return f"0x{frame.can_id:03X} [{len(frame.data)}] {frame.data.hex(' ').upper()}".rstrip()
 
 
 class Tester:
-    """One side of a bus. Used by one thread."""
+    """Sender and receiver of raw frames; for use by one thread."""
 
     def __init__(self, port: CanPort) -> None:
         self._port = port
@@ -66,37 +66,44 @@ class Tester:
         self._begun_ns = time.monotonic_ns()
 
     def begin(self) -> None:
-        """A case begins: what came before is forgotten."""
+        """Begin a case: discard everything received before."""
         self.clear()
         self._trace.clear()
         self._begun_ns = time.monotonic_ns()
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """The last frames since :meth:`begin`."""
+        """The newest frames since :meth:`begin`."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
-        """Send a frame; returns the time, ns of the monotonic clock."""
+        """Send a frame and return the time, ns of the monotonic clock."""
         now_ns = time.monotonic_ns()
         self._note(now_ns, True, can_id, data, remote)
         self._port.send(can_id, data, remote=remote)
         return now_ns
 
     def clear(self) -> None:
-        """Forget what has come so far."""
+        """Discard everything received so far."""
         self._fetch()
         self.forget()
 
     def forget(self) -> None:
-        """Empty the inbox; what still waits at the interface comes in later."""
+        """Empty the inbox; frames still queued at the interface arrive later."""
         self._inbox.clear()
 
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """The first frame of ``can_id`` that matches, out of the inbox or to come; None after
-        ``within_s``.
+        """Return the first frame of ``can_id`` that matches, from the inbox or still to come.
+
+        Args:
+            can_id: CAN-ID of a data frame.
+            within_s: Maximum wait.
+            match: Further condition.
+
+        Returns:
+            The frame; None if there is none within ``within_s``.
         """
 
         def wanted(frame: Frame) -> bool:
@@ -119,26 +126,26 @@ class Tester:
         within_s: float = ANSWER_S,
         match: Callable[[Frame], bool] | None = None,
     ) -> Frame:
-        """As :meth:`take`; raises Failed, naming ``what`` was awaited, where nothing comes."""
+        """Take a frame as :meth:`take` does. Raises Failed, which names ``what``, if there is none."""
         frame = self.take(can_id, within_s, match)
         if frame is None:
             raise Failed(f"{what} (0x{can_id:03X}) within {within_s:g} s", "nothing")
         return frame
 
     def listen(self, can_id: int, for_s: float) -> list[Frame]:
-        """All frames of ``can_id`` that come from now on for ``for_s``."""
+        """Return all frames of ``can_id`` that arrive within ``for_s`` from now."""
         self.pending(can_id)
         self.wait(for_s)
         return self.pending(can_id)
 
     def wait(self, for_s: float) -> None:
-        """Let time pass; what comes waits in the inbox."""
+        """Wait; frames that arrive are kept in the inbox."""
         end_s = time.monotonic() + for_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._receive(left_s)
 
     def pending(self, can_id: int) -> list[Frame]:
-        """Frames of ``can_id`` that have come so far; they leave the inbox."""
+        """Take all frames of ``can_id`` received so far out of the inbox."""
         self._fetch()
         found = [frame for frame in self._inbox if frame.can_id == can_id and not frame.remote]
         for frame in found:
@@ -146,13 +153,13 @@ class Tester:
         return found
 
     def expect_silence(self, can_id: int, what: str, for_s: float = QUIET_S) -> None:
-        """Raises Failed where a frame of ``can_id`` has come or comes within ``for_s``."""
+        """Raise Failed if a frame of ``can_id`` is there or arrives within ``for_s``."""
         frame = self.take(can_id, for_s)
         if frame is not None:
             raise Failed(f"no {what}", describe(frame))
 
     def _fetch(self) -> None:
-        for _ in range(_INBOX_FRAMES):  # a bus may be so full that it never falls silent
+        for _ in range(_INBOX_FRAMES):  # a full bus is never silent
             if not self._receive(0.0):
                 return
 

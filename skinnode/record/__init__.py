@@ -1,5 +1,7 @@
-"""Recordings of a hand: raw frames in a candump log or BLF file, and beside it, in a small journal, what else
-the host decoded them with. :func:`replay` makes the same fields of them again.
+"""Recordings of a hand: written while a host runs, and replayed as the same fields.
+
+``recorder`` writes raw frames to a candump log or BLF file and, beside it, a ``journal`` of what else decided
+how the host decoded them. ``replay`` reads both and decodes the frames with the host's own code.
 """
 
 from skinnode.record.recorder import Recorder, RecorderStats

@@ -1,21 +1,21 @@
-"""What a replay needs beside the frames, as JSON, one object a line, in a file beside the log.
+"""The journal of a recording: JSON lines, beside the log, of what a replay needs besides the frames.
 
-The first line says which hand it is and how its clock ran (:class:`Header`). Each further line is something
-that decided what the host made of the frames: ``bus`` and ``at`` say after how many received frames of which
+The first line holds the hand and the offset of its clock (:class:`Header`). Each further line is an event
+that decided what the host made of the frames. ``bus`` and ``at`` say after how many received frames of which
 bus it happened, ``t_ns`` when (monotonic clock of the host).
 
 =============  ==============================================================================
-``event``      means
+``event``      meaning
 =============  ==============================================================================
-``resumed``    scans of ``patch`` go through, decoded with ``facts`` (baseline, scale, serial number, and the
-               layout where it is not that of the hand); ``anew``: what was assembled before is forgotten;
-               without ``facts``: with the same solver as before
-``withheld``   scans of ``patch`` do not go through any more
-``polled``     a scan that lacked something was ended by the clock
+``resumed``    scans of ``patch`` are decoded with ``facts`` (baseline, scale, serial number, and the layout
+               if it differs from the hand's) or, without ``facts``, with the same solver as before;
+               ``anew``: what was assembled before is discarded
+``withheld``   scans of ``patch`` are not decoded any more
+``polled``     the clock ended a scan that lacked frames
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
-``dropped``    ``frames`` that were not written, because the disk was too slow
-``ended``      the recording was ended, with ``frames`` in the log; without it, its process was killed or the
-               disk full
+``dropped``    ``frames`` were not written, because the disk was too slow
+``ended``      the recording ended with ``frames`` in the log; without this event its process was killed or
+               the disk was full
 =============  ==============================================================================
 """
 
@@ -40,7 +40,7 @@ FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
 
 COMPLAINTS_KEPT: Final = 100
-"""Lines that cannot be read and are named; more are only counted."""
+"""Maximum unreadable lines named; more are only counted."""
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
@@ -56,16 +56,17 @@ class Header:
     started: str
     """Local date and time, ISO 8601."""
     wall_minus_mono_ns: int
-    """To be taken off the times in the log to have those of the host's monotonic clock."""
+    """Subtracted from the times in the log, gives times of the host's monotonic clock."""
 
     def line(self) -> str:
+        """Return the header as a line of JSON."""
         table = _without_paths(self.hand.model_dump(exclude_defaults=True))
         times = {"started": self.started, "wall_minus_mono_ns": self.wall_minus_mono_ns}
         return json.dumps({"format": FORMAT, **times, "hand": table})
 
 
 def _without_paths(value: Any) -> Any:
-    """Files are named by a hand for bring-up; a replay has what was in them."""
+    """Remove file names: bring-up needed them, a replay has their contents."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -75,7 +76,7 @@ def _without_paths(value: Any) -> Any:
 
 
 def facts_table(facts: NodeFacts) -> dict[str, Any]:
-    """NodeFacts as JSON; numbers survive bit by bit."""
+    """Return NodeFacts as JSON; numbers survive bit by bit."""
     layout, planned = facts.layout, facts.config.layout.build()
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
     own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}
@@ -92,7 +93,16 @@ def facts_table(facts: NodeFacts) -> dict[str, Any]:
 
 
 def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> NodeFacts:
-    """The other way. Raises KeyError, TypeError, OverflowError or ValueError for a table that is none."""
+    """Return the NodeFacts of :func:`facts_table`.
+
+    Args:
+        table: Content of a journal line.
+        patch: The patch.
+        bus: Its bus.
+
+    Raises:
+        KeyError, TypeError, OverflowError, ValueError: The table is malformed.
+    """
     profile = PatchProfile.from_config(patch, bus)
     baseline = np.array(table["baseline_ohm"], dtype=np.float64)
     if baseline.shape != (profile.rows, profile.columns):
@@ -113,7 +123,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # missing in the first versions, whose nodes sent no checks
+    checked = table.get("checked", False)  # the first versions lack it: their nodes sent no checks
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(
@@ -122,8 +132,16 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
 
 
 def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
-    """Header, events, and a complaint for each line that cannot be read. Raises ConfigError where there is no
-    journal, or its first line is not that of one.
+    """Read a journal.
+
+    Args:
+        path: The journal.
+
+    Returns:
+        Header, events, and a line of text for each line that cannot be read.
+
+    Raises:
+        ConfigError: The journal cannot be read, or its first line is not a header.
     """
     try:
         with path.open("rb") as file:
@@ -168,7 +186,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
 
 
 def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
-    """The event on a line. Raises KeyError, TypeError, RecursionError or ValueError where there is none."""
+    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it holds no event."""
     event: dict[str, Any] = json.loads(line)
     _whole(event["at"])
     _whole(event["t_ns"])
@@ -178,7 +196,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # recordings of the first versions did not count
+            _whole(event.get("frames", 0))  # the first versions did not count
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])
@@ -189,7 +207,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
 
 
 def _whole(value: object, least: int = 0) -> int:
-    """Raises ValueError for what is no integer of 64 bits from ``least`` on."""
+    """Return ``value`` if it is an integer of 64 bits, at least ``least``. Raises ValueError otherwise."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
         raise ValueError
     return value

@@ -1,5 +1,7 @@
-"""Writes down a host as it runs. The host's threads leave what they have in a queue; a thread of the
-recorder's own writes, so that a slow disk costs nobody but the recording anything.
+"""Records a host while it runs.
+
+The host's threads put entries into a queue; the recorder's own thread writes them, so that a slow disk delays
+only the recording.
 """
 
 from __future__ import annotations
@@ -28,13 +30,13 @@ from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFr
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""What was written longer ago is the kernel's, and survives this process."""
+"""Interval of flushes to the kernel: older entries survive this process."""
 
 SYNC_S: Final = 1.0
-"""What was written longer ago is on the disk. An fsync takes about 10 ms, of the writing thread alone."""
+"""Interval of fsync: older entries are on the disk. An fsync takes about 10 ms, on the writer thread only."""
 
 CAPACITY: Final = 50_000
-"""Batches that wait for the disk, at most: some seconds of four full buses."""
+"""Maximum batches queued for the disk: some seconds of four full buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -43,18 +45,18 @@ _Entry = Callable[[], None]
 
 @dataclass(frozen=True, slots=True)
 class RecorderStats:
-    """What a recorder has done so far."""
+    """Progress of a recorder."""
 
     frames: int
-    """Written."""
+    """Frames written."""
     dropped: int
-    """Not written, because the disk was too slow or failed."""
+    """Frames not written, because the disk was too slow or failed."""
     failure: str | None
-    """Why nothing is written any more, in one line; None while all is well."""
+    """Why nothing is written any more, in one line; None if all is well."""
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
-    """A file named after the hand, date and time."""
+    """Return the path in ``folder`` of a recording named after hand, date and time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -79,9 +81,7 @@ def make_folder(path: Path) -> Path | None:
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether ``path`` is a folder. Raises ConfigError if it cannot be a file or a folder, such as a
-    name that is too long.
-    """
+    """Return whether ``path`` is a folder. Raises ConfigError if it can be neither a folder nor a file."""
     try:
         return path.is_dir()
     except OSError as error:
@@ -89,20 +89,26 @@ def _is_folder(path: Path) -> bool:
 
 
 class Recorder:
-    """A recording under way, from construction to :meth:`close`; the host's ``tap``::
+    """A recording, from construction to :meth:`close`; the host's ``tap``.
+
+    Example::
 
         with Recorder(hand, "runs/") as recorder, Host.from_config(hand, tap=recorder) as host:
             ...
 
-    ``path`` is a file ending in .log or .blf, or a folder, created if needed, in which the file is named
-    after the hand, date and time; the journal is written beside it. Raises ConfigError if one of the files
-    exists, or if one of them or the folder cannot be created.
-    A ``with`` block that fails before the first frame leaves neither behind.
-    If the disk fails, the recording ends, one log line says so, and the host continues. An entry that raises
-    any other exception is lost, and counted in ``dropped``.
+    A recording that begins before the host does replays bit by bit. One that begins while the host runs
+    (:meth:`Host.tap`) lacks the solvers' memory. A ``with`` block that fails before the first frame leaves no
+    file. If the disk fails, the recording ends, one log line says so, and the host continues. An entry that
+    raises any other exception is lost, and counted in ``dropped``.
 
-    A recording that begins before the host does replays bit by bit; one that is begun while the host runs
-    (:meth:`Host.tap`) lacks what the solvers had in memory.
+    Args:
+        hand: The hand.
+        path: A file ending in .log or .blf, or a folder, created if needed, in which the file is named after
+            hand, date and time. The journal is written beside it.
+        kind: Format of a file in a folder.
+
+    Raises:
+        ConfigError: A file exists already, or a file or the folder cannot be created.
     """
 
     def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
@@ -139,33 +145,40 @@ class Recorder:
         self._thread.start()
 
     def stats(self) -> RecorderStats:
+        """Return the progress so far."""
         return RecorderStats(self._log.frames, self._lost, self._failure)
 
-    # --- of the host's threads
+    # --- called on the host's threads
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
+        """Record a batch of received frames."""
         self._put(lambda: self._write_frames(bus, frames, sent=False), len(frames))
 
     def sent(self, bus: str, frame: Frame) -> None:
+        """Record a sent frame."""
         self._put(lambda: self._write_frames(bus, (frame,), sent=True), 1)
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
+        """Record that scans of a patch are decoded from now on."""
         known = self._solvers.get(patch) is solver
         self._solvers[patch] = solver
         facts: dict[str, Any] = {} if known else {"facts": facts_table(solver.facts)}
         self._event(patch, "resumed", anew=anew, **facts)
 
     def withheld(self, patch: str) -> None:
+        """Record that scans of a patch are not decoded any more."""
         self._event(patch, "withheld")
 
     def polled(self, patch: str, t_ns: int) -> None:
+        """Record that the clock ended a scan."""
         self._event(patch, "polled", t_ns=t_ns)
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
+        """Record that a scan was skipped for a newer one."""
         self._event(patch, "overtaken", scan=scan, received_ns=t_receive_ns)
 
     def close(self) -> None:
-        """Write what is waiting, end and join the thread, close the files. What comes later is ignored."""
+        """Write the queued entries, join the thread and close the files; later entries are ignored."""
         if self._thread.is_alive():
             self._queue.put(None)
             self._thread.join()
@@ -177,11 +190,11 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        if error is not None and not self._log.frames:  # nothing worth keeping, and in the way of a retry
+        if error is not None and not self._log.frames:  # empty files would block a retry
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
             if self._made is not None:
-                with suppress(OSError):  # another process may use it by now
+                with suppress(OSError):  # another process may use it
                     self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> None:
@@ -194,7 +207,7 @@ class Recorder:
         bus, t_ns = self._bus_of[patch], time.monotonic_ns() if t_ns is None else t_ns
         self._put(lambda: self._write_event(bus, t_ns, event, patch=patch, **more), 0)
 
-    # --- of its own thread
+    # --- called on the recorder's thread
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "recording")
@@ -204,7 +217,7 @@ class Recorder:
         self._log.close()
 
     def _turn(self) -> bool:
-        """Wait briefly for the next entry and write it. Returns whether there may be more."""
+        """Wait briefly for the next entry and write it. Returns whether to go on."""
         if self._ended:
             return False
         with suppress(queue.Empty):
@@ -232,7 +245,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """The journal first: it must not know less than the log."""
+        """Flush the journal before the log: it must not know less."""
         if self._lost != self._lost_told:
             lost, self._lost_told = self._lost - self._lost_told, self._lost
             self._write_event("", time.monotonic_ns(), "dropped", frames=lost)
@@ -240,7 +253,7 @@ class Recorder:
         self._log.flush(to_disk=to_disk)
 
     def _begin(self, header: Header) -> None:
-        """At once, so that a recording that is killed at any moment can be read."""
+        """Write the header at once, so that a recording killed at any moment can be read."""
         self._write_line(header.line())
         self._journal.flush()
 
@@ -260,7 +273,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """The channel in a log of each bus: its name, where candump could have written it."""
+    """Return the channel of each bus in a log: its name, if candump could have written it."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

@@ -1,11 +1,12 @@
-"""Makes fields of a recording again, by the code that made them live: dispatcher, assembler, decoder, stream,
-solver, publisher. Nothing here has a thread: each scan is solved when its last frame is dispatched.
+"""Replays a recording as fields, with the code that decodes them live.
 
-**Same as live.** For the scans that were solved live the numbers are the same bits, where the recording began
-before the host did, is whole, the build and processor are the same and no deadline cut a solve short. Times
-are of the recording host's clock, to 1 µs, as log files have them. Where frames are missing or damaged,
-events of the journal are placed by time instead of by count, and the clock that ends incomplete scans is
-that of the frames.
+Dispatcher, assembler, decoder, stream, solver and publisher are the host's. Nothing here has a thread: each
+scan is solved when its last frame is dispatched.
+
+**Same as live.** The fields of scans that were solved live are equal bit by bit if the recording began before
+the host did and is whole, build and processor are the same, and no deadline cut a solve short. Times are
+those of the recording host's clock, to 1 µs, as log files have them. If frames are missing or damaged, events
+of the journal are placed by time instead of by count, and the time of the frames ends incomplete scans.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
-"""A longer one is played as one of this length: it may be a damaged time."""
+"""Maximum silence replayed; a longer one may be a damaged time."""
 
 _ROUNDING_NS: Final = 2_000
-"""A time in a log may be this much too early or late."""
+"""Maximum rounding error of a time in a log."""
 
 _SLICE_S: Final = 0.1
-"""How long :meth:`Replay.stop` may go unnoticed."""
+"""Maximum delay of :meth:`Replay.stop`."""
 
 
 def _never() -> bool:
@@ -49,21 +50,28 @@ def _never() -> bool:
 
 
 def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[[], bool] = _never) -> Replay:
-    """The fields of a recording, as an iterable::
+    """Return the fields of a recording, as an iterable.
+
+    Example::
 
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    ``speed``: 1 at the pace of the recording, 2 twice as fast; None as fast as they are solved. No scan is
-    skipped that was solved live, whatever the speed. ``cancelled`` is asked all the while; when it says True
-    the iteration ends, as by :meth:`Replay.stop`. Raises ConfigError for a recording that cannot be read
-    at all, and for a speed that is not positive.
+    No scan that was solved live is skipped, whatever the speed.
+
+    Args:
+        path: File ending in .log or .blf.
+        speed: 1 for the speed of the recording, 2 for twice as fast; None for as fast as possible.
+        cancelled: Called repeatedly; True ends the iteration, as :meth:`Replay.stop` does.
+
+    Raises:
+        ConfigError: The recording cannot be read, or ``speed`` is not positive.
     """
     return Replay(Path(path), speed, cancelled)
 
 
 class Replay:
-    """See :func:`replay`. Iterate once; the counters then say what there was."""
+    """A recording being replayed; see :func:`replay`. Iterate once; then read the counters."""
 
     def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
         if speed is not None and not 0 < speed < float("inf"):
@@ -71,21 +79,20 @@ class Replay:
         if not path.name:
             raise ConfigError("recording", str(path), "a file ending in .log or .blf")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
-        """What of the journal could not be read, a line each."""
+        """One line for each part of the journal that cannot be read."""
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
-        """The log; its ``damaged`` and ``damages`` say what of it could not be read."""
+        """The log; ``damaged`` and ``damages`` report what cannot be read."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
-        """Whether the recording was ended rather than killed."""
+        """Whether the recording was ended, not killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """After an iteration to the end: how the log is not all that was recorded, in one line; None where
-        it is."""
+        """After a complete iteration: what the log lacks, in one line; None if it is complete."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Frames that the recorder could not write."""
         self._now_ns = 0
@@ -102,7 +109,7 @@ class Replay:
             for number, bus in enumerate(self.hand.buses)
         }
         self.strange = 0
-        """Frames of a channel that is no bus of the hand."""
+        """Frames on channels that belong to no bus of the hand."""
 
     def __iter__(self) -> Iterator[FieldFrame]:
         fields = self._publisher.subscribe(64, None, None)
@@ -141,9 +148,7 @@ class Replay:
 
     @property
     def flaws(self) -> list[str]:
-        """What of the recording could not be read or is not there, a line each; all of it after an iteration
-        to the end.
-        """
+        """Missing or unreadable parts of the recording, one line each; all after a complete iteration."""
         found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
         if self.log.damaged > len(found):
             found.append(f"{self.log.damaged - len(found)} more places like these")
@@ -158,25 +163,25 @@ class Replay:
         return found
 
     def stop(self) -> None:
-        """End the iteration soon; from any thread."""
+        """End the iteration soon; callable from any thread."""
         self._stopped = True
 
     @property
     def stopped(self) -> bool:
-        """Whether it was told to end before the end of the recording."""
+        """Whether the iteration was ended before the end of the recording."""
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
-        """How a patch was where the replay is. Raises KeyError for no such patch."""
+        """Return the health of a patch at this point of the replay. Raises KeyError for an unknown patch."""
         heard = self._buses[self.hand.patch(patch).bus].patches[patch]
         return heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
 
     def bus_stats(self) -> dict[str, BusStats]:
-        """Counters by bus."""
+        """Return the counters of each bus."""
         return {name: bus.stats() for name, bus in self._buses.items()}
 
     def patch_stats(self) -> dict[str, StreamStats]:
-        """Counters by patch."""
+        """Return the counters of each patch."""
         return {patch.name: self._stream_stats(patch.name) for patch in self.hand.patches}
 
     def _stream_stats(self, patch: str) -> StreamStats:
@@ -188,15 +193,16 @@ class Replay:
             time.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:
-        """Of an event of the journal that turned out to be none."""
+        """Report an event of the journal that is malformed."""
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
-        """The time in the recording, ns of its host's monotonic clock."""
+        """Return the time in the recording, ns of its host's monotonic clock."""
         return self._now_ns
 
     @property
     def publisher(self) -> Publisher:
+        """Publisher of the fields."""
         return self._publisher
 
 
@@ -220,7 +226,7 @@ class _Pace:
 
 
 class _PollerlessDispatcher(Dispatcher):
-    """Lanes are polled where the journal says so, not after each batch: there are no batches any more."""
+    """A dispatcher that never polls: the journal says when streams are polled, not the end of a batch."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass
@@ -249,7 +255,7 @@ class _Bus:
         self._received = self._sent = 0
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """The next frame of the log. ``whole``: no frame before it was damaged."""
+        """Process the next frame of the log; ``whole``: no frame before it was damaged."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -266,7 +272,7 @@ class _Bus:
         self._dispatcher.measure(frame.t_ns)
 
     def finish(self) -> None:
-        """What happened after the last frame."""
+        """Apply the events after the last frame."""
         while self._events:
             self._happen(self._events.popleft())
 
@@ -293,7 +299,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """None where nobody knows how the scans are to be decoded."""
+        """Return the solver of an event; None if its facts are unknown."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

@@ -1,4 +1,4 @@
-"""The cases, a module an area, in the order of the plan."""
+"""The cases, one module for each area, in the order of the test plan."""
 
 from skinnode.conformance.cases import (
     eds,

@@ -1,4 +1,4 @@
-"""EDS: the data sheet against itself, and against the identity of the device."""
+"""EDS: the data sheet, checked for contradictions and against the identity of the device."""
 
 from __future__ import annotations
 

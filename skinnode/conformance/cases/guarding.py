@@ -1,4 +1,4 @@
-"""Guarding 1 to 6: the older of the two error control protocols."""
+"""GUARD 1 to 6: node guarding and life guarding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _GUARD_MS, _FACTOR = 100, 3
 
 
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
-    """A remote frame must be answered with this state and, unless None, this toggle bit."""
+    """Raise Failed unless a remote frame is answered with this state and, unless None, this toggle bit."""
     got = dut.guard(what)
     told = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:
@@ -70,7 +70,7 @@ def written(dut: Dut) -> None:
         raise Failed("0x1234 and 3 read back", f"0x{got[0]:04X} and {got[1]}")
 
 
-@case("GUARD-06", "Life guarding: begins with the first remote frame, tells when they end (EMCY 0x8130)",
+@case("GUARD-06", "Life guarding begins with the first remote frame and reports their end (EMCY 0x8130)",
       "7.2.8.2.2.1, 7.5.2.12")  # fmt: skip
 def life_guarding(dut: Dut) -> None:
     dut.need(GUARD_TIME)

@@ -1,4 +1,4 @@
-"""Heartbeat 1 to 7: producer (0x1017) and consumer (0x1016)."""
+"""HB 1 to 7: heartbeat producer (0x1017) and consumer (0x1016)."""
 
 from __future__ import annotations
 

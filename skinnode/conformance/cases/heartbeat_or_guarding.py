@@ -1,4 +1,4 @@
-"""Heartbeat versus guarding 1 to 7: a device uses one of them at a time, heartbeat first (7.2.8.2.2)."""
+"""HBVG 1 to 7: a device uses heartbeat or guarding, one at a time, heartbeat first (7.2.8.2.2)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CLAUSE = "7.2.8.2.2"
 
 
 def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
-    """Set both; NotApplicable where the device has but one of them."""
+    """Set both. Raises NotApplicable if the device has only one of them."""
     dut.need(HEARTBEAT)
     dut.need(GUARD_TIME)
     dut.need(LIFE_TIME_FACTOR)
@@ -24,7 +24,7 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Heartbeats come at their pace and nothing else does, though remote frames are sent between them."""
+    """Check that only heartbeats arrive, at their period, even if remote frames are sent between them."""
     frames = []
     for _ in range(8):
         frames.append(dut.bus.expect(dut.error_control_id, "a heartbeat"))

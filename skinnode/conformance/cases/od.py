@@ -1,4 +1,4 @@
-"""OD: every object of the EDS on the device, 1 to 6 of CiA 301's own area, 7 to 9 of all above."""
+"""OD 1 to 9: every object of the EDS on the device: 1 to 6 the objects of CiA 301, 7 to 9 all above."""
 
 from __future__ import annotations
 
@@ -45,8 +45,9 @@ def _none(expected: str, faults: list[str]) -> None:
 
 
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
-    """Compare default values. 0x1010 and 0x1011 return the device's capabilities, not defaults, so a
-    difference from the EDS there is a warning.
+    """Compare default values with the EDS.
+
+    0x1010 and 0x1011 return the device's capabilities, not defaults: a difference there is a warning.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -94,7 +95,7 @@ def write_only(dut: Dut) -> None:
         dut.sdo.aborts(request, entry.index, entry.subindex, WRITE_ONLY, f"read of {entry}")
 
 
-@case("OD-05", "Sub-index 0xFF, where there is one, names object and data type as the EDS does", "7.4.3")
+@case("OD-05", "Sub-index 0xFF, if it exists, has the object and data type of the EDS", "7.4.3")
 def structure(dut: Dut) -> None:
     known = {0x5: 0x05, 0x6: 0x06, 0x7: 0x07}
     found = False
@@ -119,7 +120,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # A mapping has rules of its own (PDO-25), the error field takes 0 alone, signatures have theirs.
+        # Mappings (PDO-25), the error field (only 0) and signatures have rules of their own.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):

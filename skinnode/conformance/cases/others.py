@@ -1,6 +1,4 @@
-"""Others 1 to 10: storing and restoring by 0x1010 and 0x1011, 0x1020, and CAN-IDs that nothing may be set
-to.
-"""
+"""OTHER 1 to 10: storing and restoring (0x1010, 0x1011), 0x1020, and restricted CAN-IDs."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ RESTRICTED = (
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Write values that are not the default to what is harmless; values before and after."""
+    """Write other values than the defaults to harmless objects; return the values before and after."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -49,10 +47,10 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
-    """Refused, and nothing has changed: neither at once nor after a reset."""
+    """Check that a wrong signature is refused and changes nothing, neither at once nor after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
-    # Were it taken for right, what is stored would have to be put back.
+    # If the device accepts it, stored parameters have to be put back.
     dut.stored = True
     for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
         request = expedited(index, subindex, signature)
@@ -72,7 +70,7 @@ def _store(dut: Dut, subindex: int) -> None:
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Default values are valid after the next reset, and not before it."""
+    """Check that default values are valid after the next reset, and not before it."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
@@ -151,7 +149,7 @@ def restricted(dut: Dut) -> None:
     found = False
     for index, subindex in _cob_ids(dut):
         found = True
-        if index == _EMCY or index >= 0x1280:  # not to be changed while valid
+        if index == _EMCY or index >= 0x1280:  # must not change while valid
             current = dut.sdo.integer(index, subindex)
             dut.sdo.write_integer(index, subindex, current | INVALID, 4)
         for block in RESTRICTED:
@@ -164,7 +162,7 @@ def restricted(dut: Dut) -> None:
 
 
 def _cob_ids(dut: Dut) -> Iterator[tuple[int, int]]:
-    """COB-IDs that can be written: SYNC, TIME, EMCY, and of each kind of PDO the first."""
+    """Yield the writable COB-IDs: SYNC, TIME, EMCY, and the first PDO of each kind."""
     pdos = [indices[0] for first in (0x1400, 0x1800) if (indices := dut.eds.indices(first, first + 0x1FF))]
     for index, subindex in ((0x1005, 0), (0x1012, 0), (_EMCY, 0), *((index, COB_ID) for index in pdos)):
         entry = dut.eds.find(index, subindex)

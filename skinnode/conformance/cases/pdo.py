@@ -13,6 +13,7 @@ from skinnode.conformance.pdo import (
     INVALID,
     NO_REMOTE,
     Pdo,
+    PdoSetup,
     Trial,
     Unsupported,
     drain,
@@ -35,7 +36,7 @@ _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """COB-IDs: the pre-defined ones of the first four, no two valid ones alike."""
+    """Check the COB-IDs: the first four are pre-defined, and no two valid ones are equal."""
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -89,10 +90,13 @@ def remote(dut: Dut) -> None:
 
 
 def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
-    """Set up for remote frames; CAN-ID and length. Unsupported where bit 30 of the COB-ID forbids them."""
+    """Set a PDO up for remote frames; return its CAN-ID and length.
+
+    Raises Unsupported if bit 30 of the COB-ID forbids remote frames.
+    """
     if dut.sdo.integer(pdo.parameter, 1) & NO_REMOTE:
         raise Unsupported(f"{pdo} does not allow remote frames: bit 30 of 0x{pdo.parameter:04X}:01 is set")
-    return set_up(dut, pdo, 253, remote=True), payload_bytes(mapped(dut, pdo))
+    return set_up(dut, pdo, PdoSetup(253, remote=True)), payload_bytes(mapped(dut, pdo))
 
 
 @case("PDO-04", "OPERATIONAL: types 254 and 255 are sent at the event timer, no closer than the inhibit time",
@@ -101,15 +105,15 @@ def event_driven(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         length = payload_bytes(mapped(dut, pdo))
         for kind in (254, 255):
-            can_id = set_up(dut, pdo, kind, event_ms=_EVENT_MS)
+            can_id = set_up(dut, pdo, PdoSetup(kind, event_ms=_EVENT_MS))
             dut.operational()
             expect_pdo(dut, can_id, length, f"{pdo} of type {kind} with an event timer of {_EVENT_MS} ms")
             dut.nmt(PRE_OPERATIONAL)
-        can_id = set_up(dut, pdo, 254, event_ms=10, inhibit=400)
+        can_id = set_up(dut, pdo, PdoSetup(254, event_ms=10, inhibit_100us=400))
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} at its event timer") for _ in range(8)]
         gaps = gaps_ms(frames)
-        # Single distances are short where the frame before was late on its way; their mean hardly is.
+        # One interval is short if the frame before was delayed; their mean hardly changes.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             told = ", ".join(f"{gap:.1f}" for gap in gaps)
             raise Failed(f"{pdo} no closer than its inhibit time of 40 ms", f"gaps of {told} ms")
@@ -123,11 +127,11 @@ def event_driven(dut: Dut) -> None:
 def event_timer(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         length = payload_bytes(mapped(dut, pdo))
-        can_id = set_up(dut, pdo, 254)
+        can_id = set_up(dut, pdo, PdoSetup(254))
         dut.operational()
-        busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))  # events of the application itself
+        busy = bool(dut.bus.listen(can_id, 3 * _EVENT_MS * 1e-3))  # events of the application
         dut.nmt(PRE_OPERATIONAL)
-        set_up(dut, pdo, 254, event_ms=_EVENT_MS)
+        set_up(dut, pdo, PdoSetup(254, event_ms=_EVENT_MS))
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} each {_EVENT_MS} ms") for _ in range(9)]
         check_period(frames, _EVENT_MS, str(pdo), or_sooner=busy)
@@ -145,7 +149,7 @@ def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         length = payload_bytes(mapped(dut, pdo))
         for kind in (1, 3):
-            can_id = set_up(dut, pdo, kind)
+            can_id = set_up(dut, pdo, PdoSetup(kind))
             dut.operational()
             dut.bus.expect_silence(can_id, f"{pdo} of type {kind} without SYNC")
             first = _first_of_cycle(dut, can_id, kind, str(pdo))
@@ -158,9 +162,7 @@ def cyclic(dut: Dut) -> None:
 
 
 def _first_of_cycle(dut: Dut, can_id: int, kind: int, name: str) -> int:
-    """Return the number of the SYNC, from 1, that triggered the first TPDO of a cycle. The type fixes the
-    distance between TPDOs, but not the phase unless there is a start value (sub-index 6).
-    """
+    """Return the number of the SYNC, from 1, that triggered the first TPDO of a cycle."""
     for number in range(1, kind + 1):
         sync(dut)
         if dut.bus.take(can_id, _FIRST_S if number < kind else ANSWER_S) is not None:
@@ -170,7 +172,9 @@ def _first_of_cycle(dut: Dut, can_id: int, kind: int, name: str) -> int:
     raise Failed(f"{name} of type {kind} after {after}", "nothing")
 
 
-def _after_sync(dut: Dut, can_id: int, length: int, due: bool, what: str, counter: int | None = None) -> None:
+def _after_sync(  # noqa: PLR0913 - one PDO, one SYNC
+    dut: Dut, can_id: int, length: int, due: bool, what: str, counter: int | None = None
+) -> None:
     sync(dut, counter)
     if due:
         expect_pdo(dut, can_id, length, what)
@@ -183,7 +187,7 @@ def _after_sync(dut: Dut, can_id: int, length: int, due: bool, what: str, counte
 def acyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         length = payload_bytes(mapped(dut, pdo))
-        can_id = set_up(dut, pdo, 0)
+        can_id = set_up(dut, pdo, PdoSetup(0))
         dut.operational()
         dut.bus.expect_silence(can_id, f"{pdo} of type 0 without SYNC")
         for _ in range(3):
@@ -213,14 +217,14 @@ def sync_start(dut: Dut) -> None:
 def _for_start(dut: Dut, pdo: Pdo) -> int:
     dut.need(_SYNC_COUNTER)
     dut.sdo.write_integer(_SYNC_COUNTER, 0, 10, 1)
-    return set_up(dut, pdo, 2, start=3)
+    return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
 # --- STOPPED, and PRE-OPERATIONAL after OPERATIONAL: the same, and nothing is sent
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:
-    """A trial: set up, let run, enter a state in which PDOs are not served, and do what asks for them."""
+    """Return a trial: set up, run, enter a state in which PDOs are not served, and trigger the PDO."""
 
     def trial(dut: Dut, pdo: Pdo) -> None:
         if kind == 253:
@@ -228,7 +232,7 @@ def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bo
         elif start:
             can_id = _for_start(dut, pdo)
         else:
-            can_id = set_up(dut, pdo, kind, event_ms=event_ms)
+            can_id = set_up(dut, pdo, PdoSetup(kind, event_ms=event_ms))
         dut.nmt(START)
         dut.nmt(command)
         drain(dut, can_id)

@@ -1,4 +1,4 @@
-"""PDO 21 to 33: what PDOs map, and remapping by the procedure of CiA 301, without it, and to nonsense."""
+"""PDO 21 to 33: what PDOs map, and remapping: by the procedure, without it, and to invalid entries."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from skinnode.conformance.pdo import (
     CAN_ID,
     INVALID,
     Pdo,
+    PdoSetup,
     disable,
     expect_pdo,
     mapped,
@@ -32,7 +33,7 @@ Fits = Callable[[EdsEntry], bool]
 
 
 def _changeable(dut: Dut, pdos: list[Pdo]) -> list[Pdo]:
-    """Those that can be remapped; NotApplicable where none can."""
+    """Return the PDOs that can be remapped. Raises NotApplicable if there is none."""
     found = []
     for pdo in pdos:
         count, cob_id = dut.eds.find(pdo.mapping, 0), dut.eds.find(pdo.parameter, 1)
@@ -58,19 +59,19 @@ def _any_for(dut: Dut, pdo: Pdo) -> EdsEntry:
 
 
 def _clear(dut: Dut, pdo: Pdo) -> int:
-    """Disable the PDO and its mapping, as the procedure begins; the COB-ID from before."""
+    """Disable the PDO and its mapping, the first step of the procedure; return the COB-ID from before."""
     cob_id = disable(dut, pdo)
     dut.sdo.write_integer(pdo.mapping, 0, 0, 1)
     return cob_id
 
 
 def _most_bytes(dut: Dut) -> int:
-    """That a frame of the bus holds."""
+    """Return the bits that a frame of the bus holds."""
     return 64 if dut.bus.fd else 8
 
 
 def _slots(dut: Dut, pdo: Pdo) -> int:
-    """How many entries the mapping has."""
+    """Return the number of entries of the mapping."""
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
@@ -92,7 +93,7 @@ def default_mapping(dut: Dut) -> None:
 
 def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
     where = f"0x{pdo.mapping:04X}:{subindex:02X}"
-    if word < 0x0020_0000:  # a dummy entry: a data type in place of an object
+    if word < 0x0020_0000:  # a dummy entry: a data type instead of an object
         if pdo.transmits or word >> 16 not in dut.eds.dummies:
             raise Failed(f"{where} to name an object or an allowed dummy", f"0x{word:08X}")
         return
@@ -116,7 +117,7 @@ def remap(dut: Dut) -> None:
         if cob_id & CAN_ID:
             dut.sdo.write_integer(pdo.parameter, 1, cob_id & ~INVALID, 4)
         if pdo.transmits and cob_id & CAN_ID:
-            can_id = set_up(dut, pdo, 1)
+            can_id = set_up(dut, pdo, PdoSetup(1))
             dut.operational()
             sync(dut)
             expect_pdo(dut, can_id, entry.size, f"{pdo} after SYNC, remapped to {entry}")
@@ -176,7 +177,7 @@ def too_many(dut: Dut) -> None:
             raise Failed(f"{pdo} still without entries", str(dut.sdo.integer(pdo.mapping, 0)))
 
 
-@case("PDO-26", "Objects of more bits in all than a frame holds are refused", "7.5.2.36, 7.5.2.38")
+@case("PDO-26", "Objects with more bits in total than a frame holds are refused", "7.5.2.36, 7.5.2.38")
 def too_long(dut: Dut) -> None:
     tried = False
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -192,7 +193,7 @@ def too_long(dut: Dut) -> None:
                 dut.sdo.write_integer(pdo.mapping, subindex, entry.mapping, 4)
         except Aborted as abort:
             if abort.code in TOO_MUCH:
-                continue  # a device may refuse the entry that is too much
+                continue  # a device may refuse the excess entry
             raise
         request = expedited(pdo.mapping, 0, bytes((count,)))
         what = f"{pdo}: {count} × {8 * entry.size} bits"
@@ -214,7 +215,7 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 
 
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
-    """Either the entry is refused or, by a device that checks all at the end, the number of entries."""
+    """Check that the entry or, on a device that checks at the end, the number of entries is refused."""
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"
         request = expedited(pdo.mapping, 1, word.to_bytes(4, "little"))

@@ -24,14 +24,14 @@ TOO_LOW = (0x0609_0030, 0x0609_0032)
 
 _DEVICE_TYPE = 0x1000
 _HARMLESS = (HEARTBEAT, 0x1015, 0x1006, 0x1007, GUARD_TIME)
-"""Objects of CiA 301 that take any value and do nothing by themselves for a while."""
+"""Objects of CiA 301 that accept any value and have no effect for a while."""
 _SPECIAL = (0x1003, 0x1010, 0x1011, 0x1020, 0x1F50, 0x1F51)
-"""Objects that take commands, or some values only."""
+"""Objects that accept commands, or only some values."""
 _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """The first entry that fits; NotApplicable, saying what lacks, for none."""
+    """Return the first entry that fits. Raises NotApplicable, which names what is missing."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -39,7 +39,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """A readable object of more than four bytes, and its value: a name or version if there is one."""
+    """Return a readable object of more than four bytes and its value: a name or version if there is one."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):
@@ -51,7 +51,7 @@ def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
 
 
 def check(dut: Dut, index: int, value: int, size: int) -> None:
-    """What was written to ``index`` must be read back."""
+    """Raise Failed unless the value written to ``index`` is read back."""
     got = dut.sdo.integer(index)
     if got != value:
         raise Failed(f"0x{value:0{2 * size}X} read back from 0x{index:04X}:00", f"0x{got:0{2 * size}X}")
@@ -109,7 +109,7 @@ def no_object(dut: Dut) -> None:
 def unknown_command(dut: Dut) -> None:
     what = "command specifier 7"
     answer = dut.sdo.ask(b"\xe0" + mux(_DEVICE_TYPE, 0), what)
-    # Which object an abort names that answers no transfer is left open.
+    # The standard does not say which object such an abort names.
     index, subindex = struct.unpack("<HB", answer[1:4])
     dut.sdo.check_abort(answer, index, subindex, UNKNOWN_COMMAND, what)
     dut.sdo.read(_DEVICE_TYPE)
@@ -126,7 +126,7 @@ def _writable_of(dut: Dut, *sizes: int) -> EdsEntry:
     )
 
 
-@case("SDO-08", "Four bytes to an object of one or two are refused, its value kept", "7.2.4.3.17")
+@case("SDO-08", "Four bytes to an object of one or two are refused; its value stays", "7.2.4.3.17")
 def too_long(dut: Dut) -> None:
     entry = _writable_of(dut, 1, 2)
     before = dut.sdo.read(entry.index, entry.subindex)
@@ -135,7 +135,7 @@ def too_long(dut: Dut) -> None:
     _unchanged(dut, entry, before)
 
 
-@case("SDO-09", "One byte to an object of two or four is refused, its value kept", "7.2.4.3.17")
+@case("SDO-09", "One byte to an object of two or four is refused; its value stays", "7.2.4.3.17")
 def too_short(dut: Dut) -> None:
     entry = _writable_of(dut, 2, 4)
     before = dut.sdo.read(entry.index, entry.subindex)
@@ -151,7 +151,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """The value just beyond a limit; None where the type holds none, or there is no limit."""
+    """Return the value just beyond a limit; None if the type cannot hold it, or there is no limit."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:
@@ -160,7 +160,7 @@ def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
         return None
 
 
-@case("SDO-10", "A value above the high limit of the EDS is refused, the value kept", "7.2.4.3.17")
+@case("SDO-10", "A value above the high limit of the EDS is refused; the value stays", "7.2.4.3.17")
 def too_high(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),
@@ -174,7 +174,7 @@ def too_high(dut: Dut) -> None:
     _unchanged(dut, entry, before)
 
 
-@case("SDO-11", "A value below the low limit of the EDS is refused, the value kept", "7.2.4.3.17")
+@case("SDO-11", "A value below the low limit of the EDS is refused; the value stays", "7.2.4.3.17")
 def too_low(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),

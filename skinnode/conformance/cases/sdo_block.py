@@ -1,4 +1,4 @@
-"""SDO 19 to 30: block transfer, and SDOs beyond the default one."""
+"""SDO 19 to 30: block transfer, and SDOs besides the default SDO."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BLOCK_SIZE, _SEQUENCE, _CRC = 0x0504_0002, 0x0504_0003, 0x0504_0004
 
 
 def _block(transfer: Callable[[], bytes | None]) -> bytes | None:
-    """Run a block transfer; NotApplicable where the first request is answered as an unknown command."""
+    """Run a block transfer. Raises NotApplicable if the server does not know block transfer."""
     try:
         return transfer()
     except Aborted as abort:
@@ -24,7 +24,9 @@ def _block(transfer: Callable[[], bytes | None]) -> bytes | None:
         raise
 
 
-def _read(dut: Dut, index: int, subindex: int, wanted: bytes, *, crc: bool, size: int = 20) -> None:
+def _read(  # noqa: PLR0913 - an object, its value, and how it is read
+    dut: Dut, index: int, subindex: int, wanted: bytes, *, crc: bool, size: int = 20
+) -> None:
     got = _block(lambda: dut.sdo.read_block(index, subindex, crc=crc, size=size))
     if got != wanted:
         raise Failed(f"{wanted.hex(' ').upper()} of 0x{index:04X}:{subindex:02X}", repr(got))
@@ -83,7 +85,7 @@ def block_write_heartbeat_crc(dut: Dut) -> None:
     start = dut.sdo.served(b"\xc6" + mux(HEARTBEAT, 0) + struct.pack("<I", 2), "a block write to 0x1017:00")
     dut.sdo.abort(HEARTBEAT, 0)
     if not start[0] & 4:
-        return  # the server does not check a CRC, and says so
+        return  # the server announces that it does not check a CRC
     try:
         dut.sdo.write_block(HEARTBEAT, 0, b"\x34\x12", crc=True, wrong_crc=True)
     except Aborted as abort:

@@ -1,4 +1,4 @@
-"""NMT states 1 to 4: the boot-up message, and what a node does in each state."""
+"""STATE 1 to 4: the boot-up message, and the services of a node in each state."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from skinnode.conformance.configuration import read_configuration
 from skinnode.conformance.dut import GUARD_TIME, HEARTBEAT, PRE_OPERATIONAL, STOP, Dut
 from skinnode.conformance.pdo import (
     SYNC_ID,
+    PdoSetup,
     Unsupported,
     disable,
     drain,
@@ -45,7 +46,7 @@ def boot_up(dut: Dut) -> None:
         other = bytes(byte ^ 0x5A for byte in value)
         request = bytes((0x23 | (4 - len(other)) << 2,)) + mux(index, subindex) + other
         if len(other) <= 4:
-            # A device may refuse any of these; none of them may survive the reset.
+            # A device may refuse these; none may survive the reset.
             changed += dut.sdo.ask(request, f"write to 0x{index:04X}:{subindex:02X}")[0] == 0x60
     if not changed:
         raise Failed("at least one parameter of 0x1000 to 0x1FFF that can be changed", "none")
@@ -61,7 +62,7 @@ def boot_up(dut: Dut) -> None:
 
 
 def _check_state(dut: Dut, state: int, what: str) -> None:
-    """By heartbeat and, once that is off, by guarding: whichever there are. SDO must be served."""
+    """Check the state by heartbeat and by guarding, as far as the device supports them, and SDO."""
     dut.start_heartbeat()
     dut.expect_state(state, what)
     if dut.eds.find(HEARTBEAT) is not None:
@@ -84,20 +85,20 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """TPDOs sent each 20 ms once OPERATIONAL: CAN-ID and length."""
+    """Set TPDOs up to be sent every 20 ms in OPERATIONAL; return CAN-ID and length."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):
             continue
         try:
-            found[set_up(dut, pdo, 254, event_ms=_EVENT_MS)] = payload_bytes(mapped(dut, pdo))
+            found[set_up(dut, pdo, PdoSetup(254, event_ms=_EVENT_MS))] = payload_bytes(mapped(dut, pdo))
         except Unsupported:
             disable(dut, pdo)
     return found
 
 
 def _no_pdos(dut: Dut, state: str) -> None:
-    """Neither at the event timer nor after SYNC; the TPDOs have been set up before the state was entered."""
+    """Check that no TPDO is sent, neither at the event timer nor after SYNC."""
     can_ids = _timed(dut) if state == "PRE-OPERATIONAL" else {}
     sync(dut)
     for can_id in can_ids:
@@ -166,7 +167,7 @@ def stopped(dut: Dut) -> None:
 
 
 def _no_emcy(dut: Dut) -> None:
-    """A frame that would bring an emergency message elsewhere: an RPDO without a byte."""
+    """Send a frame that causes an emergency message in OPERATIONAL: an RPDO without data."""
     dut.bus.pending(dut.emcy_id)
     dut.bus.send(0x200 + dut.node_id)
     dut.bus.expect_silence(dut.emcy_id, "emergency message in STOPPED")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from skinnode.conformance.case import NotApplicable, case
 from skinnode.conformance.dut import STORE, Dut
 from skinnode.conformance.frame_period import check_period
-from skinnode.conformance.pdo import SYNC_ID, Pdo, drain, mapped, payload_bytes, set_up, sync, tpdos
+from skinnode.conformance.pdo import SYNC_ID, Pdo, PdoSetup, drain, mapped, payload_bytes, set_up, sync, tpdos
 from skinnode.conformance.sdo import Aborted, expedited
 from skinnode.conformance.tester import QUIET_S, Failed, describe
 from skinnode.text.words import counted
@@ -18,7 +18,7 @@ _BUSY = (0x0800_0022,)
 
 
 def consume_only(dut: Dut) -> None:
-    """Neither producer nor period: what the counter may be written with."""
+    """Disable producer and period, so that the counter can be written."""
     dut.need(COB_ID)
     dut.sdo.write_integer(COB_ID, 0, SYNC_ID, 4)
     if dut.eds.find(PERIOD) is not None:
@@ -26,7 +26,7 @@ def consume_only(dut: Dut) -> None:
 
 
 def produce(dut: Dut, period_ms: int = PERIOD_MS) -> None:
-    """Start the SYNC producer; NotApplicable where the device has none."""
+    """Start the SYNC producer. Raises NotApplicable if the device has none."""
     dut.need(COB_ID)
     dut.need(PERIOD)
     dut.sdo.write_integer(PERIOD, 0, period_ms * 1000, 4)
@@ -62,7 +62,7 @@ def count(dut: Dut) -> None:
     for other in tpdos(dut):
         if other != pdo:
             dut.sdo.write_integer(other.parameter, 1, dut.sdo.integer(other.parameter, 1) | 1 << 31, 4)
-    can_id, length = set_up(dut, pdo, 10), payload_bytes(mapped(dut, pdo))
+    can_id, length = set_up(dut, pdo, PdoSetup(10)), payload_bytes(mapped(dut, pdo))
     dut.operational()
     drain(dut, can_id)
     for _ in range(30):
@@ -78,7 +78,7 @@ def count(dut: Dut) -> None:
 
 
 def _synchronous(dut: Dut) -> Pdo:
-    """A TPDO that is synchronous by default, else the first that maps something."""
+    """Return a TPDO that is synchronous by default, else the first that maps something."""
     usable = [pdo for pdo in tpdos(dut) if mapped(dut, pdo)]
     if not usable:
         raise NotApplicable("no TPDO maps anything by default")

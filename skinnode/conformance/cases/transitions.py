@@ -1,4 +1,4 @@
-"""NMT transitions 1 to 4: reset node against reset communication, pre-operational, start, stop."""
+"""TRANS 1 to 4: reset node and reset communication, pre-operational, start, stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"
 
 
 def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
-    """An object of 0x2000 to 0x9FFF that took another value, and the value before; None for none."""
+    """Return an object of 0x2000 to 0x9FFF that took another value, and its value before."""
     for entry in dut.eds.between(0x2000, 0x9FFF):
         if not (entry.readable and entry.writable and entry.data_type in UNSIGNED and entry.size <= 4):
             continue
@@ -71,9 +71,7 @@ def resets(dut: Dut) -> None:
 
 
 def _transition(dut: Dut, command: int, *others: int) -> None:
-    """``command`` leads to its state after each of ``others``, by node-ID and for all nodes; commands for
-    another node, or that are none, change nothing.
-    """
+    """Check that ``command`` leads to its state after each of ``others``, by node-ID and for all nodes."""
     state, name = _COMMANDS[command], _NAMES[command]
     dut.start_heartbeat()
     for other in others:

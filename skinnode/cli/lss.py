@@ -104,7 +104,7 @@ def set_node(
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
     from skinnode.diagnose.bus_connection import BusConnection
-    from skinnode.diagnose.lss_commissioning import commission, only_unconfigured
+    from skinnode.diagnose.lss_commissioning import Commissioning, commission, only_unconfigured
     from skinnode.errors import ConfigError, Shown
 
     if node_id is None and bit_rate is None:
@@ -131,9 +131,7 @@ def set_node(
         def agreed(before: int | None) -> bool:
             return yes or _confirmed(address.serial_number, before, node_id, bit_rate, store)
 
-        done = commission(
-            connection, address, node_id=node_id, bitrate_bps=bit_rate, store=store, agreed=agreed
-        )
+        done = commission(connection, address, Commissioning(node_id, bit_rate, store), agreed)
     if done is None:
         raise ConfigError("--yes", Shown("no"), "yes to the question; nothing was changed")
     if as_json:

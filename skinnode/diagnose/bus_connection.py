@@ -1,4 +1,4 @@
-"""An open bus in a technician's hands: SDO to any node, LSS, NMT, and everything that is heard meanwhile."""
+"""An open bus: SDO to any node, LSS, NMT, and everything heard on the bus."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import RemoteOd
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""How long a heartbeat is waited for; nodes that beat more seldom are not known to be there by it."""
+"""Maximum wait for a heartbeat; a node with a longer period is not detected by it."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""How long the answer to a remote frame may take; a node, or a machine, that was busy is asked once more."""
+"""Maximum waits for the answer to a remote frame: a node or machine may be busy the first time."""
 
 _POLL_S: Final = 0.002
 
@@ -31,29 +31,36 @@ class State(NamedTuple):
     """NMT state of a node and how it is known."""
 
     state: int | None
-    """None where nobody knows."""
+    """NMT state; None if unknown."""
     how: str
-    """``heartbeat``, ``guarding``, or why it is not known."""
+    """``heartbeat``, ``guarding``, or why the state is unknown."""
 
     def __str__(self) -> str:
         return "unknown" if self.state is None else state_name(self.state)
 
 
 def no_answer(wrong: str) -> str:
-    """Return what is wrong with a node without a valid SDO answer, whose newest answer is ``wrong``."""
+    """Describe a node without a valid SDO answer; ``wrong``: its newest answer, empty for none."""
     if not wrong:
         return "does not answer SDO requests"
     return f"answers SDO requests with data that is no answer of CiA 301 (newest: {wrong})"
 
 
 class BusConnection:
-    """An open bus. Raises BusError where it does not open. Closed by :meth:`close` or a ``with`` block."""
+    """An open bus, closed by :meth:`close` or a ``with`` block.
+
+    Args:
+        bus: The bus.
+
+    Raises:
+        BusError: The bus does not open.
+    """
 
     def __init__(self, bus: BusConfig) -> None:
         self.bus = bus
         self.listener = BusListener()
         self.defect: SkinError | None = None
-        """A failure of this program on the mainline."""
+        """Error of this program on the thread that receives."""
         self._remotes: dict[int, RemoteOd] = {}
         self._abandoned = threading.Event()
         self.link = BusLink(bus, {}, self._on_defect)
@@ -63,18 +70,29 @@ class BusConnection:
         self._mainline = Mainline([self.link])
 
     def od(self, node_id: int) -> RemoteOd:
-        """The object dictionary of a node."""
+        """Return the object dictionary of a node."""
         if node_id not in self._remotes:
             remote = self._remotes[node_id] = self.link.remote_od(node_id)
             remote.abandoned = self._abandoned.is_set
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """Abort the transfers of all threads, which raise Abandoned."""
+        """Abort the transfers of all threads, which then raise Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:
-        """Whether ``condition`` comes true in that time. Raises BusError if the bus fails meanwhile."""
+        """Wait for a condition.
+
+        Args:
+            condition: Called repeatedly until true.
+            within_s: Maximum wait.
+
+        Returns:
+            Whether the condition became true.
+
+        Raises:
+            BusError: The bus failed meanwhile.
+        """
         end_s = time.monotonic() + within_s
         while not condition():
             if self.defect is not None:
@@ -87,7 +105,7 @@ class BusConnection:
         return True
 
     def ask_all(self, node_id: int, request: bytes, within_s: float) -> list[bytes]:
-        """Every SDO answer to one request: two where two nodes bear the node-ID."""
+        """Send one SDO request and return all answers: two if two nodes have the node-ID."""
         since_ns = time.monotonic_ns()
         self.link.send(od.sdo_request_cob_id(node_id), request.ljust(8, b"\0"))
         self.wait_until(lambda: False, within_s)
@@ -95,16 +113,28 @@ class BusConnection:
         return [data for t_ns, data in answers if t_ns >= since_ns]
 
     def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
-        """Ask the node for its device type, twice if need be. Raises NodeError, whose message ends with
-        ``more``, if there is no valid answer.
+        """Read the device type of a node, twice if need be.
+
+        Args:
+            node_id: The node.
+            more: Returns text for the end of the message.
+
+        Raises:
+            NodeError: There is no valid answer.
         """
         remote, since_ns = self.od(node_id), time.monotonic_ns()
         if not remote.answers() and not remote.answers():
             raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
 
     def wrong_answer(self, node_id: int, since_ns: int) -> str:
-        """Return the newest frame received after ``since_ns`` in place of an SDO answer, as hexadecimal text;
-        empty if there was none. For a node without a valid answer.
+        """Return the newest frame received instead of a valid SDO answer.
+
+        Args:
+            node_id: A node without a valid answer.
+            since_ns: Earliest time of the frame.
+
+        Returns:
+            Hexadecimal text; empty if there was no frame.
         """
         newest = self.listener.node(node_id).newest_sdo
         if newest is None or newest[0] < since_ns:
@@ -112,15 +142,17 @@ class BusConnection:
         return newest[1].hex(" ") or "no data"
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """How often the node beats by its 0x1017; 0 for never, None where it does not say."""
+        """Return the heartbeat period (0x1017), s; 0 if off, None if the node does not answer."""
         try:
             return float(self.od(node_id).read(od.HEARTBEAT_PRODUCER, 0, "u16")) * 1e-3
         except NodeError:
             return None
 
     def guarded(self, node_id: int) -> bool:
-        """Whether the node expects a master to guard it: a remote frame of ours would then start its clock,
-        and our going away be taken for the master's.
+        """Return whether a master guards the node.
+
+        A remote frame from here would then start the node's life guarding, and it would take our silence for
+        the loss of its master.
         """
         remote = self.od(node_id)
         try:
@@ -129,8 +161,13 @@ class BusConnection:
             return False
 
     def state(self, node_id: int, heartbeat_s: float | None, *, guarding: bool, since_ns: int = 0) -> State:
-        """NMT state by the next heartbeat after ``since_ns``, or by guarding where there is none and
-        ``guarding`` allows it. ``heartbeat_s`` as of :meth:`heartbeat_s`.
+        """Return the NMT state from the next heartbeat, or from guarding if there is none.
+
+        Args:
+            node_id: The node.
+            heartbeat_s: Result of :meth:`heartbeat_s`.
+            guarding: Whether remote frames are allowed.
+            since_ns: Earliest time of the heartbeat.
         """
         if heartbeat_s != 0:
             wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1
@@ -150,6 +187,7 @@ class BusConnection:
         return State(None, "no heartbeat, no guarding")
 
     def close(self) -> None:
+        """Close the bus and join its thread."""
         self._mainline.stop()
         self.link.close()
 

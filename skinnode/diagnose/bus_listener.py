@@ -1,6 +1,6 @@
-"""What is heard on a bus: who beats, who tells of errors, which COB-IDs are in use.
+"""Keeps what is heard on a bus: heartbeats, emergency messages, SDO answers, COB-IDs in use.
 
-Written by the mainline of one link, read by whoever asks: readers copy, for there are no locks.
+One thread writes; other threads read copies, because there are no locks.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Messages of a kind and node that are kept: more than half a minute of heartbeats four times a second."""
+"""Messages kept of each kind and node: over half a minute of heartbeats at 4 Hz."""
 
 
 class Beat(NamedTuple):
@@ -37,47 +37,47 @@ class Emergency(NamedTuple):
 
 @dataclass(slots=True)
 class NodeTraffic:
-    """What one node-ID was heard to say."""
+    """Messages heard from one node-ID."""
 
     beats: deque[Beat] = field(default_factory=lambda: deque(maxlen=_KEPT))
     boot_ups: int = 0
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """When, and the eight bytes."""
+    """Time and eight bytes of each answer."""
     newest_sdo: tuple[int, bytes] | None = None
-    """When the newest frame on the COB-ID of SDO answers was received, and its data, of any length."""
+    """Time and data, of any length, of the newest frame on the COB-ID of SDO answers."""
 
 
 class BusListener:
-    """Everything since construction. :meth:`on_frames` is for :meth:`skinnode.host.link.BusLink.listen`."""
+    """Messages heard since construction; a link calls :meth:`on_frames`."""
 
     def __init__(self) -> None:
         self._nodes: dict[int, NodeTraffic] = {}
         self.cob_ids: Counter[int] = Counter()
-        """Data frames with 11-bit identifiers."""
+        """Number of data frames by 11-bit COB-ID."""
         self.nmt: Counter[bytes] = Counter()
         """Count of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
     another length."""
         self.extended = self.remote = self.errors = 0
-        """Frames with 29-bit identifiers, remote frames, error frames."""
+        """Numbers of frames with 29-bit identifiers, of remote frames, of error frames."""
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:
-        """By node-ID, a copy."""
+        """Messages by node-ID; a copy."""
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
-        """Of one node-ID; empty if nothing was heard of it."""
+        """Return the messages of one node-ID; empty if nothing was heard."""
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
-        """The newest heartbeat or answer to guarding after ``since_ns``, None for none."""
+        """Return the newest heartbeat or guarding answer after ``since_ns``; None if there is none."""
         beats = self.node(node_id).beats
         newest = beats[-1] if beats else None
         return newest if newest is not None and newest.t_ns > since_ns else None
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
-        """Note a batch."""
+        """Note a batch of frames."""
         for frame in frames:
             if frame.error:
                 self.errors += 1

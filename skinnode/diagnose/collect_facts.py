@@ -1,5 +1,6 @@
-"""Gathers the facts of one bus. It listens and reads; unless told to be active it changes nothing, so that a
-hand that runs goes on as before.
+"""Collects the facts of one bus.
+
+It listens and reads. Unless ``active``, it changes nothing, so that a running hand continues undisturbed.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
-"""Scans that noise is judged from: a standard deviation is then known to a tenth."""
+"""Number of scans for an estimate of noise: its standard deviation is then known to a tenth."""
 
 LONGEST_S: Final = 15.0
-"""How long scans are waited for, however long the period."""
+"""Maximum wait for scans, whatever the period."""
 
 DEFAULT_NOISE: Final = 3e-6
-"""Of the converter, where no hand file tells."""
+"""Relative noise of the converter without a hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Before each time a node is asked: a host reads a baseline in 0.1 to 0.3 s."""
+"""Pauses before each attempt to read a node: a host reads a baseline in 0.1 to 0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -54,8 +55,14 @@ Answer = TypeVar("Answer")
 def collect_facts(
     bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
 ) -> BusFacts:
-    """Everything of one bus. ``active``: nodes that do not run are started, SYNC is sent where nobody does,
-    and they are pre-operational again at the end. A bus that fails is a fact, not an error.
+    """Collect all facts of one bus. A bus that fails is a fact, not an error.
+
+    Args:
+        bus: The bus.
+        hand: The hand; None without a hand file.
+        active: Whether to start nodes that do not run and send SYNC if no other node does; the nodes are
+            returned to PRE-OPERATIONAL at the end.
+        progress: Receives a text for each step.
     """
     facts = BusFacts(
         bus.name,
@@ -124,7 +131,15 @@ def _examine(
     period_s = facts.period_s or DEFAULT_PERIOD_MS * 1e-3
     if active:
         period_s = max([period_s, *(_scan_s(patch, profiles) for patch in asked)])
-    ours, load = _listen(connection, capture, asked, profiles, period_s, active, facts.name, progress)
+    ours, load = _listen(
+        connection,
+        capture,
+        asked,
+        profiles,
+        period_s,
+        active=active,
+        progress=lambda text: progress(f"{facts.name}: {text}"),
+    )
     stats = connection.link.stats()
     heard = connection.listener
     return replace(
@@ -152,8 +167,9 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """The answer, or why there is none. Asked anew where that fails: a host that runs may have asked the node
-    at the same time, and a server has room for one transfer.
+    """Return the answer, or why there is none, after several attempts.
+
+    A running host may access the node at the same time, and a server handles one transfer at a time.
     """
     failure = ""
     for pause_s in _PAUSES_S:
@@ -165,18 +181,20 @@ def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
     return None, failure
 
 
-def _listen(
+def _listen(  # noqa: PLR0913 - one call, the state of one examination
     connection: BusConnection,
     capture: ScanCapture,
     patches: Sequence[PatchFacts],
     profiles: dict[int, PatchProfile],
     period_s: float,
+    *,
     active: bool,
-    name: str,
-    progress: Progress,
+    progress: Callable[[str], None],
 ) -> tuple[bool, float]:
-    """Take scans of the patches that run, or that are made to; whether SYNC was ours, and the load of the bus
-    in the busiest second of it.
+    """Capture scans of the running patches; start the others if ``active``.
+
+    Returns:
+        Whether SYNC was sent from here, and the load of the bus in the busiest second.
     """
     overflows: dict[int, int] = {}
     for node_id, profile in profiles.items():
@@ -205,7 +223,7 @@ def _listen(
             due_s += period_s
             connection.wait_until(lambda: False, max(0.0, due_s - time.monotonic()))
             load = max(load, connection.link.stats().load)
-            progress(f"{name}: {min(map(capture.scans, running))} of {SCANS} scans")
+            progress(f"{min(map(capture.scans, running))} of {SCANS} scans")
         return ours, load
     finally:
         for node_id in start:
@@ -213,8 +231,10 @@ def _listen(
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
-    """Return the shortest SYNC period, s, at which a node that no host has configured finishes each scan
-    before the next; 0 for any other node. Bring-up sets an inhibit time that fits the hand's period.
+    """Return the shortest SYNC period, s, for a node that no host has configured; 0 for any other node.
+
+    A node with its default inhibit time needs it to finish each scan before the next; bring-up sets an
+    inhibit time that fits the hand's period.
     """
     profile = profiles.get(patch.node_id)
     if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
@@ -249,8 +269,10 @@ def _with_scans(
 
 
 def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
-    """Count NMT commands that a host of this hand does not send: it starts its patches one by one, and
-    commands them to pre-operational. A second host of the same hand is detected by its SYNCs.
+    """Count NMT commands that a host of this hand does not send.
+
+    A host starts its patches one by one, and commands them to PRE-OPERATIONAL. A second host of the same hand
+    is detected by its SYNCs.
     """
     return sum(
         count
@@ -262,9 +284,10 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 
 
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
-    """Count the frames of COB-IDs that neither the services, nor the nodes, nor ``others`` of the hand file
-    explain. COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the
-    device; those of a patch of the hand that does not answer come from a host that polls it.
+    """Count the frames of each COB-ID that neither services, nodes nor ``others`` of the hand file explain.
+
+    COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the device;
+    those of a patch that does not answer come from a host that polls it.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}
@@ -272,7 +295,7 @@ def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> d
 
 
 def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
-    """State and bit rate of a kernel interface, as `ip` tells; None where it does not, or there is none."""
+    """Return state and bit rate of a kernel interface from ``ip``; None if unknown."""
     if bus.interface != "socketcan":
         return None, None
     try:

@@ -1,4 +1,9 @@
-"""What a node's object dictionary looks like: of a patch of ours by its identity, of others by a file."""
+"""The electronic data sheet of a node: generated for a patch, read from a file for another device.
+
+The reader is that of the conformance suite: it preserves defaults as written, which the canopen library does
+not.
+The host's check of a patch's EDS uses the library, as an independent reader.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,7 @@ class DataSheet(NamedTuple):
 
     eds: Eds
     text: str
-    """See :class:`~skinnode.canopen.eds_encoding.EdsText`."""
+    """Content; see :class:`~skinnode.canopen.eds_encoding.EdsText`."""
     codec: str = "utf-8"
     """Codec of its non-ASCII characters."""
     note: str = ""
@@ -26,7 +31,7 @@ class DataSheet(NamedTuple):
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
-    """The sizes of a patch of ours, None for another device. Raises NodeError where it does not answer."""
+    """Return the sizes of a patch; None for another device. Raises NodeError if the node does not answer."""
     try:
         identity = [remote.read(od.IDENTITY, sub, "u32") for sub in (od.IDENTITY_VENDOR, od.IDENTITY_PRODUCT)]
         if identity != [od.VENDOR_ID, od.PRODUCT_CODE]:
@@ -41,13 +46,26 @@ def read_profile(remote: RemoteOd) -> PatchProfile | None:
 
 
 def load_data_sheet(path: Path) -> DataSheet:
-    """An EDS or DCF. Raises ConfigError for a file that cannot be read, ProfileError for one that is none."""
+    """Read an EDS or DCF.
+
+    Raises:
+        ConfigError: The file cannot be read.
+        ProfileError: The file is neither.
+    """
     eds, read = parse_eds_file(path)
     return DataSheet(eds, read.text, read.codec, f"{path} {read.note}" if read.note else "")
 
 
 def data_sheet_of(remote: RemoteOd, path: Path | None) -> DataSheet:
-    """That of the file, or of a patch of ours. Raises ProfileError for another device without a file."""
+    """Return the data sheet of a node.
+
+    Args:
+        remote: The node.
+        path: Its EDS; a patch needs none.
+
+    Raises:
+        ProfileError: Another device, without a file.
+    """
     if path is not None:
         return load_data_sheet(path)
     profile = read_profile(remote)

@@ -46,10 +46,17 @@ class Dcf(NamedTuple):
 
 
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
-    """Return the DCF of a device: its EDS with the value of each writable object and device commissioning.
+    """Return the DCF of a device: its EDS with the value of each writable object, and device commissioning.
 
     The file is UTF-8, whatever the encoding of the EDS; a string that UTF-8 would change is written byte by
     byte.
+
+    Args:
+        sheet: The EDS.
+        readings: Values of the node.
+        node_id: Its node-ID.
+        bitrate_bps: Bit rate of the bus.
+        name: Name of the node.
     """
     parser = _parser(sheet.text)
     sections = {title.lower(): title for title in parser.sections()}
@@ -120,8 +127,9 @@ def _is_configuration(reading: Reading) -> bool:
 
 
 def _standard_form(reading: Reading, data: bytes) -> str | None:
-    """Return the value in the form of CiA 306: numbers in hexadecimal, reals as their bit pattern, as
-    conforming tools expect. Returns None if no form of the standard preserves these bytes.
+    """Return the value in the form of CiA 306; None if no form preserves its bytes.
+
+    Numbers are hexadecimal, reals their bit pattern, as conforming tools expect.
     """
     if reading.data_type in _STRINGS:
         return _plain(data, _STRINGS[reading.data_type])

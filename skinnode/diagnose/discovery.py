@@ -1,6 +1,7 @@
-"""Who is on a bus: every node-ID is asked at once, what beats is heard meanwhile, LSS finds the rest.
+"""Finds the nodes on a bus, by SDO, by heartbeats and by LSS.
 
-Nothing is written but LSS switches, which concern nodes without a node-ID alone.
+Every node-ID is asked for its device type; heartbeats are heard meanwhile; LSS finds nodes without a node-ID.
+Nothing is written except LSS mode switches, which concern only nodes without a node-ID.
 """
 
 from __future__ import annotations
@@ -19,22 +20,22 @@ from skinnode.errors import NodeError
 from skinnode.text.printable import printable
 
 PACE_S: Final = 0.001
-"""Between two questions: a sixth of a bus at 1 Mbit/s, so that PDOs under way are not held up."""
+"""Interval of requests: a sixth of a bus at 1 Mbit/s, so that PDOs are not delayed."""
 
 ANSWER_S: Final = 0.12
-"""How long after the last question of a sweep answers may come."""
+"""Wait for answers after the last request of a sweep."""
 
 SWEEPS: Final = 2
-"""A node that was busy with the first question hears a second one."""
+"""Number of sweeps: a node that was busy gets a second request."""
 
 LISTEN_S: Final = 1.2
-"""How long heartbeats are heard at least: of nodes that are stopped there is nothing else."""
+"""Minimum time of listening: stopped nodes send nothing but heartbeats."""
 
 LSS_S: Final = 1.5
-"""Nodes without a node-ID are counted for this long; what is left is told as more."""
+"""Maximum time for finding nodes without a node-ID; the rest is reported as "more"."""
 
 OTHERS_S: Final = 1.0
-"""How long another client's SDO transfers are waited for at most."""
+"""Maximum wait for other SDO clients."""
 
 _QUIET_S: Final = 0.1
 _THREADS: Final = 16
@@ -44,31 +45,31 @@ _ASK_SERIAL: Final = upload_request(od.IDENTITY, od.IDENTITY_SERIAL)
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """A node-ID that was heard. What the node does not have, or did not answer, is None."""
+    """A node-ID that was heard. Figures are None if the node lacks them or did not answer."""
 
     node_id: int
     answers: bool
-    """By SDO; a stopped node does not."""
+    """Whether it answers SDO; a stopped node does not."""
     state: str
     state_known_by: str
-    """Or why it is not known."""
+    """How the state is known, or why not."""
     name: str | None
-    """0x1008."""
+    """Device name (0x1008)."""
     device_type: int | None
-    """0x1000: the number of the device profile in the lower half."""
+    """Device type (0x1000); the lower half is the number of the device profile."""
     error_register: int | None
-    """0x1001."""
+    """Error register (0x1001)."""
     vendor_id: int | None
     product_code: int | None
     revision: int | None
     serial: int | None
     heartbeat_ms: int | None
     boot_ups: int
-    """Heard during the survey."""
+    """Boot-up messages heard meanwhile."""
     duplicate: str
-    """What speaks for two nodes with this node-ID; empty for nothing."""
+    """Evidence for two nodes with this node-ID; empty if there is none."""
     wrong_answer: str = ""
-    """Newest frame in place of an SDO answer, as hexadecimal text, if none of its answers was valid."""
+    """Newest frame instead of an SDO answer, as hexadecimal text, if no answer was valid."""
 
     @property
     def profile(self) -> str:
@@ -89,29 +90,37 @@ class FoundNode:
 
     @property
     def is_patch(self) -> bool:
-        """Whether it is one of ours by vendor and product."""
+        """Whether vendor and product are those of a patch."""
         return (self.vendor_id, self.product_code) == (od.VENDOR_ID, od.PRODUCT_CODE)
 
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """What was found."""
+    """The nodes found."""
 
     nodes: tuple[FoundNode, ...]
-    """By ascending node-ID."""
+    """In ascending order of node-IDs."""
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
-    """There are others that time did not allow to tell apart."""
+    """Whether there are further nodes without a node-ID."""
     seconds: float
 
 
 def discover(connection: BusConnection, progress: Callable[[str], None] = lambda _: None) -> Discovery:
-    """Find everybody. ``progress`` is told what is being done. Raises BusError."""
+    """Find all nodes on a bus.
+
+    Args:
+        connection: The bus.
+        progress: Receives a text for each step.
+
+    Raises:
+        BusError: The bus failed.
+    """
     begun_s = time.monotonic()
     _let_others_finish(connection)
     asked_ns = time.monotonic_ns()
-    with ThreadPoolExecutor(_THREADS, thread_name_prefix="survey") as pool:
+    with ThreadPoolExecutor(_THREADS, thread_name_prefix="discovery") as pool:
         try:
             lss = pool.submit(find_unconfigured, connection)
             progress("asking node-IDs 1 to 127")
@@ -121,7 +130,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
             unconfigured, more = lss.result()
-        except BaseException:  # Ctrl-C too: the threads of the pool would go on
+        except BaseException:  # also at Ctrl-C: the threads of the pool must end
             connection.abandon()
             raise
     heard = connection.listener.nodes
@@ -131,8 +140,9 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
 
 def _let_others_finish(connection: BusConnection) -> None:
-    """Wait while another client's SDO transfers are under way: a question of ours would abort them. A host
-    has some at bring-up, and none while it runs.
+    """Wait while another client's SDO transfers are under way: a request would abort them.
+
+    A host transfers at bring-up, and not while it runs.
     """
     end_s = time.monotonic() + OTHERS_S
     while time.monotonic() < end_s:
@@ -148,8 +158,9 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Nodes without a node-ID, and whether there are more than time allowed to find. They wait again at the
-    end.
+    """Return nodes without a node-ID, and whether there are more than time allowed to find.
+
+    The nodes return to LSS waiting mode.
     """
     found: list[LssAddress] = []
     end_s = time.monotonic() + LSS_S
@@ -167,7 +178,7 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
 
 
 def _sweep(connection: BusConnection) -> dict[int, int]:
-    """Node-IDs that answer, and the most answers that one question got."""
+    """Return the node-IDs that answer, with the number of answers to one request."""
     answers: dict[int, int] = {}
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()
@@ -214,7 +225,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
 
 
 def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> FoundNode | None:
-    """A node-ID that sends heartbeats and no valid SDO answer, asked from ``asked_ns`` on."""
+    """Return a node with heartbeats but without a valid SDO answer; None if it has no heartbeats."""
     beat = connection.listener.newest_beat(node_id)
     if beat is None:
         return None
@@ -236,7 +247,7 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 
 
 def _two_serials(connection: BusConnection, node_id: int) -> str:
-    """What speaks for two nodes; empty where the second answer was a late one to the sweep before."""
+    """Return evidence for two nodes; empty if the second answer was a late one to an earlier request."""
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
     if len(answers) < 2:

@@ -1,4 +1,4 @@
-"""What the doctor knows, as plain data: the checks see nothing else."""
+"""The facts of a bus and its patches, as plain data: the checks see nothing else."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ Counts = NDArray[np.int64]
 
 
 class Sure(StrEnum):
-    """How sure a finding is."""
+    """Certainty of a finding."""
 
     CERTAIN = "certain"
-    """A node or a counter says so."""
+    """A node or a counter reports it."""
     LIKELY = "likely"
-    """The figures have hardly another cause."""
+    """The figures hardly have another cause."""
     POSSIBLE = "possible"
-    """It may be as it should be: somebody has to look."""
+    """It may be intended; a person must look."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is wrong."""
+    """One fault."""
 
     area: str
-    """bus, nodes, configuration, wires, baseline, timing or losses"""
+    """Area: bus, nodes, configuration, wires, baseline, timing or losses."""
     where: str
     what: str
     sure: Sure
@@ -46,52 +46,53 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFacts:
-    """Scans of one patch as they came, T of them, U upper and K lower wires."""
+    """Captured scans of one patch: T scans, U upper wires, K lower wires."""
 
     ratio: Float
-    """(T, U, K) R/R0, NaN where there was no measurement."""
+    """(T, U, K) R/R0; NaN where there is no measurement."""
     n_open: Counts
     n_short: Counts
     n_over: Counts
-    """(U, K) scans in which a crossing was open, shorted, out of range."""
+    """(U, K) number of scans in which a crossing was open, shorted, out of range."""
     t_s: Float
-    """(T,) when the last frame came, since the first scan."""
+    """(T,) time of the last frame since the first scan, s."""
     latency_s: Float
-    """(T,) from SYNC to the last frame, NaN where no SYNC was heard."""
+    """(T,) time from SYNC to the last frame, s; NaN if no SYNC was heard."""
     device_us: Counts
-    """(T,) the node's clock, -1 where the summary was lost."""
+    """(T,) clock of the node, µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
     """(T,)"""
     step: float
-    """A code as a share of R0."""
+    """One code as a share of R0."""
     told_noise: float
-    """Relative, of the converter, as the hand file says."""
+    """Relative noise of the converter in the hand file."""
     stats: AssemblerStats
 
     @property
     def scans(self) -> int:
+        """Number of scans."""
         return len(self.ratio)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchFacts:
-    """One patch: what is wanted of it and what is there. None where it is not known."""
+    """One patch: its configuration and what was found; None if unknown."""
 
     name: str
     node_id: int
     wanted: PatchConfig | None = None
     layout_hash: int | None = None
-    """The one that the hand file asks for."""
+    """Layout hash of the hand file."""
     inhibit_100us: int | None = None
     """Inhibit time that the host sets; None if it configures no node of this bus."""
     eds_problem: str = ""
-    """Why the EDS of the hand file is not that of the patch; empty where it is, or where none is given."""
+    """Why the EDS of the hand file is not that of the patch; empty if it is, or none is given."""
     found: FoundNode | None = None
     info: NodeInfo | None = None
     failure: str = ""
-    """Why there is no ``info`` of a node that was found."""
+    """Why ``info`` is missing although the node was found."""
     boot_ups: int = 0
-    """Heard while listening."""
+    """Boot-up messages heard while listening."""
     emergencies: tuple[Emergency, ...] = ()
     scans: ScanFacts | None = None
 
@@ -105,49 +106,48 @@ class BusFacts:
     channel: str
     bitrate_bps: int
     failure: str = ""
-    """Why it does not open, or failed; empty where it is well."""
+    """Why the bus does not open, or failed; empty if it works."""
     link_state: str | None = None
-    """Of the controller, as the kernel tells (ERROR-ACTIVE …)."""
+    """State of the controller in the kernel (ERROR-ACTIVE …)."""
     link_bitrate_bps: int | None = None
     seconds: float = 0.0
-    """How long was listened."""
+    """Time of listening."""
     frames: int = 0
     load: float = 0.0
-    """Share of the bus that frames took, in the busiest second in which scans were waited for; in the last
-    one where none could come."""
+    """Share of the bus taken by frames, in the busiest second of scans; without scans, in the last second."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0
     foreign: Mapping[int, int] = field(default_factory=dict)
-    """Frames by COB-ID that nothing explains."""
+    """Number of unexplained frames by COB-ID."""
     unconfigured: tuple[LssAddress, ...] = ()
     strangers: tuple[FoundNode, ...] = ()
-    """Nodes that are not in the hand."""
+    """Nodes that are not in the hand file."""
     period_s: float | None = None
-    """Of SYNC, as the hand file says."""
+    """SYNC period in the hand file."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
-    """When SYNCs were heard; not our own."""
+    """Times of SYNCs heard, s; empty if the doctor sends them."""
     sync_counters: tuple[int, ...] = ()
-    """As they came with them; 0 where there was none."""
+    """Their counters; 0 if a SYNC has none."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """Period of our own SYNC; 0 if another node sends it. Longer than ``period_s`` if a node that no host has
-    configured needs longer for a scan."""
+    """Period of the doctor's own SYNC; 0 if another node sends it. Longer than ``period_s`` if a node that
+    no host has configured needs longer for a scan."""
     active: bool = False
-    """Whether nodes that do not run were to be started."""
+    """Whether nodes that did not run were to be started."""
     role: str = "master"
-    """Of the host on this bus, as the hand file says."""
+    """Role of the host on this bus in the hand file."""
     nmt_commands: int = 0
     """NMT commands heard that a host of this hand does not send."""
     master_node_id: int | None = None
-    """With which the host beats, as the hand file says."""
+    """Node-ID of the host's heartbeat in the hand file."""
     master_beats_s: Float | None = None
-    """When that was heard."""
+    """Times at which that heartbeat was heard, s."""
     heartbeat_ms: int | None = None
-    """As the hand file wants it."""
+    """Heartbeat period in the hand file."""
     patches: tuple[PatchFacts, ...] = ()
 
     @property
     def running(self) -> bool:
-        """Whether somebody runs the hand."""
+        """Whether a host runs the hand."""
         return any(patch.found is not None and patch.found.state == "operational" for patch in self.patches)

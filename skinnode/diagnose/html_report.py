@@ -1,4 +1,4 @@
-"""The doctor's report as one HTML file that needs nothing else: findings, and plots as inline SVG."""
+"""Writes the doctor's report as one self-contained HTML file: findings, figures, and plots as inline SVG."""
 
 from __future__ import annotations
 
@@ -31,7 +31,13 @@ svg { max-width: 100%; height: auto; margin-top: 1.2rem }
 
 
 def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> str:
-    """The report. Needs matplotlib where there are scans."""
+    """Return the report. Needs matplotlib if there are scans.
+
+    Args:
+        buses: Facts of each bus.
+        groups: Findings by root cause.
+        title: Name of the hand, or of the bus.
+    """
     when = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
     parts = [
         f"<h1>{escaped(title)}: {counted(len(groups), 'finding')}</h1>",
@@ -64,11 +70,11 @@ def _finding(finding: Finding, below: str = "") -> str:
 def _bus(bus: BusFacts) -> str:
     rows = [
         ("interface", f"{bus.interface} {bus.channel}, {bus.bitrate_bps} bit/s"),
-        ("controller", bus.link_state or "not told"),
+        ("controller", bus.link_state or "not reported"),
         ("heard", f"{bus.frames} frames in {bus.seconds:.1f} s, load {bus.load:.0%}"),
         ("error frames", bus.error_frames),
         ("dropped by this machine", bus.dropped),
-        ("SYNC", "our own" if bus.sync_ours else f"{len(bus.sync_s)} heard"),
+        ("SYNC", "sent by the doctor" if bus.sync_ours else f"{len(bus.sync_s)} heard"),
     ]
     return f"<h2>Bus {escaped(bus.name)}</h2>{_table(rows)}"
 
@@ -99,7 +105,7 @@ def _table(rows: Sequence[tuple[str, object]]) -> str:
 
 
 def _maps(scans: ScanFacts) -> str:
-    """Noise over what is told, and R/R0, crossing by crossing."""
+    """Draw maps of noise and of R/R0."""
     analysis = analyse_noise(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
     title = "noise / stated noise, grey: none" + (
@@ -113,19 +119,19 @@ def _maps(scans: ScanFacts) -> str:
     return _svg(figure)
 
 
-def _map(
+def _map(  # noqa: PLR0913 - one image
     figure: Any, axes: Any, values: Float, title: str, colours: str, low: float, high: float | None
 ) -> None:
-    axes.set_facecolor("#888")  # where there is no value
+    axes.set_facecolor("#888")  # colour of crossings without a value
     image = axes.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
     axes.set(title=title, xlabel="lower wire", ylabel="upper wire")
     figure.colorbar(image, ax=axes, pad=0.01)
 
 
 def _timeline(scans: ScanFacts) -> str:
-    """When each scan came after its SYNC, and which had holes."""
+    """Draw the time of each scan after its SYNC, and mark incomplete scans."""
     figure, (axes,) = _figure(1, 1, height_in=2.6)
-    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # of a scan with holes: no last frame
+    late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # an incomplete scan has no last frame
     if np.isfinite(late_ms).any():
         axes.plot(scans.t_s, late_ms, ".-", color="#2b6cb0", lw=0.8, label="last frame after SYNC, ms")
         axes.set_ylabel("ms after SYNC")

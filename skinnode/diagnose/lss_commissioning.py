@@ -1,4 +1,4 @@
-"""A node gets its node-ID and its bit rate by LSS."""
+"""Gives a node its node-ID and bit rate by LSS (CiA 305)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
 
 BOOT_S: Final = 5.0
-"""How long a node may take to boot at its new node-ID."""
+"""Maximum boot time at the new node-ID."""
 
 _ASKED_S: Final = 0.15
 _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
@@ -25,23 +25,23 @@ _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
 
 @dataclass(frozen=True, slots=True)
 class Commissioned:
-    """What was done."""
+    """Result of a commissioning."""
 
     address: LssAddress
     node_id_before: int | None
-    """None for a node that had none."""
+    """Node-ID before; None if it had none."""
     node_id: int | None
-    """The new one; None where it stays."""
+    """New node-ID; None if unchanged."""
     bitrate_bps: int | None
-    """From the next power-on on; None where it stays."""
+    """New bit rate, valid from the next power-on; None if unchanged."""
     stored: bool
     booted: bool
-    """At the new node-ID; also True where that stays."""
+    """Whether the node booted at the new node-ID, or kept its node-ID."""
     faults: tuple[str, ...]
 
 
 def only_unconfigured(connection: BusConnection) -> LssAddress:
-    """The one node that has no node-ID. Raises ConfigError where there is none, or several."""
+    """Return the only node without a node-ID. Raises ConfigError if there is none, or several."""
     found, more = find_unconfigured(connection)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
@@ -52,48 +52,74 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
     return found[0]
 
 
+@dataclass(frozen=True, slots=True)
+class Commissioning:
+    """What to set in a node."""
+
+    node_id: int | None
+    """New node-ID; None to keep it."""
+    bitrate_bps: int | None
+    """New bit rate; None to keep it."""
+    store: bool
+    """Whether to store both, so that they survive power-off."""
+
+
 def commission(
     connection: BusConnection,
     address: LssAddress,
-    *,
-    node_id: int | None,
-    bitrate_bps: int | None,
-    store: bool,
+    wanted: Commissioning,
     agreed: Callable[[int | None], bool],
 ) -> Commissioned | None:
-    """Set what is given; ``agreed`` is told the present node-ID before anything is written, and None is
-    returned where it says no. Raises ConfigError for a node-ID that is taken or a node that is not there,
-    LssFailed where it refuses.
+    """Set node-ID, bit rate or both.
+
+    Args:
+        connection: The bus.
+        address: The node.
+        wanted: What to set.
+        agreed: Called with the present node-ID before anything is written; False ends the commissioning.
+
+    Returns:
+        The result; None if ``agreed`` returned False.
+
+    Raises:
+        ConfigError: The node-ID is taken, or there is no such node.
+        LssFailed: The node refuses.
     """
+    node_id = wanted.node_id
     if node_id is not None and connection.ask_all(node_id, _ASK_DEVICE_TYPE, _ASKED_S):
         raise ConfigError("--node-id", node_id, "one that no other node has")
     if not connection.lss.select(address):
         raise ConfigError("--serial", address.serial_number, "the serial number of a node on this bus")
-    faults: list[str] = []
-    stored = False
     boot_ups = 0 if node_id is None else connection.listener.node(node_id).boot_ups
     try:
         before = connection.lss.node_id()
         if not agreed(before):
             return None
-        if bitrate_bps is not None:
-            connection.lss.set_bit_rate(bitrate_bps)
-        if node_id is not None:
-            connection.lss.set_node_id(node_id)
-        if store:
-            try:
-                connection.lss.store()
-                stored = True
-            except LssFailed as error:
-                faults.append(f"not stored, so lost at power-off: {error}")
-    finally:  # a node without a node-ID boots when it is let go
+        fault = _configure(connection, wanted)
+    finally:  # a node without a node-ID boots when it is released
         connection.lss.release()
+    faults = [fault] if fault else []
     booted = True
     if node_id is not None and node_id != before:
         if before is not None:
-            time.sleep(0.01)  # the switch to waiting comes first
+            time.sleep(0.01)  # the node switches to waiting mode first
             connection.link.send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, before))
         booted = connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > boot_ups, BOOT_S)
         if not booted:
             faults.append(f"no boot-up message of node {node_id} within {BOOT_S:g} s")
-    return Commissioned(address, before, node_id, bitrate_bps, stored, booted, tuple(faults))
+    stored = wanted.store and not fault
+    return Commissioned(address, before, node_id, wanted.bitrate_bps, stored, booted, tuple(faults))
+
+
+def _configure(connection: BusConnection, wanted: Commissioning) -> str:
+    """Set and store; return why storing failed, empty if it did not."""
+    if wanted.bitrate_bps is not None:
+        connection.lss.set_bit_rate(wanted.bitrate_bps)
+    if wanted.node_id is not None:
+        connection.lss.set_node_id(wanted.node_id)
+    if wanted.store:
+        try:
+            connection.lss.store()
+        except LssFailed as error:
+            return f"not stored, so lost at power-off: {error}"
+    return ""

@@ -1,4 +1,4 @@
-"""NMT commands (CiA 301, 7.2.8) whose effect is looked at."""
+"""Sends NMT commands (CiA 301, 7.2.8) and observes their effect."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, s
 from skinnode.diagnose.bus_connection import BusConnection, State
 
 FOLLOW_S: Final = 1.5
-"""How long a node may take to say that it is in its new state, beyond its heartbeat period."""
+"""Maximum time, besides its heartbeat period, for a node to report its new state."""
 
 BOOT_S: Final = 5.0
-"""How long a node may take to boot."""
+"""Maximum boot time of a node."""
 
 _GUARD_EACH_S: Final = 0.1
 
 
 class Command(StrEnum):
-    """What a node is told."""
+    """An NMT command."""
 
     START = "start"
     STOP = "stop"
@@ -32,6 +32,7 @@ class Command(StrEnum):
 
     @property
     def resets(self) -> bool:
+        """Whether the command resets the node."""
         return self in (Command.RESET_NODE, Command.RESET_COMMUNICATION)
 
 
@@ -46,19 +47,19 @@ _SPECIFIERS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What became of a command at one node."""
+    """Effect of a command on one node."""
 
     node_id: int
     before: str
     after: str
     followed: bool
     known_by: str
-    """How the state after is known, or why the node counts as not following."""
+    """How the new state is known, or why the node counts as not following."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Watch:
-    """How the state of a node can be known."""
+    """What is known of a node before a command."""
 
     node_id: int
     heartbeat_s: float | None
@@ -70,8 +71,16 @@ class _Watch:
 def command_nodes(
     connection: BusConnection, node_ids: Sequence[int], command: Command, *, at_once: bool
 ) -> list[Change]:
-    """Command these nodes, ``at_once`` by one message to all nodes of the bus, else one after the other, and
-    see what they do. Raises BusError.
+    """Command nodes and observe what they do.
+
+    Args:
+        connection: The bus.
+        node_ids: The nodes.
+        command: The command.
+        at_once: Whether to send one message to all nodes of the bus instead of one to each.
+
+    Raises:
+        BusError: The bus failed.
     """
     watches = [_watch(connection, node_id) for node_id in node_ids]
     sent_ns = time.monotonic_ns()
@@ -83,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """What can only be asked beforehand: a stopped node does not answer."""
+    """Read what a stopped node would not answer any more."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)
@@ -91,7 +100,7 @@ def _watch(connection: BusConnection, node_id: int) -> _Watch:
 
 
 def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
-    """Whether the node says that it is in the state it was told to enter."""
+    """Return whether the node reports the commanded state."""
     wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
     end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:
@@ -106,7 +115,7 @@ def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_n
 
 
 def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
-    """Whether the node booted, and the state in which it then is."""
+    """Return whether the node booted, and its state then."""
     node_id = watch.node_id
     if not connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > watch.boot_ups, BOOT_S):
         why = f"no boot-up message within {BOOT_S:g} s"
@@ -114,7 +123,7 @@ def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
         after = "silent" if now is None else state_name(now.state)
         return Change(node_id, str(watch.before), after, False, why)
     booted_ns = time.monotonic_ns()
-    heartbeat_s = connection.heartbeat_s(node_id)  # it may have been reset, too
+    heartbeat_s = connection.heartbeat_s(node_id)  # the reset may have changed it
     guarding = not connection.guarded(node_id)
     now_in = connection.state(node_id, heartbeat_s, guarding=guarding, since_ns=booted_ns)
     how = "boot-up message" + (f", {now_in.how}" if now_in.state is not None else "")

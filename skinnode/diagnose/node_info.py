@@ -1,4 +1,4 @@
-"""Everything that a technician wants to know of one node, read from it. Nothing is written."""
+"""Reads everything about one node. Nothing is written."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class PatchInfo:
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """One node. What it does not have is None."""
+    """What is known of a node; None for what it lacks."""
 
     node_id: int
     state: str
@@ -76,7 +76,7 @@ class NodeInfo:
     serial: int | None
     error_register: int | None
     errors: tuple[str, ...]
-    """History, the newest first."""
+    """Error history, the newest first."""
     heartbeat_ms: int | None
     heartbeats_watched: tuple[str, ...]
     guarding: str
@@ -89,7 +89,7 @@ class NodeInfo:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What is wrong with the node, as it says itself."""
+        """Faults that the node reports itself."""
         found = [f"error register: {register_text(self.error_register)}"] if self.error_register else []
         if self.patch is not None:
             if self.patch.baseline_missing:
@@ -106,7 +106,7 @@ class NodeInfo:
 
 
 class _Reader:
-    """Optional objects of a node."""
+    """Reads optional objects of a node."""
 
     def __init__(self, remote: RemoteOd) -> None:
         self.remote = remote
@@ -131,8 +131,15 @@ class _Reader:
 
 
 def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None) -> NodeInfo:
-    """Ask the node everything. ``sheet`` names the objects of a device other than a patch. Raises
-    NodeError where it does not answer.
+    """Read everything about a node.
+
+    Args:
+        connection: The bus.
+        node_id: The node.
+        sheet: Names of the objects of a device that is not a patch.
+
+    Raises:
+        NodeError: The node does not answer.
     """
     remote = connection.od(node_id)
 
@@ -143,7 +150,7 @@ def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None)
     read = _Reader(remote)
     try:
         profile = read_profile(remote)
-    except SdoAbort:  # a node without an identity, or of ours without a descriptor
+    except SdoAbort:  # a node without an identity, or a patch without a descriptor
         profile = None
     if profile is not None and sheet is None:
         sheet = parse_eds(eds_text(profile), "profile")
@@ -266,7 +273,7 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
-    """(U, K) R0 in ohm, 0 where there is none. Raises NodeError."""
+    """Return the (U, K) baseline R0, ohm; 0 if there is none. Raises NodeError."""
     data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
         raise NodeError(
@@ -277,7 +284,7 @@ def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
 
 
 def _masks(read: _Reader, index: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Open and shorted wires in the words of 0x2030 or 0x2031."""
+    """Return the open and the shorted wires of 0x2030 or 0x2031."""
     wires: tuple[list[int], list[int]] = ([], [])
     for sub in range(1, (read.number(index) or 0) + 1):
         word, first = read.number(index, sub) or 0, (sub - 1) // 2 * 32

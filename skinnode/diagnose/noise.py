@@ -1,11 +1,11 @@
-"""Noise of each crossing and wire, told apart from touch. Pure functions.
+"""Estimates the noise of each crossing and wire, even while the skin is touched. Pure functions.
 
-Noise is taken from second differences of successive scans (their variance is 6 σ²), which a slow touch
-leaves alone, and from what the other wires leave unexplained, which a quick one leaves alone: a touch moves
-crossings of many wires by a few functions of time, noise has one of its own for each. Both are at least the
-noise, so the smaller counts. Of a touch that is quick, deep and small even that leaves something; so on skin
-that is touched a wire is judged by its smallest singular values, which touch hardly reaches, against those
-of its neighbours, and the patch by its own.
+There are two estimates. Second differences of successive scans (variance 6 σ²) are insensitive to a slow
+touch. The residual of a crossing after projection on the other wires is insensitive to a quick one: a touch
+moves crossings of many wires by a few functions of time, noise has a function of its own for each crossing.
+Both are upper bounds of the noise, so the smaller counts. A quick, deep and small touch leaves a rest in
+both. On touched skin a wire is therefore judged by its smallest singular values, which a touch hardly
+reaches, compared with those of its neighbours, and the patch by its own.
 """
 
 from __future__ import annotations
@@ -21,66 +21,68 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""A standard deviation of fewer is known to worse than a quarter."""
+"""Minimum scans: the standard deviation of fewer is known to worse than a quarter."""
 
 _MOST_SCANS: Final = 64
-"""More are not looked at: the newest are enough, and time grows with their square."""
+"""Maximum scans used, the newest: computing time grows with their square."""
 
 _FLOOR: Final = 8
-"""Smallest singular values of a patch that are its floor: what they tell of noise is known to a fifth."""
+"""Number of singular values that form the floor of a patch; their noise level is known to a fifth."""
 
 _MOVED: Final = 6.0
-"""Times the noise told; a crossing that moved by less is not said to be touched."""
+"""Minimum motion of a touched crossing, in units of the stated noise."""
 _EXPLAINED: Final = 2.0
-"""How much larger the motion of a crossing is, if touched, than what other wires leave of it unexplained. Of
-noise with 25 degrees of freedom one in a million looks like that."""
+"""Minimum ratio of the motion of a touched crossing to its unexplained rest. Noise with 25 degrees of
+freedom exceeds it once in a million."""
 _TOUCHED: Final = 2
-"""Crossings that have to move together before the skin counts as touched: a loose contact moves one."""
+"""Minimum crossings that move together on touched skin: a loose contact moves one."""
 _STEP: Final = 20.0
-"""Least height of a jump, in units of the noise told."""
+"""Minimum height of a jump, in units of the stated noise."""
 _STAYS: Final = 0.3
-"""Share of a jump by which the medians before and after may differ from it."""
+"""Maximum difference between a jump and the change of the median, as a share of the jump."""
 _STILL: Final = 0.1
-"""Most deviation of a crossing beside its jump, as a share of that."""
+"""Maximum standard deviation of a crossing besides its jump, as a share of the jump."""
 _EVEN: Final = 0.2
-"""Most noise of a crossing beside what all have in common, as a share of that, where the supply is noisy."""
+"""Maximum noise of a crossing besides the common noise, as a share of the common noise, if the supply is
+noisy."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseAnalysis:
-    """Crossing by crossing (U, K), where nothing else is said."""
+    """Noise of a patch; arrays are (U, K), one value for each crossing, unless stated otherwise."""
 
     noise: Float
-    """Relative to R0, what touch left of it in; NaN where it could not be had."""
+    """Noise relative to R0, with the rest that a touch leaves; NaN if unknown."""
     told: Float
-    """What converter and codes explain."""
+    """Noise that converter and codes explain."""
     level: Float
     """Median R/R0."""
     touched: Mask
-    """Moved, and by what moved others too."""
+    """Whether the crossing moved together with others."""
     steps: Mask
-    """Stayed where it was but for one jump of its own."""
+    """Whether the crossing was constant except for one jump of its own."""
     step_at: Counts
     step_by: Float
     upper: Float
-    """(U,) noise of each upper wire over what is told, touch left out as far as can be."""
+    """(U,) noise of each upper wire divided by the stated noise, without the effect of touch as far as
+    possible."""
     lower: Float
-    """(K,)"""
+    """(K,) the same for each lower wire."""
     floor: float
-    """The same of all crossings together."""
+    """The same for all crossings together."""
     supply: float
-    """Noise that all crossings have in common over what is told; 0 where they differ."""
+    """Noise common to all crossings divided by the stated noise; 0 if they differ."""
 
     @property
     def is_touched(self) -> bool:
-        """Whether something moved on the skin."""
+        """Whether something touched the skin."""
         return int(self.touched.sum()) >= _TOUCHED
 
 
 def analyse_noise(scans: ScanFacts) -> NoiseAnalysis:
-    """Figures of each crossing over all scans. Needs LEAST_SCANS."""
+    """Analyse the noise of at least LEAST_SCANS scans."""
     ratio = scans.ratio[scans.complete] if scans.complete.sum() >= LEAST_SCANS else scans.ratio
     ratio = ratio[-_MOST_SCANS:]
     known: Mask = np.asarray(np.isfinite(ratio).all(axis=0))
@@ -117,8 +119,10 @@ def _roughness(series: Float) -> Float:
 
 
 def _unexplained(moved: Float) -> Float:
-    """(U, K) deviation that is left of each crossing without the leading half of the functions of time of all
-    other upper wires, or of all other lower wires where that leaves more. ``moved`` has mean 0.
+    """Return (U, K) standard deviations that the other wires do not explain.
+
+    The leading half of the functions of time of all other upper wires, or of all other lower wires, is
+    projected out; the larger rest counts. ``moved`` has mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -136,7 +140,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Of each wire of the first axis: the smaller of its floor and of its median crossing, 0 for none."""
+    """Return the smaller of floor and median crossing of each wire of the first axis; 0 if unknown."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():
@@ -146,7 +150,7 @@ def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
 
 
 def _floor(moved: Float, values: int) -> float:
-    """The smallest singular values of (T, n) over those of noise of deviation 1."""
+    """Return the smallest singular values of (T, n) data divided by those of unit noise."""
     return _smallest(moved, values) / _of_noise(moved.shape, values) if moved.shape[1] else 0.0
 
 
@@ -162,8 +166,9 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Where each crossing made its largest step, how large that was, and whether it is all that happened: the
-    medians before and after differ by it, and little else does.
+    """Return scan and height of the largest jump of each crossing, and whether nothing else happened.
+
+    The medians before and after differ by the jump, and little else varies.
     """
     jumps = np.diff(safe, axis=0)
     at = np.abs(jumps).argmax(axis=0)

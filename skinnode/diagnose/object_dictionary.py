@@ -1,5 +1,6 @@
-"""The object dictionary of a node as people read and write it: named and typed by its EDS (CiA 306), dumped
-to a DCF, compared with an EDS or a DCF.
+"""Reads and writes the object dictionary of a node: named and typed by its EDS (CiA 306), dumped, compared.
+
+Objects without an EDS are named by CiA 301 (``standard_objects``).
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""What a node says of itself, whatever its EDS has for a default."""
+"""Objects that hold a node's state, whatever default its EDS gives."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One value of a node."""
+    """One value read from a node."""
 
     index: int
     subindex: int
@@ -53,18 +54,19 @@ class Reading:
     data_type: str
     access: str
     value: Value | None
-    """None for bytes that have no simple value, and where the node refused."""
+    """The value; None if the bytes have no simple value, or the node refused."""
     data: bytes | None
-    """As it travelled; None where the node refused."""
+    """The bytes transferred; None if the node refused."""
     refused: str
-    """Why; empty where it did not."""
+    """Reason of the refusal; empty if there was none."""
     refused_code: int = 0
     """SDO abort code of the refusal, 0 if the read succeeded."""
 
     @property
     def content(self) -> bytes | None:
-        """Value as bytes, None if the node refused. Many nodes refuse to read an empty string for lack of
-        data: its content is empty.
+        """Value as bytes; None if the node refused.
+
+        Many nodes refuse to read an empty string for lack of data; its content is empty.
         """
         if self.refused_code == AbortCode.NO_DATA and self.data_type in _STRINGS:
             return b""
@@ -72,7 +74,7 @@ class Reading:
 
     @property
     def text(self) -> str:
-        """The value for people."""
+        """The value as text."""
         if self.data is None:
             return self.refused
         if isinstance(self.value, str):
@@ -87,19 +89,21 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An object that is not as a file has it."""
+    """An object whose value differs from a file."""
 
     index: int
     subindex: int
     name: str
     node: str
-    """What the node has, or why it does not tell."""
+    """Value of the node, or why it is unknown."""
     file: str
 
 
 def parse_address(text: str) -> tuple[int, int | None]:
-    """``1018:4``, ``0x1018``: index in hexadecimal, as CANopen writes it, sub-index decimal or 0x… Raises
-    ConfigError.
+    """Parse an address such as ``1018:4`` or ``0x1018``: hexadecimal index, decimal or 0x… sub-index.
+
+    Raises:
+        ConfigError: The text is not an address.
     """
     match = _ADDRESS.fullmatch(text)
     subindex = None if match is None or match[2] is None else int(match[2], 0)
@@ -109,13 +113,13 @@ def parse_address(text: str) -> tuple[int, int | None]:
 
 
 def hex_text(data: bytes) -> str:
-    """Bytes for people; long ones by their beginning."""
+    """Return bytes as hexadecimal text; long data is abbreviated."""
     shown = data[:_LONGEST_SHOWN].hex(" ")
     return shown if len(data) <= _LONGEST_SHOWN else f"{shown} … ({len(data)} bytes)"
 
 
 def decode(entry: EdsEntry, data: bytes) -> Value | None:
-    """The value in ``data``; None where it is no number and no text, or not of the length of its type."""
+    """Return the value in ``data``; None if it is neither number nor text, or has a wrong length."""
     if entry.data_type == _TEXT:
         return printable(data)
     if entry.size != len(data):
@@ -128,7 +132,16 @@ def decode(entry: EdsEntry, data: bytes) -> Value | None:
 
 
 def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
-    """What a person wrote, as it travels. Raises ConfigError for what does not fit the type."""
+    """Return the bytes of a value written by a person.
+
+    Args:
+        entry: The object.
+        text: The value.
+        node_id: Replaces $NODEID.
+
+    Raises:
+        ConfigError: The text does not fit the type.
+    """
     kind = _TYPES.get(entry.data_type, f"data type 0x{entry.data_type:X}")
     try:
         if entry.data_type == _TEXT:
@@ -147,7 +160,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """A value of a node; an abort is a reading too. Raises NodeError where the node does not answer."""
+    """Read a value; an abort is a reading too. Raises NodeError if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -158,12 +171,12 @@ def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
 
 
 def type_name(entry: EdsEntry) -> str:
-    """The data type in the words of CiA 301."""
+    """Return the name of the data type in CiA 301."""
     return _TYPES.get(entry.data_type, "" if not entry.data_type else f"0x{entry.data_type:X}")
 
 
 def abort_text(abort: SdoAbort) -> str:
-    """The reason of an abort."""
+    """Return the reason of an abort."""
     return f"0x{abort.code:08X} {str(abort).rpartition(': ')[2]}"
 
 
@@ -174,8 +187,13 @@ def unnamed(eds: Eds, index: int, subindex: int) -> EdsEntry:
 
 
 def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], int]) -> list[EdsEntry]:
-    """Return the entries at an address: one value, or all of an object. An object that the EDS lacks is named
-    by CiA 301; an object that CiA 301 lacks too is accessed as given. ``count`` reads its sub-index 0.
+    """Return the entries at an address.
+
+    Args:
+        eds: Names of the objects; an object missing there is named by CiA 301, or accessed without a name.
+        index: Index.
+        subindex: One value; None for all values of the object.
+        count: Reads sub-index 0 of the object.
     """
     if subindex is None:
         listed = list(eds.between(index, index))
@@ -214,7 +232,7 @@ def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
 
 
 def dump(remote: RemoteOd, eds: Eds, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
-    """Every value that can be read."""
+    """Read every readable value of the EDS."""
     readable = [entry for entry in eds.entries.values() if entry.readable]
     for done, entry in enumerate(readable):
         if done % 20 == 0:
@@ -225,8 +243,16 @@ def dump(remote: RemoteOd, eds: Eds, progress: Callable[[str], None] = lambda _:
 def compare(
     remote: RemoteOd, eds: Eds, node_id: int, progress: Callable[[str], None] = lambda _: None
 ) -> list[Difference]:
-    """Where the node is not as the file has it: every value that is given there and can be read, but for what
-    a node says of its own state.
+    """Compare a node with a file.
+
+    Args:
+        remote: The node.
+        eds: The file; each readable value given there is compared, except the node's state.
+        node_id: Replaces $NODEID.
+        progress: Receives a text now and then.
+
+    Returns:
+        The values that differ.
     """
     found: list[Difference] = []
     given = [
@@ -253,16 +279,19 @@ def compare(
 
 
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
-    """Return whether the node's value is that of the file; a string may have trailing zeros that the default
-    of an EDS cannot express.
+    """Return whether the node's value equals that of the file.
+
+    Trailing zeros of a string count only if the file gives the bytes: the default of an EDS cannot express
+    them.
     """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
     return data == wanted or (not spelt_out and data.rstrip(b"\0") == wanted)
 
 
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
-    """Return the texts of two different values; their bytes from the first difference on if the texts are
-    equal, as those of strings that differ in trailing zeros.
+    """Return the texts of two different values.
+
+    Equal texts are followed by the bytes from the first difference.
     """
     if got.data is None or expected.data is None or got.text != expected.text:
         return got.text, expected.text

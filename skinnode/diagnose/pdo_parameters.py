@@ -1,4 +1,4 @@
-"""The PDO parameters of a node (0x1400 to 0x1BFF), read and in words."""
+"""Reads the PDO parameters of a node (0x1400 to 0x1BFF) and describes them in words."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """One PDO. Times in the units of CiA 301; None where the node does not have the sub-index."""
+    """One PDO. Times are in the units of CiA 301; None if the node lacks the sub-index."""
 
     direction: Direction
     number: int
-    """From 1 on."""
+    """Number, from 1."""
     cob_id: int
     enabled: bool
     kind: int
@@ -38,20 +38,21 @@ class Pdo:
     event_timer_ms: int | None
     sync_start: int | None
     mapped: tuple[int, ...]
-    """As in the mapping parameter: index, sub-index, bits."""
+    """Mapping entries: index, sub-index, bits."""
 
     @property
     def bits(self) -> int:
+        """Length of the mapped data, bits."""
         return sum(entry & 0xFF for entry in self.mapped)
 
 
 def read_pdos(remote: RemoteOd) -> tuple[Pdo, ...]:
-    """All PDOs, TPDOs first. Raises NodeError where the node does not answer."""
+    """Read all PDOs, TPDOs first. Raises NodeError if the node does not answer."""
     return (*_read(remote, "TPDO", od.TPDO1_PARAMETER), *_read(remote, "RPDO", od.RPDO1_PARAMETER))
 
 
 def read_pdo(remote: RemoteOd, direction: Direction, number: int) -> Pdo | None:
-    """One PDO, None where the node does not have it."""
+    """Read one PDO; None if the node lacks it."""
     first = od.TPDO1_PARAMETER if direction == "TPDO" else od.RPDO1_PARAMETER
     index = first + number - 1
     cob_id = _optional(remote, index, od.PDO_COB_ID, "u32")
@@ -91,7 +92,7 @@ def _optional(remote: RemoteOd, index: int, subindex: int, kind: str) -> int | N
 
 
 def kind_text(pdo: Pdo) -> str:
-    """When it is sent, or taken over."""
+    """Return when the PDO is sent, or when its data is used."""
     if 1 <= pdo.kind <= 240:
         every = "every SYNC" if pdo.kind == 1 else f"every {pdo.kind} SYNCs"
         return every if pdo.direction == "TPDO" or pdo.kind == 1 else "at the next SYNC"
@@ -101,7 +102,7 @@ def kind_text(pdo: Pdo) -> str:
 
 
 def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
-    """The PDO in a line. ``name_of`` knows objects by index and sub-index."""
+    """Return the PDO in one line; ``name_of`` returns the name of an index and sub-index."""
     name = f"{pdo.direction}{pdo.number}"
     if not pdo.enabled:
         return f"{name} off"
@@ -119,7 +120,7 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
 
 
 def _shortened(names: list[str]) -> str:
-    """Runs of numbered names as one."""
+    """Merge runs of numbered names."""
     shown: list[str] = []
     for name in names:
         stem, _, number = name.rpartition(" ")

@@ -34,13 +34,13 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Patterns of a cause and its consequences, each matched at the beginning of a finding's text."""
+    """A cause and its consequences, as patterns matched at the beginning of a finding's text."""
 
     cause: str
     follow: tuple[str, ...]
     evidence: Mapping[str, str]
-    """For a pattern of ``follow``: pattern that each part of the evidence must contain for the finding to be
-    a consequence."""
+    """For a pattern of ``follow``: a pattern that each part of the evidence must contain, so that the
+    finding counts as a consequence."""
 
 
 _HOLES: Final = ("scans with holes", "whole scans are missing")
@@ -55,13 +55,13 @@ _CONFIGURED_BY_OTHERS: Final = (
     "no heartbeat: nobody sees it go",
     "the patch scans by its own timer",
 )
-_SAID: Final = "^error register 0x|^last: none reported$"
-"""Pattern of the evidence of a reported error that leaves its cause open."""
-_OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_SAID}")
-_WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_SAID}")
-_RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_SAID}")
-_COLLISION: Final = dict.fromkeys(_ERRORS, f"collision|{_SAID}")
-_CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_SAID}")
+_UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
+"""Pattern of the evidence of an error report that names no cause."""
+_OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_UNEXPLAINED}")
+_WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_UNEXPLAINED}")
+_RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_UNEXPLAINED}")
+_COLLISION: Final = dict.fromkeys(_ERRORS, f"collision|{_UNEXPLAINED}")
+_CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_UNEXPLAINED}")
 _ANYTHING: Final[Mapping[str, str]] = {}
 
 # The first rule that fits a finding takes it. Rules about a patch come before rules about its bus; a rule
@@ -143,17 +143,16 @@ RULES: Final = (
 
 
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
-    """Return all findings of these buses grouped by root cause: groups with the most certain finding first,
-    then those with the most consequences.
+    """Return all findings of these buses, grouped by root cause.
+
+    Groups with the most certain finding come first, then those with the most consequences.
     """
     groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
     return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))
 
 
 def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]:
-    """Return each distinct finding once, with the places where it was made; an overload affects every
-    patch.
-    """
+    """Return each distinct finding once, with its places: an overload affects every patch."""
     places: dict[str, list[Finding]] = {}
     for finding in findings:
         places.setdefault(finding.what, []).append(finding)
@@ -161,7 +160,7 @@ def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]
 
 
 def _of_bus(bus: str, findings: list[Finding]) -> list[Group]:
-    """Give each finding to the first rule that fits; a chain of causes ends at its root."""
+    """Assign each finding to the first rule that fits; a chain of causes ends at its root."""
     cause_of: dict[int, int] = {}
     for rule in RULES:
         for at, cause in enumerate(findings):

@@ -1,4 +1,4 @@
-"""Scans as they come off a bus: the assembler of the host, without its solvers."""
+"""Assembles scans as the host does, without solving them."""
 
 from __future__ import annotations
 
@@ -20,22 +20,30 @@ from skinnode.transport import Frame
 _MOST_SCANS: Final = 1000
 _MOST_SYNCS: Final = 100_000
 _LONGEST_NS: Final = 10_000_000_000
-"""From a SYNC to the scan that it began."""
+"""Maximum time, ns, from a SYNC to the scan that it triggered."""
 
 
 class ScanCapture:
-    """Assembles the scans of some patches and notes every SYNC. :meth:`on_frames` is for the mainline of a
-    link; what it has is read when it is quiet.
+    """Assembles the scans of some patches and notes every SYNC.
+
+    :meth:`on_frames` runs on the receiving thread of a link; read the results when it has stopped.
     """
 
     def __init__(self) -> None:
         self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
-        """When, and the counter; 0 for none."""
+        """Time, ns, and counter of each SYNC; counter 0 if it has none."""
         self._patches: dict[int, _Patch] = {}
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 
     def add(self, node_id: int, profile: PatchProfile, overflow: int, period_s: float) -> None:
-        """Take the scans of this patch from now on."""
+        """Assemble the scans of a patch from now on.
+
+        Args:
+            node_id: The node.
+            profile: Sizes of the patch.
+            overflow: Overflow value of the SYNC counter.
+            period_s: SYNC period.
+        """
         assembler = ScanAssembler(
             profile, counter_overflow=overflow, period_ns=round(period_s * 1e9), node_id=node_id
         )
@@ -44,11 +52,11 @@ class ScanCapture:
         self._takers = {**takers, od.summary_cob_id(node_id): (patch, False)}
 
     def scans(self, node_id: int) -> int:
-        """How many there are of a patch."""
+        """Return the number of scans of a patch."""
         return len(self._patches[node_id].scans)
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
-        """Take a batch."""
+        """Process a batch of frames."""
         for frame in frames:
             if frame.error or frame.remote or frame.extended:
                 continue
@@ -56,7 +64,7 @@ class ScanCapture:
                 self.note_sync(frame.t_ns, frame.data[0] if frame.data else 0)
             elif (taker := self._takers.get(frame.can_id)) is not None:
                 patch, chunk = taker
-                if not patch.begun:  # the scan that was under way when somebody began to listen is nobody's
+                if not patch.begun:  # the first scan was under way when listening began
                     patch.begun = not chunk
                     continue
                 take = patch.assembler.on_chunk if chunk else patch.assembler.on_summary
@@ -65,11 +73,17 @@ class ScanCapture:
             patch.keep(patch.assembler.poll(frames[-1].t_ns), self._sync_ns)
 
     def note_sync(self, t_ns: int, counter: int) -> None:
-        """A SYNC, heard or sent."""
+        """Note a SYNC that was heard or sent."""
         self.syncs.append((t_ns, counter))
 
     def facts(self, node_id: int, scale: CodeScale, told_noise: float) -> ScanFacts | None:
-        """All that came of a patch, None for nothing."""
+        """Return the scans of a patch; None if there are none.
+
+        Args:
+            node_id: The node.
+            scale: Scale of its codes.
+            told_noise: Relative noise of its converter in the hand file.
+        """
         patch = self._patches[node_id]
         patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
         scans = list(patch.scans)
@@ -95,10 +109,8 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """When the SYNC of a scan came: the newest before its first frame, of its counter where SYNCs have
-        one. The next SYNC may be there before the last frame.
-        """
-        for t_ns, number in reversed(list(self.syncs)):  # another thread may note one meanwhile
+        """Return the time of a scan's SYNC: the newest before its first frame, of the same counter."""
+        for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None
             if t_ns <= scan.t_first_ns and number in (scan.counter, 0):

@@ -23,7 +23,7 @@ class _Object(NamedTuple):
     access: str
     array: bool = False
     subs: tuple[tuple[str, int], ...] = ()
-    """Name and data type of each sub-index of a record, from 1 on."""
+    """Name and data type of each sub-index of a record, from 1."""
 
 
 _SDO: Final = (
@@ -92,7 +92,7 @@ SERIES: Final = tuple(indices for indices, _ in _MANY)
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:
-    """Return the entry that CiA 301 defines there; None if it defines no such object or sub-index."""
+    """Return the entry that CiA 301 defines; None if it defines no such object or sub-index."""
     item = _find(index)
     if item is None:
         return None
@@ -113,8 +113,11 @@ def standard_entry(index: int, subindex: int) -> EdsEntry | None:
 
 
 def standard_entries(index: int, count: int) -> Iterator[EdsEntry]:
-    """Yield all entries of an object whose sub-index 0 reads ``count``, or the single entry of an object
-    without sub-indices.
+    """Yield all entries of an object.
+
+    Args:
+        index: Index.
+        count: Value of its sub-index 0; ignored for an object without sub-indices.
     """
     item = _find(index)
     if item is None:

@@ -1,7 +1,7 @@
-"""Tares patches from the technician's side, by SDO, even while a host runs on the bus.
+"""Tares patches by SDO, even while a host runs on the bus.
 
 The node responds to the write to 0x2021:4 after it has measured, so the response is the confirmation. The
-summary of its next scan says that the baseline changed, and a running host then reads the baseline. An SDO
+summary of its next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
 server handles one transfer at a time, so a request from here would abort that upload: the baseline is read
 back once the node's SDO channel is quiet.
 """
@@ -59,6 +59,7 @@ class Tared:
 
     @property
     def done(self) -> bool:
+        """Whether the patch was tared."""
         return not self.problem
 
 
@@ -79,9 +80,20 @@ def tare(
     sync_period_s: float = 0.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Tared:
-    """Tare one node and read its new baseline back. A node that does not answer, or refuses, gives a result,
-    not an exception. ``sync_period_s``: SYNC period of a host that may be running. Raises BusError if the bus
-    fails.
+    """Tare one node and read its new baseline back.
+
+    Args:
+        connection: The bus.
+        node_id: The node.
+        patch: Name of the patch; empty if no hand names it.
+        sync_period_s: SYNC period of a host that may be running.
+        progress: Receives a text for each step.
+
+    Returns:
+        The result, also if the node does not answer or refuses.
+
+    Raises:
+        BusError: The bus failed.
     """
     try:
         return _tare(connection, node_id, patch, sync_period_s, progress)
@@ -130,8 +142,9 @@ def _runs(connection: BusConnection, node_id: int) -> bool:
 
 
 def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Read the baseline: (U, K) R0 in ohm. Repeats the upload if another client interrupted it. Raises
-    NodeError if the upload fails or has the wrong size.
+    """Read the (U, K) baseline R0, ohm; repeat the upload if another client interrupts it.
+
+    Raises NodeError if the upload fails or has the wrong size.
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -149,8 +162,9 @@ def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile
 
 
 def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
-    """Wait until the node's SDO channel has been quiet for QUIET_S, or for ``at_least_s`` if no other client
-    begins; at most OTHERS_S.
+    """Wait, at most OTHERS_S, until the node's SDO channel has been quiet for QUIET_S.
+
+    Wait ``at_least_s`` if no other client begins.
     """
     begun_s = quiet_s = time.monotonic()
     request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)

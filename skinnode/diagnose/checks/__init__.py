@@ -1,3 +1,4 @@
-"""What is wrong with a hand: facts are gathered from its buses, checks that know nothing of buses draw the
-conclusions, a page shows both.
+"""The doctor's checks: pure functions from facts to findings, one file for each area.
+
+They know nothing of buses; ``run`` calls them all.
 """

@@ -1,4 +1,4 @@
-"""What the facts say of a bus: interface, controller, load, strangers, and who is its master."""
+"""Checks of a bus: interface, controller, load, unknown frames, and masters."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Of two producers half of the counters follow the other's; of one that loses some, few do not follow."""
+"""Maximum share of SYNC counters that do not follow the one before. Two producers break half of them; lost
+SYNCs break few."""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
-"""Of its period; two senders beat twice as often."""
+"""Minimum heartbeat period, as a share of the configured one: two senders halve it."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
-    """Interface, controller, load, strangers."""
+    """Check interface, controller, load, unknown frames and nodes without a node-ID."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
@@ -89,7 +90,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_masters(bus: BusFacts) -> Iterator[Finding]:
-    """Who commands the nodes: of each thing that only a master sends there should be one sender."""
+    """Check that there is one sender of everything that only a master sends."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)

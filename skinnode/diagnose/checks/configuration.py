@@ -1,4 +1,4 @@
-"""What the facts say of the configuration of the nodes: sizes, layout, EDS, PDOs, times."""
+"""Checks of the configuration of the nodes: sizes, layout, EDS, PDOs, times."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def check_configuration(bus: BusFacts) -> Iterator[Finding]:
-    """Sizes, layout, EDS, PDOs, inhibit time, heartbeat."""
+    """Check sizes, layout, EDS, PDOs, inhibit time and heartbeat."""
     for patch in bus.patches:
         if patch.info is None or patch.info.patch is None:
             continue
@@ -57,7 +57,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """Compare the PDOs with what the host sets. A value that the host has yet to write is no fault."""
+    """Compare the PDOs with those that the host sets; a value that the host has yet to write is no fault."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:

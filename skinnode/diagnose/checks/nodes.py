@@ -1,4 +1,4 @@
-"""What the facts say of nodes: there, the right ones, alive, without errors."""
+"""Checks of the nodes: presence, identity, state, errors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from collections.abc import Iterator
 
 from skinnode.canopen.emergency import error_text, register_text
 from skinnode.diagnose.bus_connection import no_answer
+from skinnode.diagnose.discovery import FoundNode
 from skinnode.diagnose.facts import BusFacts, Finding, PatchFacts, Sure
 from skinnode.text.words import counted, known
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:
-    """Present, the right ones, alive, without errors."""
+    """Check that the nodes are present, the right ones, running and without errors."""
     if bus.failure:
         return
     if bus.patches and all(patch.found is None for patch in bus.patches):
@@ -52,7 +53,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("nodes", patch.name, what, sure, evidence, advice)
 
-    node, wanted, info = patch.found, patch.wanted, patch.info
+    node, wanted = patch.found, patch.wanted
     if node is None:
         yield found(
             "the node is not there",
@@ -91,6 +92,14 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             f"serial {known(node.serial)}, the hand file says {wanted.serial}",
             "two patches exchanged? Put them back, or correct the hand file and its calibration",
         )
+    yield from _check_state(bus, patch, node)
+
+
+def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[Finding]:
+    def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("nodes", patch.name, what, sure, evidence, advice)
+
+    info = patch.info
     if patch.failure:
         yield found(
             "it did not tell all about itself", Sure.CERTAIN, patch.failure, "skinnode info shows more"
@@ -117,10 +126,10 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             f"last: {info.errors[0] if info.errors else 'none reported'}",
             "fix the fault it names; skinnode info shows its history",
         )
-    told = [emergency for emergency in patch.emergencies if emergency.code]
-    if told:
+    reported = [emergency for emergency in patch.emergencies if emergency.code]
+    if reported:
         kinds = Counter(
-            error_text(emergency.code, emergency.detail, ours=node.is_patch) for emergency in told
+            error_text(emergency.code, emergency.detail, ours=node.is_patch) for emergency in reported
         )
         shown = "; ".join(f"{count} × {text}" for text, count in kinds.most_common(3))
         yield found(

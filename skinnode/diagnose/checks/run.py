@@ -1,4 +1,4 @@
-"""All that the facts say of a hand, room by room. Pure functions over :class:`BusFacts`."""
+"""Runs all checks on the facts of a bus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 
 def run_checks(facts: BusFacts) -> list[Finding]:
-    """All findings of a bus, the surest first within each area."""
+    """Return all findings of a bus; within each area the most certain first."""
     checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
         bus.check_bus,
         bus.check_masters,
@@ -36,8 +36,9 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 
 
 def others(facts: BusFacts) -> list[str]:
-    """Describe each device that is neither a patch nor in the hand file, in one line: what it is, not what is
-    wrong.
+    """Describe each device that is neither a patch nor in the hand file, in one line.
+
+    The lines say what the device is, not what is wrong.
     """
     lines = []
     for node in facts.strangers:
@@ -57,7 +58,7 @@ def others(facts: BusFacts) -> list[str]:
 
 
 def not_judged(facts: BusFacts) -> list[str]:
-    """What could not be looked at, and why, a line each."""
+    """Return what could not be judged, and why, one line each."""
     if facts.failure:
         return [f"{facts.name}: nothing but the interface"]
     lines = []

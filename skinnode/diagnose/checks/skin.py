@@ -1,6 +1,6 @@
-"""What some fifty scans say of the skin: wires, noise, frozen values, steps, baseline. Pure functions.
+"""Checks of the skin from captured scans: wires, noise, frozen values, jumps, baseline.
 
-Somebody who touches the skin is no defect: what touch may explain is not told of.
+Touched skin is not a defect: a finding that a touch can explain is not reported.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Times the noise told above which a crossing is noisy: far beyond what 20 scans leave open."""
+"""Minimum noise of a noisy crossing, in units of the stated noise: far beyond the uncertainty of 20 scans."""
 
 _DRIFT: Final = 0.003
-"""|R/R0 − 1| at rest that is worth a tare: a hundred times the noise of a good converter, 1 % of a press."""
+"""Minimum |R/R0 − 1| at rest that is worth a tare: 100 times the noise of a good converter, 1 % of a
+press."""
 
 _MANY: Final = 0.8
 _FEW: Final = 0.1
 _SHARE: Final = 0.7
-"""Of the crossings of a noisy wire: a few may be quiet by chance or be spoilt otherwise."""
+"""Minimum share of noisy crossings on a noisy wire: some may be quiet by chance."""
 
 
 def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysis]]:
@@ -35,7 +36,7 @@ def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysi
 
 
 def check_wires(bus: BusFacts) -> Iterator[Finding]:
-    """Open, short, out of range: by the node's own masks and by the codes."""
+    """Check for open, shorted and out-of-range wires and crossings, by the node's masks and by codes."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         upper: set[int] = set()
@@ -58,8 +59,8 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
 def _check_crossings(
     patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
 ) -> Iterator[Finding]:
-    """Crossings apart from the wires that are at fault as a whole."""
-    whole = max(1, int(scans.complete.sum()))  # a scan with holes says nothing of what was in them
+    """Check crossings besides the wires that are at fault as a whole."""
+    whole = max(1, int(scans.complete.sum()))  # the missing part of a torn scan is unknown
     rest = np.ones(scans.n_open.shape, dtype=np.bool_)
     rest[sorted(upper), :] = False
     rest[:, sorted(lower)] = False
@@ -70,7 +71,7 @@ def _check_crossings(
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
         for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
-            if wires.any():  # the node was asked before it scanned
+            if wires.any():  # the node's masks were read before these scans
                 yield Finding(
                     "wires",
                     patch.name,
@@ -101,7 +102,7 @@ def _check_crossings(
 
 
 def check_noise(bus: BusFacts) -> Iterator[Finding]:
-    """Noise against what the hand file tells, steps, and values that stand still."""
+    """Check noise against the hand file, jumps, and values that do not change."""
     for patch, scans, analysis in _judged(bus):
         yield from _check_frozen(patch, scans)
         yield from _check_noise(patch, scans, analysis)
@@ -163,7 +164,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Whether a wire is noisy where its neighbours are not: a touch takes the next wires with it."""
+    """Return whether a wire is noisy where its neighbours are not; a touch affects the next wires too."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
@@ -193,26 +194,24 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Whether a converter gave the same codes in all of LEAST_SCANS or more, of which nothing follows: what
-    noise it has, as is told, does not show in every code.
-    """
+    """Return whether all codes are constant although the stated noise is too small to prove a defect."""
     known, still = _still(scans)
     return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
 
 
 def _shows(scans: ScanFacts) -> bool:
-    """Whether the noise told changes every code soon."""
+    """Return whether the stated noise soon changes every code."""
     return scans.told_noise > scans.step
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Crossings that were always measured; those of them that never changed."""
+    """Return the crossings that were always measured, and of them those that never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 
 
 def check_baseline(bus: BusFacts) -> Iterator[Finding]:
-    """A baseline that is missing, or no longer that of the skin at rest."""
+    """Check for a baseline that is missing, or no longer that of the skin at rest."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         if own is not None and own.baseline_missing:
@@ -227,7 +226,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
     for patch, scans, analysis in _judged(bus):
         at_rest = np.isfinite(analysis.level) & ~analysis.touched & ~analysis.steps
         if at_rest.sum() < 0.5 * at_rest.size:
-            continue  # somebody touches the skin
+            continue  # the skin is touched
         off = analysis.level[at_rest] - 1.0
         share = float(np.mean(np.abs(off) > _DRIFT))
         one_way = max(float(np.mean(off > 0)), float(np.mean(off < 0)))
@@ -254,7 +253,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
 
 
 def is_touched(scans: ScanFacts) -> bool:
-    """Whether something moved on the skin, so that not all could be judged."""
+    """Return whether something touched the skin, so that not everything could be judged."""
     return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
 
 
@@ -271,6 +270,6 @@ def _listed(wires: tuple[int, ...]) -> str:
 
 
 def _places(mask: Mask) -> str:
-    """Crossings as upper/lower wire."""
+    """Return crossings as upper/lower wire numbers."""
     places = [f"{row}/{column}" for row, column in np.argwhere(mask)[:6]]
     return ", ".join(places) + (" …" if mask.sum() > 6 else "")

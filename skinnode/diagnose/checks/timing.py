@@ -1,4 +1,4 @@
-"""What the facts say of time and of losses: SYNC, scans after it, frames that went missing."""
+"""Checks of timing and losses: SYNC, scans after SYNC, lost frames."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from skinnode.diagnose.facts import BusFacts, Finding, Sure
 from skinnode.text.words import counted
 
 _JITTER: Final = 0.1
-"""Share of the period that a SYNC may come early or late before somebody should know."""
+"""Maximum SYNC jitter, as a share of the period."""
 
 _PERIOD_ERROR: Final = 0.02
 _LATE: Final = 0.95
-"""Share of the period after which a scan that is not over runs into the next."""
+"""Maximum duration of a scan, as a share of the period."""
 
 
 def check_timing(bus: BusFacts) -> Iterator[Finding]:
-    """SYNC, and how soon after it a scan is there."""
+    """Check SYNC, and the delay of scans after it."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
 
-    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # whose master has to send it
+    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # another master must send it
     if awaited and len(bus.sync_s) == 0 and bus.seconds > 0 and not bus.failure:
         timers = any(p.info and p.info.patch and p.info.patch.period_ms for p in bus.patches)
         if not timers:
@@ -36,6 +36,28 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
                 + ("nodes are operational" if bus.running else "the host is a guest here"),
                 "is the host, or the robot's master, running? Patches scan at SYNC alone",
             )
+    yield from _check_sync(bus)
+    for patch in bus.patches:
+        if patch.scans is None or bus.period_s is None:
+            continue
+        latency_s = patch.scans.latency_s[np.isfinite(patch.scans.latency_s)]
+        period_s = max(bus.period_s, bus.own_period_s)
+        if len(latency_s) and float(np.median(latency_s)) > _LATE * period_s:
+            yield found(
+                patch.name,
+                "scans end when the next has begun",
+                Sure.CERTAIN,
+                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
+                "a shorter inhibit time, a longer period, less load on the bus",
+            )
+
+
+def _check_sync(bus: BusFacts) -> Iterator[Finding]:
+    """Check period, losses and jitter of SYNC."""
+
+    def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
+        return Finding("timing", where, what, sure, evidence, advice)
+
     intervals = np.diff(bus.sync_s)
     if len(intervals) >= 5:
         period_s = float(np.median(intervals))
@@ -66,23 +88,10 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
                 f"99 % within {jitter_s * 1e3:.1f} ms of a period of {period_s * 1e3:.1f} ms",
                 "load of the machine that sends it; a real-time priority for the host",
             )
-    for patch in bus.patches:
-        if patch.scans is None or bus.period_s is None:
-            continue
-        latency_s = patch.scans.latency_s[np.isfinite(patch.scans.latency_s)]
-        period_s = max(bus.period_s, bus.own_period_s)
-        if len(latency_s) and float(np.median(latency_s)) > _LATE * period_s:
-            yield found(
-                patch.name,
-                "scans end when the next has begun",
-                Sure.CERTAIN,
-                f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
-                "a shorter inhibit time, a longer period, less load on the bus",
-            )
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Where frames went missing: before this program, on the bus, at the node."""
+    """Check where frames were lost: in this machine, on the bus, at the node."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)

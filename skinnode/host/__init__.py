@@ -1,4 +1,4 @@
-"""The host: discover, configure, start, supervise; receive, assemble, solve, publish.
+"""The host: configure, start and supervise nodes; receive, assemble, solve and publish their scans.
 
 **Containment.** No exception ends a thread of the host. An exception raised while serving a patch makes that
 patch faulty with the reason: its scans are withheld, and it is brought up again after a pause of 0.1 s that

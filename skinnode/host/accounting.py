@@ -1,5 +1,7 @@
-"""The sums that must agree, bus by bus and patch by patch: what came in is what went on, or is counted as
-lost. Of a host that runs, numbers are read one after the other, so ask when it has closed or stands still."""
+"""Check that the counters of a host add up: all that came in went on, or is counted as lost.
+
+The counters of a running host are read one after the other, so check a host that is closed or idle.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from skinnode.text.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:
-    """What does not add up, a line each; empty where all sums agree.
+    """Return what does not add up, a line each; an empty list if all sums agree.
 
     ===========  ==========================================================================================
     of a bus     frames read = received + ignored + error frames + dropped + waiting
@@ -42,8 +44,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """What of a bus did not come in, and what its interface said of errors, in words by counter; empty
-    where all is well."""
+    """Return the losses and errors of a bus as text by counter, an empty dictionary if there were none."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -55,7 +56,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """The same of a patch."""
+    """Return the losses of a patch as text by counter, an empty dictionary if there were none."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
@@ -69,7 +70,7 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
 
 
 def frames_counted(assembler: AssemblerStats) -> int:
-    """Chunks and summaries of which the assembler says what became of them."""
+    """Return the number of chunks and summaries that the assembler accounts for."""
     return (
         assembler.chunks_accepted
         + assembler.summaries_accepted
@@ -84,14 +85,14 @@ def frames_counted(assembler: AssemblerStats) -> int:
 
 
 def _of_bus(bus: BusStats) -> list[str]:
-    told = bus.received + bus.ignored + bus.error_frames + bus.dropped + bus.waiting
-    return _unless_equal("frames read", bus.read, "those told of", told)
+    counted_frames = bus.received + bus.ignored + bus.error_frames + bus.dropped + bus.waiting
+    return _unless_equal("frames read", bus.read, "those counted", counted_frames)
 
 
 def _of_stream(stream: StreamStats) -> list[str]:
     assembler = stream.assembler
     return [
-        *_unless_equal("frames", stream.frames, "those told of", frames_counted(assembler)),
+        *_unless_equal("frames", stream.frames, "those counted", frames_counted(assembler)),
         *_unless_equal(
             "scans offered or withheld",
             stream.offered + stream.withheld + stream.partial,

@@ -1,8 +1,9 @@
-"""When the next scan of a patch should have come, so that the receiver may let other frames gather before.
+"""Predict when the next scan of a patch ends, so that the receiver may let other frames gather before.
 
-On a full bus that is not always a period after the last: where heartbeats go before the frames of several
-nodes, a scan may end at one of two instants of its period, by turns (12 ms apart at every fifth scan in
-``bench pipeline``, and not without heartbeats). So each instant at which one of the last ended is looked at.
+On a full bus that is not always one period after the last: where heartbeats precede the frames of several
+nodes, a scan may alternate between two instants of its period (12 ms apart at every fifth scan in ``bench
+pipeline``; not without heartbeats). So the prediction covers each instant at which one of the last scans
+ended.
 """
 
 from __future__ import annotations
@@ -11,28 +12,34 @@ from collections import deque
 from typing import Final
 
 REMEMBERED: Final = 8
-"""Scans whose ends are remembered."""
+"""Number of scan ends remembered."""
 APART_NS: Final = 1_000_000
-"""Ends nearer to each other than that are one: the bits that a controller stuffs into the frames of a scan,
-and the clock of whoever sends SYNC, come to less."""
+"""Time within which two ends count as the same instant: stuffed bits and the clock of the SYNC producer vary
+by less."""
 MOST: Final = 3
-"""With more instants than that a scan may come at any time, by all that can be told."""
+"""Maximum number of instants predicted; with more, a scan may come at any time."""
 
 
 class ArrivalPredictor:
-    """The ends of the scans of a patch, ``period_ns`` from one to the next. Owned by one thread."""
+    """Predicts from the ends of the last scans of a patch, ``period_ns`` apart. Owned by one thread."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self._ends: deque[int] = deque(maxlen=REMEMBERED)
 
     def next_ns(self, t_ns: int) -> tuple[int, ...]:
-        """After a scan that ended at ``t_ns``: when the next may end, ascending; empty where nobody can
-        say."""
+        """Note the end of a scan and predict the end of the next.
+
+        Args:
+            t_ns: Monotonic time at which the scan ended.
+
+        Returns:
+            Monotonic times in ascending order, one of which should apply; empty if none can be predicted.
+        """
         period_ns, ends = self._period_ns, self._ends
         ends.appendleft(t_ns)
         due: list[int] = []
-        for end_ns in ends:  # the newest first: it knows best
+        for end_ns in ends:  # the newest first: it is the best predictor
             due_ns = end_ns + ((t_ns - end_ns + period_ns // 2) // period_ns + 1) * period_ns
             for other_ns in due:
                 if -APART_NS < due_ns - other_ns < APART_NS:

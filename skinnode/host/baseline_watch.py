@@ -17,10 +17,10 @@ from skinnode.host.supervised import JOIN_DEADLINE_S, LEAST_NS, Joined, Supervis
 _log = logging.getLogger(__name__)
 
 _DOUBT_NS: Final = 2_000_000_000
-"""Minimum time between two readings of a baseline that may have changed unnoticed, ns."""
+"""Minimum interval between two readings of a baseline that may have changed unnoticed."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum time between two readings of an error register that is not zero, ns. The emergency that clears an
+"""Minimum interval between two readings of an error register that is not zero. The emergency that clears an
 error may be lost, and the patch must be operational within a second of it. Costs four SDO frames a second."""
 
 
@@ -34,8 +34,10 @@ class BaselineWatch:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Read it again where the node said that it changed, or may have said so in a summary that was
-        lost. In the first case scans are withheld until then."""
+        """Read the baseline again if the node announced a new one, or may have done so in a lost summary.
+
+        After an announcement scans are withheld until then.
+        """
         remote, stream, job = node.remote, node.remote.stream, node.job
         if job is not None:
             if job.done():
@@ -49,7 +51,7 @@ class BaselineWatch:
             return
         if remote.listen_only:
             if changed:
-                remote.monitor.refusal = "its baseline changed; a guest that sends nothing cannot read it"
+                remote.monitor.refusal = 'its baseline changed; guest_sends = "nothing" forbids reading it'
             return
         stream.doubtful = False
         abandon = node.abandon = threading.Event()
@@ -61,7 +63,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Ask a node with an error for its error register: the emergency that ended it may have been lost."""
+        """Read the error register of a node with an error: its end may have been reported in a lost frame."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return
@@ -75,7 +77,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _take_baseline(self, node: Supervised, job: Future[Joined | None], now_ns: int) -> None:
-        if job.exception() is None and job.result() is None:  # it was the error register
+        if job.exception() is None and job.result() is None:  # the job read the error register
             return
         remote, stream = node.remote, node.remote.stream
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
@@ -83,7 +85,7 @@ class BaselineWatch:
             read = job.result()
         except (BusError, ConfigError) as error:  # if the node is gone, its silence will show
             stream.doubtful = True
-            _log.warning("%s; its baseline is read again", error)
+            _log.warning("%s; reading its baseline again", error)
             return
         except Abandoned:
             return
@@ -94,13 +96,15 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # or found after a lost summary
+            node.announced = True  # also if it was found after a lost summary
             note_baseline(node)
 
 
 def note_baseline(node: Supervised) -> None:
-    """Note with which baseline the scans are solved now. A bring-up finds a new one too: after a reading that
-    failed, or if it changed while the node was away."""
+    """Note with which baseline the scans are solved now, and count it if it is new.
+
+    A bring-up finds a new one too: after a reading that failed, or if it changed while the node was away.
+    """
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # of a node that was brought up
     node.baseline_ohm = facts.baseline_ohm

@@ -1,4 +1,4 @@
-"""Fields to a function of a program, on a thread of its own: it may block or raise at its own cost."""
+"""Call a function of the program with each field, on a thread of its own, so that it delays nothing else."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from skinnode.model.frames import FieldFrame
 _log = logging.getLogger(__name__)
 
 LAST_CALL_S: Final = 1.0
-"""How long the end of a host, or of a callback, waits for a call that is under way."""
+"""Longest wait for a call under way when a callback or the host ends, s."""
 
 
 class FieldCallback:
-    """Calls ``function`` with each field of ``fields``, one after the other, until :meth:`close` or the end
-    of the host. What it raises is counted, the first logged with its traceback; the next field follows."""
+    """Calls a function with each field until :meth:`close` or the end of the host.
+
+    Exceptions of the function are counted, and the first is logged with its traceback; the next field
+    follows. Threads: one of its own calls the function; any thread may call the methods.
+    """
 
     def __init__(
         self,
@@ -42,16 +45,16 @@ class FieldCallback:
 
     @property
     def failed(self) -> int:
-        """Fields at which it raised."""
+        """Fields at which the function raised."""
         return self._failed
 
     def close(self) -> None:
-        """Call it no more. Waits for a call under way, a second at most; may be called by the function."""
+        """End the calls. Waits for a call under way for a second at most; the function itself may call it."""
         self._fields.end()
         self.join()
 
     def join(self) -> None:
-        """Wait until the last call has returned, a second at most; then say that it has not."""
+        """Wait for the last call to return, a second at most, and log a warning if it does not."""
         if self._thread is threading.current_thread():
             return
         self._thread.join(LAST_CALL_S)
@@ -60,7 +63,7 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether it is called no more."""
+        """Whether the function is not called any more."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -70,7 +73,7 @@ class FieldCallback:
         """Wait for the next field and process it. Returns False at the end of the fields."""
         try:
             field = self._fields.take(None)
-        except SkinError as error:  # what stopped the host; other subscribers are told too
+        except SkinError as error:  # it stopped the host; every subscriber gets it
             _log.debug("callback %s: %s", _name(self._function), error)
             return False
         if field is None:
@@ -85,14 +88,18 @@ class FieldCallback:
 
 
 class Callbacks:
-    """All callbacks of a host. Exceptions raised outside their functions are reported to ``defects``."""
+    """All callbacks of a host. Exceptions outside their functions are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects
         self._all: list[FieldCallback] = []
 
     def add(self, function: Callable[[FieldFrame], object], fields: Subscription) -> FieldCallback:
-        """A new one, running. Raises TypeError for what cannot be called, or would have to be awaited."""
+        """Start a callback.
+
+        Raises:
+            TypeError: if ``function`` is not a function, or is async.
+        """
         if not callable(function):
             raise TypeError(f"function: got {function!r}, must be a function of a field")
         if inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(type(function).__call__):
@@ -103,7 +110,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all; their subscriptions have ended."""
+        """Wait for all callbacks, whose subscriptions have ended."""
         for callback in self._all:
             callback.join()
 

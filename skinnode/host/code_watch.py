@@ -1,23 +1,25 @@
-"""What the codes of a patch say of its converter and its wires, scan by scan. Plain code with one owner.
+"""Detect a frozen converter and faulty wires from the codes of a patch, scan by scan. No thread, one owner.
 
-**Frozen.** A converter whose noise reaches the codes cannot give the same ones again and again. With a noise
-of σ codes a reading keeps its code with a probability of at most 2Φ(1/2σ) − 1, when the truth lies in the
-middle of a step; so n scans of m codes are all the same with at most that to the power of n·m. That must be
-below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file says may give the same
-codes for hours: so the stream itself must have shown noise, ``FLICKERS`` scans in which a code went back to
-where it had been (a touch, or rubber that creeps, goes one way), and the run must be ``LONGER`` times as long
-as any that ended by itself. A converter that never flickers is never called frozen. Scans in which only
-changed chunks were sent, or chunks are missing, are left out. What remains: a converter of a third of the
-noise in the hand file flickers while rubber creeps, and rests then; it may be called frozen once.
+**Frozen.** A converter whose noise reaches the codes cannot repeat the same codes for long. With a noise of σ
+codes, a reading keeps its code with a probability of at most 2Φ(1/2σ) − 1, which applies if the true value is
+in the middle of a step; so n scans of m codes are all equal with at most that probability to the power of
+n·m. It must be below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file says may
+repeat its codes for hours. So the stream itself must have shown noise, that is ``FLICKERS`` scans in which a
+code returned to its previous value (a touch, or creeping rubber, goes one way), and the run must be
+``LONGER`` times as long as any that ended by itself. A converter that never flickers is never called frozen.
+Scans in which only changed chunks were sent, or chunks are missing, are ignored. What remains: a converter
+with a third of the noise in the hand file flickers while rubber creeps, and is constant afterwards; it may be
+called frozen once.
 
-**Wires.** Open or shorted: all crossings are, in a whole scan. Noisy and drifting are judged over windows of
-``WINDOW`` scans and must hold in ``WINDOWS`` of them running. The second difference in time of a code leaves
-out what moves evenly; a wire is noisy if its mean square is ``NOISY`` times that of the median wire of its
-side, and of the noise expected. A wire drifts if the resistances of all its crossings went the same share of
-R0 away from those of the median wire, and from rest, by more than ``DRIFT``, and its neighbours did not come
-along: a touch is uneven along a wire, and the rubber takes the next wires with it. Of 780,000 instants of
-simulated touches in which a wire was that far away, spheres of 2 mm to 0.3 m pressed in by 10 to 60 %, none
-passes for a drift. So two neighbours that drift alike are not told of, nor a wire while something touches it.
+**Wires.** A wire is open or shorted if all its crossings are, in a complete scan. Noise and drift are judged
+over windows of ``WINDOW`` scans and must hold in ``WINDOWS`` consecutive windows. The second difference in
+time of a code removes steady movement; a wire is noisy if the mean square of the difference is ``NOISY``
+times that of the median wire of its side, and that of the expected noise. A wire drifts if the resistances of
+all its crossings moved by the same share of R0, by more than ``DRIFT`` from those of the median wire and from
+rest, and its neighbours did not follow: a touch is uneven along a wire, and the rubber moves the next wires
+with it. In 780,000 instants of simulated touches that moved a wire that far, spheres of 2 mm to 0.3 m pressed
+in by 10 to 60 %, none passed for a drift. So two neighbours that drift alike are not reported, nor is a wire
+while it is touched.
 """
 
 from __future__ import annotations
@@ -37,24 +39,30 @@ from skinnode.protocol.summary import SummaryFlag
 _CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 
 FALSE_ALARM: Final = 1e-12
-"""A hand of 16 patches at 80 scans/s would be called frozen wrongly once in 25 years."""
+"""Probability of a false alarm for each run of equal scans: once in 25 years for a hand of 16 patches at 80
+scans/s."""
 FLICKERS: Final = 10
+"""Scans with a returning code that show that the noise reaches the codes."""
 LONGER: Final = 4
+"""Ratio of a frozen run to the longest run that ended by itself."""
 LEAST_RUN: Final = 5
+"""Minimum length of a frozen run, scans."""
 WINDOW: Final = 16
+"""Scans in a window."""
 WINDOWS: Final = 3
+"""Consecutive windows in which a wire must be noisy or drift."""
 NOISY: Final = 25.0
-"""Five times the noise."""
+"""Ratio of noise power: five times the noise."""
 DRIFT: Final = 1e-3
-"""Of R0; a tenth of what a light touch does to the wire pairs below it."""
+"""Minimum drift, as a share of R0; a tenth of what a light touch does to the wire pairs below it."""
 UNEVEN: Final = 0.05
-"""Of the drift: how far any crossing of a wire may differ from their median."""
+"""Maximum deviation of a crossing from the median of its wire, as a share of the drift."""
 APART: Final = 0.3
-"""Of the drift: how far the nearer of its neighbours must be."""
+"""Minimum distance of a wire from the nearer of its neighbours, as a share of the drift."""
 
 
 class WireState(enum.StrEnum):
-    """What is wrong with a wire."""
+    """Fault of a wire."""
 
     OPEN = "open"
     SHORT = "short"
@@ -64,7 +72,7 @@ class WireState(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class WireFault:
-    """A wire and what is wrong with it."""
+    """A wire and its fault."""
 
     side: str
     """``upper`` or ``lower``."""
@@ -73,7 +81,12 @@ class WireFault:
 
 
 class CodeWatch:
-    """Watches the scans of one patch; ``relative_noise`` is that of its converter as the hand file says."""
+    """Watches the scans of one patch. Owned by the mainline.
+
+    Args:
+        scale: Scale of the codes.
+        relative_noise: Noise of the converter as in the hand file, as a share of the resistance.
+    """
 
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
         self._scale, self._relative_noise = scale, relative_noise
@@ -86,10 +99,12 @@ class CodeWatch:
         self._broken: tuple[WireFault, ...] = ()
         self._odd: dict[WireFault, int] = {}  # windows running in which a wire was noisy or drifted
         self._window: list[Codes] = []
-        self._measured: NDArray[np.bool_] | None = None  # which codes were in all of its scans; None: all
+        self._measured: NDArray[np.bool_] | None = (
+            None  # codes that all of its scans contain; None: all codes
+        )
 
     def on_scan(self, scan: Scan) -> None:
-        """The next scan."""
+        """Evaluate the next scan."""
         if not scan.complete or scan.flags & _CHANGED_ONLY:
             return
         codes, last = scan.codes, self._last
@@ -105,14 +120,14 @@ class CodeWatch:
         self._accumulate(codes)
         if broken != self._broken:
             self._broken = broken
-            self._tell()
+            self._update_wires()
 
     # --- frozen
 
     def _compare(self, codes: Codes, last: Codes, before: Codes) -> None:
         changed = codes != last
         if changed.any():
-            if self._flickers < FLICKERS:  # more are not asked for
+            if self._flickers < FLICKERS:  # enough is known
                 self._flickers += bool((changed & (codes == before)).any())
                 self._before = np.where(changed, last, before)
             by_itself = not self.frozen or np.abs(codes.astype(np.int64) - last).max() <= 1
@@ -126,7 +141,7 @@ class CodeWatch:
         self.frozen = self._run >= LEAST_RUN and self._run >= self._needed
 
     def _impossible(self, codes: Codes) -> float:
-        """Scans in which the noise expected cannot keep all these codes the same."""
+        """Return the number of scans for which the expected noise cannot keep all these codes equal."""
         measured = codes[codes <= self._scale.steps]
         if not measured.size or not self._relative_noise:
             return math.inf
@@ -151,10 +166,10 @@ class CodeWatch:
     def _accumulate(self, codes: Codes) -> None:
         self._window.append(codes)
         if len(self._window) == WINDOW:
-            self._judge_window()
+            self._evaluate_window()
             self._window, self._measured = [], None
 
-    def _judge_window(self) -> None:
+    def _evaluate_window(self) -> None:
         scale, every = self._scale, np.ones(self._window[0].shape, np.bool_)
         measured = every if self._measured is None else self._measured
         if not measured.any():
@@ -174,7 +189,7 @@ class CodeWatch:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # Away from rest too: where a touch has moved the median wire, the others are away from that.
+            # Distance from rest too: if a touch has moved the median wire, the others are away from it.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])
@@ -184,22 +199,22 @@ class CodeWatch:
             ):
                 odd |= {WireFault(side, int(i), state) for i in np.flatnonzero(is_so)}
         self._odd = {fault: self._odd.get(fault, 0) + 1 for fault in odd}
-        self._tell()
+        self._update_wires()
 
-    def _tell(self) -> None:
+    def _update_wires(self) -> None:
         lasting = (fault for fault, windows in self._odd.items() if windows >= WINDOWS)
         self.wires = tuple(sorted({*self._broken, *lasting}))
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """np.median where no value is NaN, in a third of the time that takes for a patch."""
+    """Return the median of values without NaN, three times as fast as ``np.median`` for a patch."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle
 
 
 def _median_of_known(values: NDArray[np.float64]) -> float:
-    """Of those that are not NaN; NaN where all are."""
+    """Return the median of the values that are not NaN; NaN if all are."""
     known = values[~np.isnan(values)]
     return float(_median(known, 0)) if known.size else math.nan
 
@@ -207,8 +222,10 @@ def _median_of_known(values: NDArray[np.float64]) -> float:
 def _of_wires(
     values: NDArray[np.float64], axis: int, whole: NDArray[np.bool_], plain: Any, without_nan: Any
 ) -> NDArray[np.float64]:
-    """A number for each wire from its crossings, of which those not measured are NaN; NaN for a wire of which
-    none was. The way for patches without a fault takes a tenth of the time of the other."""
+    """Return a number for each wire from its crossings, of which unmeasured ones are NaN; NaN if all are.
+
+    The branch for patches without a fault takes a tenth of the time of the other.
+    """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))
     found = np.full(len(whole), np.nan)

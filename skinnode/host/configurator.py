@@ -1,8 +1,9 @@
-"""From a node that may be there to one that is known, configured and ready to start.
+"""Configure a node: wait for it, check its identity and layout, write its parameters, read its baseline.
 
-Nothing is written to a node before its identity and its layout are what the hand file says: it could be a
-drive. What is written is read back. A guest writes what belongs to the patch alone, and only what differs: no
-NMT, no SYNC parameters; one that sends nothing takes all from files.
+Nothing is written before identity and layout are known to match the hand file, because the node could be a
+drive. What is written is read back. On a bus of another master the host writes only what belongs to the patch
+alone, and only if it differs: no NMT, no SYNC parameters. If it must send nothing (``guest_sends =
+"nothing"``), all facts come from files.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""How long a node may take to answer for the first time; controllers boot and tare within a second."""
+"""Longest time to the first response of a node, s; controllers boot and tare within a second."""
 
 HEARTBEATS_WATCHED: Final = 3
-"""Heartbeats of the host that a node may miss before it falls silent, where the host sends one."""
+"""Heartbeats of the host that a node may miss before it stops sending, if the host sends any."""
 
 _POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Brings up one node after the other, or several side by side, until ``abandoned`` says so.
+    """Configures nodes of one bus, one after the other or side by side.
 
-    ``on_answer`` hears of each node that answered at all.
+    Threads: each node has one thread at a time.
     """
 
     send: Callable[[int, bytes], None]
@@ -50,17 +51,28 @@ class Configurator:
     bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
+    """Called repeatedly; once it returns True, configuring ends with Abandoned."""
     on_answer: Callable[[PatchConfig], None]
+    """Called for each node that answered at all."""
     search: Callable[[PatchConfig], object]
-    """Looks for a node that does not answer, by its serial number."""
+    """Searches for a node that does not answer, by its serial number."""
 
     def configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
-        """Wait for the node, check who it is, configure it; on the bus of a master it ends up
-        pre-operational.
+        """Wait for the node, check its identity, configure it.
 
-        Raises NodeTimeout where it does not answer in time, NodeError where it is not the patch of the file
-        or does not keep its configuration, SdoAbort where it refuses, ConfigError for a baseline file that
-        does not fit the patch.
+        On a bus where the host is the master, the node is pre-operational afterwards.
+
+        Args:
+            patch: The patch of the hand file.
+            profile: Its wire format.
+            remote: The object dictionary of its node.
+
+        Raises:
+            NodeTimeout: if the node does not answer in time.
+            NodeError: if it is not the patch of the hand file, or does not keep its configuration.
+            SdoAbort: if it refuses a transfer.
+            ConfigError: if the baseline file does not fit the patch.
+            Abandoned: if ``abandoned`` returned True.
         """
         if not (self.bus.role == "master" or self.bus.guest_sends == "sdo"):
             return self._from_files(patch, profile)
@@ -108,7 +120,7 @@ class Configurator:
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
-        """Return the node's serial number and revision number."""
+        """Check the identity of the node. Returns its serial number and revision number."""
         for subindex, what, wanted in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
@@ -147,7 +159,7 @@ class Configurator:
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        """The electrodes as the node knows them."""
+        """Return the layout that the node has in its coordinates."""
         self._go_on()
         data = remote.read_block(od.COORDINATES)
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
@@ -157,7 +169,7 @@ class Configurator:
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """What a master decides: SYNC, and whose heartbeat is watched."""
+        """Write what only a master may set: SYNC, and which heartbeat the node watches."""
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
@@ -173,19 +185,19 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Tell the node to beat; a guest does so only where nobody else has. Returns the period, s."""
+        """Set the heartbeat period; on a bus of another master only if none is set. Returns the period, s."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
-            told_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
-            if told_ms:
-                return told_ms * 1e-3
+            present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
+            if present_ms:
+                return present_ms * 1e-3
         remote.write_checked(od.HEARTBEAT_PRODUCER, 0, "u16", heartbeat_ms)
         return heartbeat_ms * 1e-3
 
     def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
-        """What belongs to the patch alone: when it scans and how it sends."""
+        """Write what belongs to the patch alone: when it scans and how it sends."""
         sync = self.hand.sync
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
@@ -215,8 +227,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the PDOs have the mapping of the node's revision, the only one that the decoder
-        understands."""
+        """Check that the PDOs have the mapping of the node's revision, the only one the decoder supports."""
         wanted = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(wanted[index][0].default or 0)
@@ -230,8 +241,17 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """(U, K) R0 that the node encodes with, in ohm: its own or, written to it where it differs, that of
-        the file. A node that still tares itself has zeros; it may take the boot deadline."""
+        """Return the baseline with which the node encodes; write that of a file first if it differs.
+
+        A node that still tares itself has zeros, which are waited for up to the boot deadline.
+
+        Returns:
+            (U, K) resistances at rest, ohm.
+
+        Raises:
+            NodeError: if the node does not keep the baseline, or it is not positive.
+            SkinError: as :meth:`configure`.
+        """
         wanted = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = time.monotonic() + self.boot_deadline_s
         while True:
@@ -256,9 +276,11 @@ class Configurator:
         return baseline
 
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """As one block; value by value from a node that does not have it so. For 300 values a block is 176
-        frames and single reads are 600: at 1 Mbit/s 86 ms, at the node's own pace, against 75 ms plus 300
-        times what a node takes to answer, and never the bus whole."""
+        """Read the baseline as one block, or value by value from a node without block transfer.
+
+        For 300 values a block is 176 frames, single reads are 600. At 1 Mbit/s that is 86 ms at the node's
+        own pace, against 75 ms plus 300 response times; single reads never use the whole bus.
+        """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
         except SdoAbort as abort:
@@ -281,9 +303,17 @@ class Configurator:
 
 
 def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
-    """Read back what decides whether the node sends scans: True if it is as a master configures it. A node
-    that was reset unseen while it was brought up, or was configured by another master, has other values.
-    Raises as :class:`RemoteOd`."""
+    """Read back the values that decide whether the node sends scans.
+
+    A node that was reset unnoticed while it was brought up, or that another master configured, has other
+    values.
+
+    Returns:
+        Whether they are as a master configures them.
+
+    Raises:
+        NodeError: as :class:`RemoteOd` raises it.
+    """
     wanted = (
         (od.SYNC_COUNTER_OVERFLOW, 0, "u8", hand.sync.counter_overflow),
         (od.TPDO1_PARAMETER, od.PDO_COB_ID, "u32", od.chunk_cob_id(patch.node_id)),
@@ -293,8 +323,10 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 
 def _open_window(remote: RemoteOd) -> None:
-    """Disable the synchronous window (0x1007), because a summary follows only after its whole scan. A node
-    without the object has no window."""
+    """Disable the synchronous window (0x1007), because a summary follows only after its whole scan.
+
+    A node without the object has no window.
+    """
     try:
         remote.write_checked(od.SYNC_WINDOW, 0, "u32", 0)
     except SdoAbort as abort:
@@ -303,8 +335,10 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Write entry 1 of 0x1016, which watches the host. Other entries stay unchanged, except one that also
-    watches the host: a node-ID may occur only once."""
+    """Write entry 1 of 0x1016, which watches the host.
+
+    Other entries stay unchanged, except one that also watches the host: a node-ID may occur only once.
+    """
     try:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
     except SdoAbort as abort:

@@ -1,8 +1,8 @@
-"""Contains exceptions in the host's threads: one rule, and the tools for it.
+"""Contain exceptions in the host's threads: the rule, and the tools that implement it.
 
 An exception raised while serving one subject (a patch, a bus, a subscriber) is reported to the
-:class:`Defects` of that subject and affects no other; the operation is then retried. :mod:`skinnode.host` has
-the table.
+:class:`Defects` of that subject and affects no other; the operation is then retried. The table in
+:mod:`skinnode.host` lists every thread.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ def one_line(error: BaseException | None) -> str:
 
 
 class Pause:
-    """Pauses of an operation that is retried repeatedly, in seconds. After the operation has worked for as
-    long as the longest pause, they start over with the first."""
+    """Pauses of an operation that is retried repeatedly, s.
+
+    After the operation has worked for as long as the longest pause, they start over with the first.
+    """
 
     def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
         self._first_s, self._longest_s = first_s, longest_s
@@ -91,6 +93,7 @@ class Defects:
         return self._newest
 
     def stats(self) -> DefectStats:
+        """Return the statistics so far."""
         return DefectStats(self._count, self._newest)
 
     def report(self, doing: str, error: Exception) -> None:
@@ -115,8 +118,10 @@ class Defects:
 
 
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
-    """Call ``turn`` until it returns False. An exception ends that turn and is followed by a pause of 1 to
-    20 ms."""
+    """Call ``turn`` until it returns False.
+
+    An exception ends that turn only; a pause of 1 to 20 ms follows.
+    """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:
         try:

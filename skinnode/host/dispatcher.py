@@ -1,6 +1,6 @@
 """Counts the frames of a bus and dispatches them to handlers by COB-ID. No thread, no clock.
 
-A :class:`~skinnode.host.link.BusLink` is fed by a bus; a replay feeds a dispatcher from a recording.
+A :class:`~skinnode.host.link.BusLink` feeds it with the frames of a bus; a replay feeds it with a recording.
 """
 
 from __future__ import annotations
@@ -22,57 +22,73 @@ from skinnode.transport.bus_state import BusState, bus_state
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[bytes, int], None]
-"""What happens to a frame: its data and when it was received, monotonic ns."""
+"""Called with the data of a frame and the monotonic time at which it was received, ns."""
 
 _MARK_NS: Final = 100_000_000
+"""Interval at which the bits are summed."""
 _MARKS: Final = 10
-"""The load is the mean over the last ten tenths of a second."""
+"""Intervals over which the load is averaged."""
 
 _POLL_NS: Final = 2_000_000
-"""How often the pollers are asked: what they wait for takes 5 ms at least, and frames come in batches a
-millisecond apart."""
+"""Minimum interval between calls of the pollers: what they wait for takes at least 5 ms, and batches of
+frames come a millisecond apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusStats:
-    """What passed on a bus since the host opened it."""
+    """Counters of a bus since the host opened it."""
 
     received: int
-    """Data frames read, the host's own not among them."""
+    """Data frames read, without those of the host."""
     sent: int
     foreign: int
-    """Data frames of a COB-ID that the hand file does not explain."""
+    """Data frames with a COB-ID that the hand file does not explain."""
     ignored: int
     """Remote and extended frames; on a bus without ``fd`` also CAN FD frames."""
     error_frames: int
-    """What the interface says of errors on the bus, and of its controller's state."""
+    """Error frames: the interface reports errors on the bus and states of its controller."""
     bus_offs: int
-    """Times it said that the controller went off the bus."""
+    """Times the interface reported that its controller went bus-off."""
     controller: BusState | None
-    """What it said last of its controller; None where it said nothing."""
+    """Newest reported state of the controller; None if none was reported."""
     foreign_ids: Mapping[int, int]
-    """How many frames of each foreign COB-ID."""
+    """Number of frames by foreign COB-ID."""
     read: int
-    """Frames of all kinds read off the interface."""
+    """Frames of all kinds read from the interface."""
     waiting: int
-    """Frames of those that nobody has looked at yet."""
+    """Frames read but not dispatched yet."""
     kernel_dropped: int
-    """Frames that the kernel had no room for; 0 where the interface does not tell."""
+    """Frames for which the kernel had no room; 0 if the interface does not report it."""
     dropped: int
     """Frames that found the receive queue full."""
     malformed: int
-    """Frames of a known COB-ID with a length that it does not have."""
+    """Frames of a known COB-ID whose length or form is wrong."""
     outages: int
-    """Times the interface failed and was opened again."""
+    """Times the interface failed and was reopened."""
     bits: int
-    """Exact length of all data frames, received and sent, up to a tenth of a second ago."""
+    """Exact length of all data frames, received and sent, bits; up to a tenth of a second old."""
     load: float
-    """Share of the bus that these took over the last second; 1 is full."""
+    """Share of the bus capacity used over the last second; 1 is full."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortCounters:
+    """Counters that the feeder of a dispatcher keeps."""
+
+    sent: int = 0
+    dropped: int = 0
+    outages: int = 0
+    read: int | None = None
+    """None: as many as were dispatched."""
+    waiting: int = 0
+    kernel_dropped: int = 0
 
 
 class Dispatcher:
-    """One bus of the hand, as far as its frames go. Owned by one thread, the mainline; only what says so may
-    be called from others."""
+    """Dispatches the frames of one bus of the hand, and counts them.
+
+    Threads: owned by the mainline; :meth:`count` and :meth:`count_sent` may be called from any thread.
+    """
 
     def __init__(self, config: BusConfig, handlers: Mapping[int, Handler], now_ns: int) -> None:
         self.config = config
@@ -95,37 +111,50 @@ class Dispatcher:
         self._polled_ns = 0
 
     def handle(self, cob_id: int, handler: Handler, defects: Defects | None = None) -> None:
-        """Pass the data frames of ``cob_id`` to ``handler`` from now on, on the mainline. Its exceptions are
-        reported to ``defects``, by default those of the bus."""
+        """Pass the data frames of ``cob_id`` to ``handler`` from now on, on the mainline.
+
+        Args:
+            cob_id: Identifier of the frames.
+            handler: Replaces the previous handler.
+            defects: Gets the exceptions of the handler; by default those of the bus.
+        """
         if defects is not None:
             self._owners[cob_id] = defects
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """From now on ``listener`` gets every batch of frames whole, of all kinds, before any handler does,
-        on the mainline."""
+        """Pass every batch of frames, of all kinds, to ``listener`` from now on, before the handlers.
+
+        On the mainline.
+        """
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """From now on ``listener`` gets no more. On the mainline."""
+        """End :meth:`listen` for this listener. On the mainline."""
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
-        """From now on ``poller`` is told the time, monotonic ns, after a batch of frames and when none come;
-        not more often than every 2 ms. Its exceptions are reported to ``defects``, by default those of the
-        bus."""
+        """Call ``poller`` with the monotonic time after batches of frames, and also when none come.
+
+        Args:
+            poller: Called at most every 2 ms.
+            defects: Gets the exceptions of the poller; by default those of the bus.
+        """
         self._pollers = (*self._pollers, (poller, defects))
 
     def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
-        """Handle ``error``, raised while ``doing`` something with frames. Raises it if there is no bus to
-        continue with, as in a replay."""
+        """Handle ``error``, raised while ``doing`` something with frames.
+
+        Raises:
+            Exception: ``error`` itself, because a replay has no bus to continue with.
+        """
         raise error
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Whoever is fed by a bus wants the frame that comes at one of these times without delay."""
+        """Ignore a prediction: only a bus can fetch a frame early."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
-        """Let a frame that was sent count towards the load. From any thread."""
+        """Count a sent frame towards the load. From any thread."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
@@ -178,7 +207,7 @@ class Dispatcher:
         self._meter.add_all(batch)
 
     def poll(self, now_ns: int) -> None:
-        """Tell the pollers the time, after a batch."""
+        """Call the pollers with the time, after a batch."""
         if not 0 <= now_ns - self._polled_ns < _POLL_NS:
             self._polled_ns = now_ns
             for poll, owner in self._pollers:
@@ -188,13 +217,15 @@ class Dispatcher:
                     self.contain(owner, "polling", defect)
 
     def measure(self, now_ns: int) -> None:
-        """Work out the load, when that is due. It takes as long as forty frames do, so whoever has several
-        buses lets one of them at a time."""
+        """Compute the load if that is due.
+
+        It takes as long as forty frames, so with several buses call it for one of them at a time.
+        """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a frame that is not what its COB-ID promises; log the first of a COB-ID. Mainline only."""
+        """Count a malformed frame; log the first of its COB-ID. Mainline only."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -202,31 +233,26 @@ class Dispatcher:
             self._complained.add(error.cob_id)
             _log.warning("%s: %s; rejected, as are others like it", self.config.name, error)
 
-    def count(
-        self,
-        *,
-        sent: int = 0,
-        dropped: int = 0,
-        outages: int = 0,
-        read: int | None = None,
-        waiting: int = 0,
-        kernel_dropped: int = 0,
-    ) -> BusStats:
-        """All counters; the arguments are those of whoever feeds the dispatcher. From any thread."""
+    def count(self, port: PortCounters = PortCounters()) -> BusStats:
+        """Return all counters. From any thread.
+
+        Args:
+            port: Counters of the interface that feeds the dispatcher.
+        """
         return BusStats(
             received=self._received,
-            sent=sent,
+            sent=port.sent,
             foreign=self._foreign,
             ignored=self._ignored,
             error_frames=self._error_frames,
             bus_offs=self._bus_offs,
             controller=self._bus_state,
             foreign_ids=dict(self._foreign_ids),
-            read=self._received + self._ignored + self._error_frames if read is None else read,
-            waiting=waiting,
-            kernel_dropped=kernel_dropped,
-            dropped=dropped,
-            outages=outages,
+            read=self._received + self._ignored + self._error_frames if port.read is None else port.read,
+            waiting=port.waiting,
+            kernel_dropped=port.kernel_dropped,
+            dropped=port.dropped,
+            outages=port.outages,
             malformed=self._malformed,
             bits=self._marks[-1][1],
             load=self._load,
@@ -234,14 +260,14 @@ class Dispatcher:
 
     def _on_error_frame(self, frame: Frame) -> None:
         self._error_frames += 1
-        if self.config.interface == "socketcan":  # others put other things into them
+        if self.config.interface == "socketcan":  # other interfaces code them differently
             state, before = bus_state(frame), self._bus_state
             if state is not None:
                 self._bus_state = state
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Work out the bits so far; the meter has one owner, so nobody else may ask it."""
+        """Sum the bits so far. The meter has one owner, so only the mainline calls this."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

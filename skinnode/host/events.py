@@ -1,4 +1,4 @@
-"""What happens to the health of a hand, as it happens: events for who subscribes, and lines in the log."""
+"""Events: changes in the health of a hand, for subscribers and for the log."""
 
 from __future__ import annotations
 
@@ -22,30 +22,41 @@ CAPACITY_EVENTS: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class HealthEvent:
-    """A change of health. ``subject`` is the name of a patch or a bus, or ``host``; ``what`` is the new
-    condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that grew, or ``defects``."""
+    """A change of health."""
 
     t_ns: int
     """Monotonic."""
     subject: str
+    """Name of a patch or a bus, or ``host``."""
     what: str
+    """The new condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that grew, or ``defects``.
+    """
     text: str
-    """For people, without the subject."""
+    """Description for people, without the subject."""
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}"
 
 
 class EventSubscription:
-    """The events of a running host from now on. A full queue loses its oldest; ``dropped`` counts. Iterate
-    over it until the host closes, or ask with :meth:`get`."""
+    """The events of a running host from now on. Iterate over it until the host closes, or use :meth:`get`.
+
+    A full queue drops its oldest event; ``dropped`` counts. Any thread may read.
+    """
 
     def __init__(self, capacity: int) -> None:
         self._queue: DropOldestQueue[HealthEvent] = DropOldestQueue(capacity)
         self.dropped = 0
 
     def get(self, timeout_s: float | None = None) -> HealthEvent | None:
-        """The next event, or None after ``timeout_s``, or None at once when the host has closed."""
+        """Return the next event, or None.
+
+        Args:
+            timeout_s: Longest wait, s; None waits without limit.
+
+        Returns:
+            None if no event came in time, or at once if the host has closed.
+        """
         try:
             event = self._queue.get(timeout_s)
         except queue.Empty:
@@ -62,7 +73,7 @@ class EventSubscription:
 
 
 class Events:
-    """All subscriptions to events. One thread tells, any thread subscribes."""
+    """All subscriptions to events. One thread publishes; any thread may subscribe."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects
@@ -71,7 +82,11 @@ class Events:
         self._ended = False
 
     def subscribe(self, capacity: int) -> EventSubscription:
-        """Raises ValueError for a capacity below 1."""
+        """Create a subscription.
+
+        Raises:
+            ValueError: if ``capacity`` is below 1.
+        """
         check_capacity(capacity)
         subscription = EventSubscription(capacity)
         with self._lock:
@@ -81,7 +96,7 @@ class Events:
         return subscription
 
     def publish(self, event: HealthEvent) -> None:
-        """Pass ``event`` to all subscribers and to the log. Never raises."""
+        """Pass an event to all subscribers and to the log. Never raises."""
         try:
             _log.info("%s", event)
         except Exception as error:
@@ -89,7 +104,7 @@ class Events:
         self._offer(event)
 
     def end(self) -> None:
-        """The host has closed."""
+        """End all subscriptions: the host has closed."""
         self._ended = True
         self._offer(End())
 

@@ -1,4 +1,4 @@
-"""The files that a hand file names, held against the wire format that it asks for: EDS and baselines."""
+"""Check the files that a hand file names, EDS and baselines, against its wire format."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ _LONGEST_SHOWN = 40
 
 
 def check_files(hand: HandConfig) -> None:
-    """Read the EDS and the baseline of every patch. Raises ConfigError for the first that is none, or not of
-    the patch."""
+    """Read the EDS and the baseline of every patch.
+
+    Raises:
+        ConfigError: if a file is not valid, or does not fit its patch.
+    """
     for patch in hand.patches:
         profile = PatchProfile.from_config(patch, hand.bus(patch.bus))
         if patch.eds is not None:
@@ -32,8 +35,14 @@ def check_files(hand: HandConfig) -> None:
 
 
 def load_baseline(path: Path, profile: PatchProfile) -> Float:
-    """(U, K) resistances of a text file, ohm, as REAL32 has them. Raises ConfigError for what is no table of
-    that many positive numbers."""
+    """Read a baseline from a text file.
+
+    Returns:
+        (U, K) resistances at rest, ohm, rounded to REAL32.
+
+    Raises:
+        ConfigError: if the file is not a table of that many positive numbers.
+    """
     allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
     text = read_input("baseline", path).decode("utf-8", "replace")
     rows: list[list[float]] = []
@@ -61,10 +70,11 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 def check_eds(path: Path, profile: PatchProfile) -> None:
     """Check that an EDS file describes the wire format of the hand file, in either revision.
 
-    Raises ConfigError if the file cannot be read, and ProfileError if it is not an EDS, or for the first
-    object that differs or is missing.
+    Raises:
+        ConfigError: if the file cannot be read.
+        ProfileError: if it is not an EDS, or an object differs or is missing.
     """
-    from canopen.objectdictionary.eds import import_eds  # whatever the file is called
+    from canopen.objectdictionary.eds import import_eds  # it ignores the file name
 
     data = read_input("EDS", path, MOST_EDS_BYTES)
     try:
@@ -75,7 +85,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     check_form(text, str(path))
     try:
         described = import_eds(io.StringIO(text), None)  # type: ignore[no-untyped-call]
-    except Exception as error:  # the library lets its parser's errors through, whatever they are
+    except Exception as error:  # the library does not catch what its parser raises
         raise no_eds(error, str(path), text) from None
     checked = described.get_variable(od.SUMMARY, od.SUMMARY_CHECK) is not None
     for item in replace(profile, checked=checked).objects():

@@ -1,5 +1,7 @@
-"""A hand frame: the fields of all patches of one SYNC. Gathered by whoever reads, out of the fields as they
-come; no thread of its own."""
+"""Hand frames: the fields of all patches of one SYNC, gathered by the reader of fields.
+
+No thread of its own.
+"""
 
 from __future__ import annotations
 
@@ -15,38 +17,43 @@ from skinnode.host.publish import Subscription, check_timeout
 from skinnode.model.frames import FieldFrame
 
 LATE: Final = "late"
-"""Nothing came in time from a patch that is well."""
+"""Reason for a missing field: the patch is operational, and its field did not come in time."""
 OVERTAKEN: Final = "overtaken"
-"""A newer scan of the patch was there first."""
+"""Reason for a missing field: a newer scan of the patch came first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandFrame:
-    """All patches at one SYNC."""
+    """The fields of all patches at one SYNC."""
 
     scan: int
-    """Number of the SYNC since the host started, unwrapped: the scan number of every field."""
+    """Number of the SYNC since the host started, without wrapping: the scan number of every field."""
     t_sync_ns: int
-    """When it was sent or seen on the last of the buses, monotonic; 0 where it was not. Each field has the
-    time of its own (``sync.stagger_ms``)."""
+    """Monotonic time at which SYNC was sent or received on the last of the buses; 0 if unknown. Each field
+    has its own (``sync.stagger_ms``)."""
     fields: Mapping[str, FieldFrame]
     """By patch."""
     missing: Mapping[str, str]
-    """Why a patch is not among them: :data:`LATE`, :data:`OVERTAKEN`, or the condition it is in, such as
-    ``lost``."""
+    """Why the field of a patch is missing: :data:`LATE`, :data:`OVERTAKEN`, or the condition of the patch,
+    such as ``lost``."""
 
     @property
     def complete(self) -> bool:
-        """Whether every patch is there."""
+        """Whether no patch is missing."""
         return not self.missing
 
 
 class HandGatherer:
-    """Fields in, hand frames out, in ascending order. Plain code with one owner; times are those handed in.
+    """Makes hand frames from fields, in ascending order. No thread and no clock; one owner.
 
-    A frame is ready when every patch that is waited for has given a field of it or a newer one. A patch that
-    gave none for :data:`~skinnode.host.health.SCANS_MISSED` frames running is not waited for until it gives
-    one again, nobody longer than ``patience_ns`` after the first field.
+    A frame is ready when every awaited patch has delivered a field of it or a newer one. A patch that missed
+    :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is not awaited until it delivers again. No
+    patch is awaited for longer than ``patience_ns`` after the first field.
+
+    Args:
+        patches: Names of the patches.
+        patience_ns: Longest wait after the first field of a frame.
+        condition: Returns the condition of a patch.
     """
 
     def __init__(
@@ -57,24 +64,24 @@ class HandGatherer:
         self._until_ns: dict[int, int] = {}
         self._newest = dict.fromkeys(self._patches, 0)
         self._absences = dict.fromkeys(self._patches, 0)
-        self._told = 0
+        self._newest_given = 0
         self.late = 0
-        """Fields that came when the frame they belong to was out."""
+        """Fields that came after their frame was complete or had been given up."""
 
     def add(self, field: FieldFrame, now_ns: int) -> None:
-        """Take a field."""
+        """Add a field, received at monotonic time ``now_ns``."""
         stamp = field.stamp
         assert stamp is not None
         self._newest[stamp.patch] = stamp.scan
         self._absences[stamp.patch] = 0
-        if stamp.scan <= self._told:
+        if stamp.scan <= self._newest_given:
             self.late += 1
             return
         self._open.setdefault(stamp.scan, {})[stamp.patch] = field
         self._until_ns.setdefault(stamp.scan, now_ns + self._patience_ns)
 
     def next(self, now_ns: int) -> HandFrame | None:
-        """The oldest frame, if it is ready."""
+        """Return the oldest frame if it is ready at ``now_ns``, otherwise None."""
         if not self._open:
             return None
         scan = min(self._open)
@@ -82,7 +89,7 @@ class HandGatherer:
             return None
         fields = self._open.pop(scan)
         del self._until_ns[scan]
-        self._told = scan
+        self._newest_given = scan
         absent = [patch for patch in self._patches if patch not in fields]
         for patch in absent:
             self._absences[patch] += 1
@@ -91,7 +98,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """When :meth:`next` has a frame if no field comes before; None while there is none begun."""
+        """Return when :meth:`next` has a frame if no field comes before; None if no frame has begun."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -105,9 +112,11 @@ class HandGatherer:
 
 
 class HandSubscription:
-    """The hand frames of a running host. Iterate over it with ``for`` or ``async for``, or ask with
-    :meth:`get`. Whoever is slow loses the oldest fields, counted in ``dropped``, and then has hand frames
-    with patches missing."""
+    """The hand frames of a running host. Iterate with ``for`` or ``async for``, or use :meth:`get`.
+
+    A slow reader loses the oldest fields, counted in ``dropped``, and then gets hand frames with patches
+    missing. One thread reads.
+    """
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:
         check_timeout(timeout_s)
@@ -120,24 +129,37 @@ class HandSubscription:
 
     @property
     def late(self) -> int:
-        """Fields that came when the frame they belong to was out."""
+        """Fields that came after their frame was complete or had been given up."""
         return self._gatherer.late
 
     def get(self, timeout_s: float | None = None) -> HandFrame | None:
-        """The next frame, or None after ``timeout_s``, or None when the host has closed. Raises the SkinError
-        that stopped the host, if one did."""
+        """Return the next frame, or None.
+
+        Args:
+            timeout_s: Longest wait, s; None waits without limit.
+
+        Returns:
+            None if no frame came in time, or the host has closed.
+
+        Raises:
+            SkinError: that stopped the host, if one did.
+        """
         try:
             return self._next(timeout_s)
         except queue.Empty:
             return None
 
     def close(self) -> None:
-        """Want no more."""
+        """End the subscription."""
         self._fields.close()
 
     def __iter__(self) -> Iterator[HandFrame]:
-        """Frames until the host closes. Raises TimeoutError when none came for the subscription's timeout and
-        the SkinError that stopped the host, if one did."""
+        """Yield frames until the host closes.
+
+        Raises:
+            TimeoutError: if no frame came for the subscription's timeout.
+            SkinError: that stopped the host, if one did.
+        """
         while True:
             try:
                 frame = self._next(self._timeout_s)
@@ -148,7 +170,7 @@ class HandSubscription:
             yield frame
 
     async def __aiter__(self) -> AsyncIterator[HandFrame]:
-        """As ``for``, in an event loop."""
+        """Yield frames in an event loop, as ``for`` does."""
         while True:
             end_ns = _end_ns(self._timeout_s)
             while (frame := self._gatherer.next(time.monotonic_ns())) is None:
@@ -172,7 +194,7 @@ class HandSubscription:
         self.close()
 
     def _next(self, timeout_s: float | None) -> HandFrame | None:
-        """Raises queue.Empty after ``timeout_s``."""
+        """Return the next frame; raise queue.Empty after ``timeout_s``."""
         check_timeout(timeout_s)
         end_ns = _end_ns(timeout_s)
         while (frame := self._gatherer.next(time.monotonic_ns())) is None:
@@ -188,7 +210,7 @@ class HandSubscription:
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Until there is something to do."""
+        """Return the time until there is something to do, s."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - time.monotonic_ns()) * 1e-9 if times else None
 

@@ -1,6 +1,6 @@
-"""How each patch is: what its node says of itself and what it does, side by side.
+"""Health of patches and buses: conditions, and the rules by which facts lead to a condition.
 
-The mainline writes down what it sees (:class:`NodeMonitor`), :func:`judge` draws the conclusion when asked.
+:class:`~skinnode.host.node_monitor.NodeMonitor` collects the facts on the mainline.
 """
 
 from __future__ import annotations
@@ -18,42 +18,43 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Heartbeat periods without one after which a node counts as lost. CiA 301 leaves it to the integrator; one
-may be late behind a burst of frames and one be hit by a bus error."""
+"""Heartbeat periods without a heartbeat after which a node is lost. CiA 301 leaves it to the integrator; one
+may be delayed by a burst of frames and one be destroyed by a bus error."""
 
 SCANS_MISSED: Final = 3
-"""SYNC periods without a scan after which a patch counts as stale."""
+"""SYNC periods without a scan after which a patch is stale."""
 
 SYNCS_MISSED: Final = 5
-"""SYNC periods without one after which a guest says so; a patch is stale by then."""
+"""SYNC periods without SYNC after which a bus of another master lacks SYNC; its patches are stale by then."""
 
 
 class Condition(enum.StrEnum):
-    """The one word for a patch."""
+    """The state of a patch in one word."""
 
     NEVER_SEEN = "never seen"
     BOOTING = "booting"
-    """Heard, not operational yet."""
+    """The node sends, but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
     """Operational by its heartbeat, but no scans arrive, or all are withheld."""
     RESTARTING = "restarting"
-    """Restarting by itself in a loop: see :data:`LOOP_RESTARTS`. A node that restarted once, or that is
-    operational again and has not restarted for 0.5 s, has the condition of its present state."""
+    """The node restarts by itself in a loop: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. A node
+    that restarted once, or that is operational again and has not restarted for 0.5 s, has the condition of
+    its present state."""
     FROZEN = "frozen"
-    """Scans come, but always with the same values: see :mod:`skinnode.host.code_watch`."""
+    """Scans arrive, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
     """The node's error register is not zero, or the host had a defect while serving the patch:
     :attr:`PatchHealth.defect`."""
     REFUSED = "refused"
-    """It answers, but is not what the hand file says, or does not keep its configuration."""
+    """The node answers, but is not what the hand file says, or does not keep its configuration."""
     LOST = "lost"
-    """Was there, and its heartbeat stopped."""
+    """The heartbeat of the node stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Health of a patch at one instant. Ages are None where the thing was never seen."""
+    """Health of a patch at one instant. An age is None if the event never occurred."""
 
     patch: str
     node_id: int
@@ -64,26 +65,27 @@ class PatchHealth:
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """EMCY messages with an error, since the host started."""
+    """EMCY messages that reported an error, since the host started."""
     last_emergency: int | None
     """Code of the newest of them."""
     emergency_text: str
-    """The newest of them in words; empty before the first."""
+    """Description of the newest of them; empty before the first."""
     error_register: int
     rejoins: int = 0
     """Times the node came back and was brought up again since the host started."""
     refusal: str | None = None
-    """Why a node that answers is not taken up: another identity or layout, a configuration not kept."""
+    """Why a node that answers is not used: another identity or layout, or a configuration not kept."""
     restarts_in_a_loop: bool = False
-    """It restarted by itself three times within ten seconds, and goes on."""
+    """Whether the node restarted by itself three times within ten seconds, and continues to."""
     duplicate_id: bool = False
-    """Heartbeats come more often than one node sends them."""
+    """Whether heartbeats come more often than one node sends them."""
     conflicts: int = 0
-    """Frames that contradict others of their scan: a node that counts wrongly, or two with one node-ID."""
+    """Frames that contradict others of their scan: the node counts wrongly, or two nodes share a node-ID."""
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""
     defect: str | None = None
-    """Operation of the host and the exception that it raised, until the patch has been brought up again."""
+    """Operation of the host that raised an exception, and the exception, until the patch is brought up again.
+    """
     slow_overruns: int = 0
     """Number of emergencies 0x8110 that report a computer or bus too slow for the node's scans."""
     baselines: int = 0
@@ -143,9 +145,9 @@ class BusHealth:
 
     bus: str
     away: str | None
-    """Why the interface is away; None while it is there."""
+    """Why the interface is away; None while it works."""
     load: float
-    """Share of the last second that frames took."""
+    """Share of the last second taken by frames."""
     error_frames: int
     bus_offs: int
     outages: int
@@ -154,16 +156,17 @@ class BusHealth:
     """Frames that found the host's own queue full."""
     malformed: int
     foreign: int
-    """Frames of COB-IDs that the hand file does not explain: those of ``foreign_ids``."""
+    """Frames with COB-IDs that the hand file does not explain: those of ``foreign_ids``."""
     foreign_ids: tuple[int, ...]
     other_syncs: int
-    """SYNC of another producer, where the host is the master."""
+    """SYNC messages of another producer on a bus where the host is the master."""
     other_masters: int
-    """NMT commands, SDO requests to our nodes, or our own heartbeat, from somebody else."""
+    """NMT commands, SDO requests to nodes of the hand, or heartbeats with the host's node-ID, from another
+    sender."""
     controller: BusState | None = None
-    """What the interface said last of its controller; None where it said nothing, and where it does not."""
+    """Newest reported state of the controller; None if none was reported."""
     no_sync: bool = False
-    """Where the host is a guest: none of its master's SYNCs has come for :data:`SYNCS_MISSED` periods."""
+    """Whether another master runs the bus and its SYNC has not come for :data:`SYNCS_MISSED` periods."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,10 @@ from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""How often the watch looks: what is over sooner shows in counters alone."""
+"""Interval of the checks, s: a change that ends sooner shows only in counters."""
 
 _QUIET_NS: Final = 1_000_000_000
-"""A counter that keeps growing is told of this often."""
+"""Minimum interval between events of a counter that keeps growing."""
 
 
 _PATCH_COUNTERS: Final = {
@@ -27,7 +27,8 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters, and what is counted: one, and several where that is not one and an s."""
+"""Counters of :class:`PatchHealth`, each with the singular of what it counts, and the plural if that is
+irregular."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -39,11 +40,14 @@ _BUS_COUNTERS: Final = {
     "other_syncs": ("SYNC of another producer", "SYNCs of another producer"),
     "other_masters": ("command of another master", "commands of another master"),
 }
+"""Counters of :class:`BusHealth`, likewise."""
 
 
 class HealthWatch:
-    """Looks at the health of all patches and buses, on a thread of its own from construction to
-    :meth:`close`, and tells what changed."""
+    """Compares the health of all patches and buses with the last check, and publishes what changed.
+
+    Threads: one of its own checks, from construction to :meth:`close`.
+    """
 
     def __init__(
         self,
@@ -64,7 +68,7 @@ class HealthWatch:
         self._thread.start()
 
     def close(self) -> None:
-        """End and join the thread, after a last look."""
+        """End and join the thread, after a last check."""
         self._stop.set()
         self._thread.join()
 
@@ -80,8 +84,10 @@ class HealthWatch:
         keep_on(self._turn, self._defects, "watching the health")
 
     def _turn(self) -> bool:
-        """Wait, then compare the health with the last check. Returns False after the last check. A check that
-        raised is repeated: an event may come twice, but none is missed."""
+        """Wait, then check. Returns False after the last check.
+
+        A check that raised is repeated: an event may come twice, but none is missed.
+        """
         if self._ended:
             return False
         self._ended = self._stop.wait(_CHECK_S)

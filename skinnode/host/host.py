@@ -85,7 +85,7 @@ class Host:
 
     @classmethod
     @contextlib.contextmanager
-    def from_toml(
+    def from_toml(  # noqa: PLR0913 - public keyword arguments
         cls,
         path: Path | str,
         *,
@@ -123,7 +123,7 @@ class Host:
 
     @classmethod
     @contextlib.contextmanager
-    def from_config(
+    def from_config(  # noqa: PLR0913 - public keyword arguments
         cls,
         hand: HandConfig,
         *,

@@ -1,4 +1,4 @@
-"""One bus of the hand: its port, and what becomes of what is received there and sent."""
+"""One bus of the hand: its port, what is sent on it, and what is received from it."""
 
 from __future__ import annotations
 
@@ -14,25 +14,34 @@ from skinnode.canopen.indices import SYNC_COB_ID, sdo_response_cob_id
 from skinnode.config import BusConfig
 from skinnode.errors import BusError, CodecError, SkinError
 from skinnode.host.containment import Defects, Pause, keep_on, one_line
-from skinnode.host.dispatcher import BusStats, Dispatcher, Handler
+from skinnode.host.dispatcher import BusStats, Dispatcher, Handler, PortCounters
 from skinnode.host.sdo_client import RemoteOd, SkinNetwork
 from skinnode.transport import CanPort, Frame, Intake
 
 _log = logging.getLogger(__name__)
 
 _REOPEN_S: Final = 0.1
-"""Pause before an interface that failed is opened again."""
+"""Pause before a failed interface is reopened, s."""
 
 
 class BusLink(Dispatcher):
-    """An open bus, from construction to :meth:`close` or the end of a ``with`` block. A
-    :class:`~skinnode.host.mainline.Mainline` makes it dispatch what comes.
+    """An open bus, from construction to :meth:`close` or the end of a ``with`` block.
 
-    ``handlers`` get the data frames of their COB-IDs, on the mainline. An exception in a handler, a poller, a
-    listener or a job loses that frame or call; an exception in the mainline's own work pauses the bus, while
-    received frames wait. ``on_defect`` is called with the first occurrence of each complaint, on the thread
-    that raised it. Raises BusError if the interface does not open. An interface that fails later is reopened
-    until it is back.
+    An exception in a handler, a poller, a listener or a job loses that frame or call; an exception in the
+    mainline's own work pauses the bus, while received frames wait. An interface that fails later is reopened
+    until it works.
+
+    Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
+    :class:`~skinnode.host.mainline.Mainline` calls the rest. A thread of its own reopens the interface.
+
+    Args:
+        config: The bus.
+        handlers: Called on the mainline with the data frames of their COB-IDs.
+        on_defect: Called with the first occurrence of each complaint, on the thread that raised it.
+        open_port: Opens the interface.
+
+    Raises:
+        BusError: if the interface does not open.
     """
 
     def __init__(
@@ -48,12 +57,12 @@ class BusLink(Dispatcher):
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
-        """Why the bus is away; None while it is there."""
-        self._due_s = 0.0  # when an interface that was opened again and has not failed counts as back
+        """Why the bus is away; None while it works."""
+        self._due_s = 0.0  # when a reopened interface that has not failed counts as working
         self._outages = 0
         self.t_dispatched_ns = 0
-        """What was received up to then has been dispatched, monotonic."""
-        self._rests = False  # while the bus is away, and for a while after a defect
+        """Monotonic time: all frames received up to then have been dispatched."""
+        self._rests = False  # True while the bus is away, and for a while after a defect
         self._rest_end_s = 0.0
         self._opening = False
         self._pause = Pause()
@@ -64,11 +73,15 @@ class BusLink(Dispatcher):
         self._stop = threading.Event()
         self._port = open_port(config)
         self.intake = Intake(self._port)
-        """What is received and not dispatched yet."""
+        """Queue of received frames."""
         self.network = SkinNetwork(self.send)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a data frame, from any thread. Raises BusError."""
+        """Send a data frame. Any thread.
+
+        Raises:
+            BusError: if the interface does not take it.
+        """
         t_ns = time.monotonic_ns()
         self._port.send(can_id, data)
         try:  # the frame is sent; a listener must not fail the caller
@@ -86,9 +99,14 @@ class BusLink(Dispatcher):
         on_answer: Callable[[int], None] = lambda t_ns: None,
         defects: Defects | None = None,
     ) -> RemoteOd:
-        """Return the object dictionary of a node on this bus; ``on_answer`` is called when it answers.
-        ``defects`` as in :meth:`handle`; with them, an exception in a transfer that is retried counts as a
-        defect of the bus."""
+        """Return the object dictionary of a node on this bus.
+
+        Args:
+            node_id: Node-ID of the node.
+            on_answer: Called with the monotonic time of each SDO response, on the mainline.
+            defects: As of :meth:`handle`; if given, an exception in a transfer that is retried counts for the
+                bus.
+        """
 
         def on_response(data: bytes, t_ns: int) -> None:
             if len(data) != 8:
@@ -104,7 +122,11 @@ class BusLink(Dispatcher):
         return RemoteOd(self.network, node_id, lambda error: self.defects.report(doing, error))
 
     def ask_remote(self, can_id: int) -> None:
-        """Send a remote frame, as guarding does, from any thread. Raises BusError."""
+        """Send a remote frame, as node guarding does. Any thread.
+
+        Raises:
+            BusError: if the interface does not take it.
+        """
         t_ns = time.monotonic_ns()
         self._port.send(can_id, b"", remote=True)
         self.intake.asked(t_ns)
@@ -112,17 +134,20 @@ class BusLink(Dispatcher):
             listener(Frame(can_id, b"", t_ns, remote=True))
 
     def listen_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """From now on ``listener`` gets every frame that was sent, with the time at which it was handed to
-        the interface, on the thread that sent it."""
+        """Pass every sent frame and its time of sending to ``listener``, on the sending thread."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """From now on ``listener`` gets no more. On the mainline."""
+        """End :meth:`listen_to_sent` for this listener. On the mainline."""
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
-        """Run ``job`` on the mainline, before any frame received from now on. ``defects`` as in
-        :meth:`handle`."""
+        """Run ``job`` on the mainline before it dispatches any frame received from now on. Any thread.
+
+        Args:
+            job: The function to run.
+            defects: Gets its exception; by default those of the bus.
+        """
         self._jobs.append((job, self.defects if defects is None else defects))
 
     def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
@@ -130,13 +155,16 @@ class BusLink(Dispatcher):
         (self.defects if owner is None else owner).report(doing, error)
 
     def stats(self) -> BusStats:
+        """Return all counters."""
         return self.count(
-            sent=self._port.sent,
-            dropped=self.intake.dropped,
-            outages=self._outages,
-            read=self._port.received,
-            waiting=self.intake.queued,
-            kernel_dropped=self._port.dropped,
+            PortCounters(
+                sent=self._port.sent,
+                dropped=self.intake.dropped,
+                outages=self._outages,
+                read=self._port.received,
+                waiting=self.intake.queued,
+                kernel_dropped=self._port.dropped,
+            )
         )
 
     def close(self) -> None:
@@ -154,11 +182,11 @@ class BusLink(Dispatcher):
     # --- the mainline's
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """As :meth:`Intake.expect`."""
+        """Predict arrivals, as :meth:`Intake.expect`."""
         self.intake.expect(what, times_ns)
 
     def begin(self, resume: Callable[[], None]) -> None:
-        """Before the first turn. ``resume``: receives again on an interface that was opened again."""
+        """Prepare for the first turn; ``resume`` is called to receive again on a reopened interface."""
         self._resume = resume
 
     def turn(self) -> None:
@@ -179,7 +207,7 @@ class BusLink(Dispatcher):
             self.defects.report("dispatching frames", error)
 
     def measure_load(self) -> None:
-        """As :meth:`measure`, at the time up to which was dispatched. Raises nothing."""
+        """Measure the load at the time up to which frames were dispatched. Never raises."""
         try:
             if not self._rests and self.t_dispatched_ns * 1e-9 >= self._load_due_s:
                 self.measure(self.t_dispatched_ns)
@@ -188,14 +216,14 @@ class BusLink(Dispatcher):
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
-        """After the last turn: open the interface no more."""
+        """End after the last turn: reopen the interface no more."""
         self._stop.set()
         if self._reopening is not None:
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
-        """One batch of frames to their handlers; whether there was any."""
-        seen_ns = self.intake.seen_ns  # first: whatever came before it is in the batch
+        """Dispatch one batch of frames. Returns whether there was any."""
+        seen_ns = self.intake.seen_ns  # read first: the batch then holds all frames that came before it
         batch = self.intake.take()
         while self._jobs:
             job, owner = self._jobs.popleft()
@@ -203,8 +231,8 @@ class BusLink(Dispatcher):
                 job()
             except Exception as error:
                 owner.report("a job of the mainline", error)
-        # While frames wait, here or in the interface, time is that of the newest one dispatched: nothing is
-        # late because we are.
+        # While frames wait, here or in the interface, time is that of the newest dispatched one, so that a
+        # delay of the host makes no node late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns
@@ -246,8 +274,7 @@ class BusLink(Dispatcher):
         self._reopening = thread  # set after start(): a thread that did not start cannot be joined
 
     def _reopen(self) -> None:
-        """Reopen the interface. If it does not open, or fails at once, retries after a pause, longer after a
-        defect."""
+        """Reopen the interface. If that fails, retry after a pause, a longer one after a defect."""
         keep_on(self._reopens_not, self.defects, "reopening the interface")
 
     def _reopens_not(self) -> bool:

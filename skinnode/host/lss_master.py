@@ -1,10 +1,9 @@
-"""Layer setting services, the master's side (CiA 305 v3.0): nodes without a node-ID are found, a node is
-selected by its address, gets a node-ID and a bit rate, and stores them.
+"""LSS master (CiA 305 v3.0): finds nodes without a node-ID, and sets node-ID and bit rate of a node.
 
-A slave that does not agree is silent, so every *no* costs a waiting time. Answers bear no number: one that
-comes late, to a question that was given up, looks like one to the question of now. So a node counts as found
-or selected only when it has told its own address, which nobody else's answer can; and a service that got no
-answer is given up only when none can be under way any more.
+A slave that does not match is silent, so every *no* costs a waiting time. Responses have no number: a late
+response to an earlier request looks like one to the present request. So a node counts as found or selected
+only once it has sent its own address, which no other response equals; and after a service without a response
+the master waits until no response can still arrive.
 """
 
 from __future__ import annotations
@@ -31,24 +30,24 @@ from skinnode.canopen.lss import (
 from skinnode.errors import BusError
 
 ANSWER_S: Final = 0.1
-"""How long an answer may take; the frame has the lowest priority but for heartbeats."""
+"""Longest wait for a response, s; only heartbeats have a lower priority."""
 
 STORE_ANSWER_S: Final = 2.0
-"""Longest time to the answer to the store command: the node writes to flash memory, or to a file that it
-synchronises to disk. CANopenNode's LSS master waits 1 s for any answer."""
+"""Longest wait for the response to the store command, s: the node writes to flash memory, or to a file that
+it synchronises to disk. CANopenNode's LSS master waits 1 s for any response."""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""The same within a fastscan, where every *no* is waited for; the longer one where the first found nobody
-who agrees in the end."""
+"""Waiting times in a fastscan, where every *no* costs one, s; the longer one if the first attempt found no
+node."""
 
 _TRIES: Final = 2
-"""Questions of which silence means that nobody is there; a busy machine may miss one."""
+"""Requests without a response after which no node is assumed; a busy machine may miss one."""
 
 _SETTLE: Final = 0.2
-"""Share of the waiting time that the answers of several slaves to one question may lie apart."""
+"""Share of the waiting time by which the responses of several slaves to one request may differ."""
 
 _UNDER_WAY_S: Final = 0.4
-"""After which an answer that was due is not waited for, nor feared, any more."""
+"""Time after which a missing response cannot arrive any more, s."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
@@ -57,12 +56,15 @@ _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
 
 
 class LssFailed(BusError):
-    """A slave refused a service or fell silent."""
+    """A slave refused a service, or did not answer."""
 
 
 class LssMaster:
-    """Speaks through ``send``; :meth:`on_response` gets what comes on 0x7E4. One thread at a time may ask,
-    but for :meth:`give_node_id`, which waits for its turn."""
+    """LSS master on one bus. It sends with ``send``; :meth:`on_response` gets the frames of COB-ID 0x7E4.
+
+    Threads: one thread at a time may use it, except that :meth:`give_node_id` waits for its turn; the
+    mainline calls :meth:`on_response`.
+    """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         self._send = send
@@ -70,14 +72,21 @@ class LssMaster:
         self._dialogue = threading.Lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """A frame of a slave. One that is not of 8 bytes is ignored, as the standard wants it."""
+        """Take a response of a slave. One without 8 bytes is ignored, as the standard requires."""
         if len(data) == 8:
             self._answers.put(data)
 
     def give_node_id(self, serial: int, node_id: int) -> bool:
-        """Have the patch with this serial number boot at ``node_id``; False where there is none, or it does
-        not take it. A patch that is there already is left alone. Nothing is stored in it: that is for
-        technicians. Raises BusError."""
+        """Make the patch with this serial number boot at ``node_id``, without storing it.
+
+        Storing is left to technicians. A patch that has the node-ID already stays unchanged.
+
+        Returns:
+            Whether there is such a patch and it took the node-ID.
+
+        Raises:
+            BusError: if a frame cannot be sent.
+        """
         with self._dialogue:
             if self.select_patch(serial) is None:
                 return False
@@ -87,7 +96,7 @@ class LssMaster:
                     self.set_node_id(node_id)
             except LssFailed:
                 return False
-            finally:  # a slave without a node-ID boots when it is let go
+            finally:  # a slave without a node-ID boots when it is released
                 self.release()
             if active not in (None, node_id):
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
@@ -96,16 +105,22 @@ class LssMaster:
     # --- who is there
 
     def any_unconfigured(self) -> bool:
-        """Return whether there is a node without a node-ID. Sends *identify non-configured remote slave* and
-        the first request of fastscan, because some stacks (CANopenNode) support fastscan only."""
+        """Return whether there is a node without a node-ID.
+
+        Sends *identify non-configured remote slave* and the first request of fastscan, because some stacks
+        (CANopenNode) support fastscan only.
+        """
         wanted = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
         if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) for _ in range(_TRIES)):
             return True
         return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
     def find_unconfigured(self) -> LssAddress | None:
-        """One node without a node-ID, by fastscan; it is in configuration until :meth:`release`. None where
-        there is none, or nobody agrees in the end."""
+        """Find a node without a node-ID by fastscan; it is in configuration state until :meth:`release`.
+
+        Returns:
+            Its address, or None if no node was found.
+        """
         for answer_s in _SCAN_ANSWERS_S:
             if self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is None:
                 return None
@@ -122,7 +137,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """The part of the address of the node that stays in the race; None where nobody agrees in the end."""
+        """Return one part of the address of the node that remains in the scan; None if no node remains."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -136,14 +151,14 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        if answer is not None:  # others may agree a little later: not to the next question
+        if answer is not None:  # other slaves may answer a little later, before the next request
             time.sleep(answer_s * _SETTLE)
         return answer
 
     # --- one node
 
     def select(self, address: LssAddress) -> bool:
-        """Switch the node with that address to configuration; False where there is none."""
+        """Switch the node with that address to configuration state. Returns whether there is one."""
         self.release()
         for command, value in enumerate(address[:3], LssCommand.SELECT_VENDOR):
             self._request(command, value.to_bytes(4, "little"))
@@ -156,8 +171,11 @@ class LssMaster:
         return False
 
     def select_patch(self, serial: int) -> LssAddress | None:
-        """Switch the patch with this serial number, of any revision, to LSS configuration state. Returns its
-        address, or None if there is no such patch."""
+        """Switch the patch with this serial number, of any revision, to configuration state.
+
+        Returns:
+            Its address, or None if there is no such patch.
+        """
         for revision in _REVISIONS:
             address = LssAddress(od.VENDOR_ID, od.PRODUCT_CODE, revision, serial)
             if self.select(address):
@@ -165,25 +183,37 @@ class LssMaster:
         return None
 
     def _is_in_configuration(self, address: LssAddress) -> bool:
-        """Whether the node in configuration says that it has that address."""
+        """Return whether the node in configuration state answers that it has that address."""
         return all(
             self._ask(command, b"", bytes((command,)) + value.to_bytes(4, "little")) is not None
             for command, value in enumerate(address, LssCommand.INQUIRE_VENDOR)
         )
 
     def node_id(self) -> int | None:
-        """Of the node in configuration; None for none. Raises LssFailed."""
+        """Return the node-ID of the node in configuration state; None if it has none.
+
+        Raises:
+            LssFailed: if the node does not answer.
+        """
         answer = self._must(LssCommand.INQUIRE_NODE_ID, b"", "the inquiry for its node-ID")
         return None if answer[1] == NOT_CONFIGURED else answer[1]
 
     def set_node_id(self, node_id: int) -> None:
-        """It counts from the node's next reset of communication on. Raises LssFailed."""
+        """Set the node-ID that the node has after its next reset of communication.
+
+        Raises:
+            LssFailed: if the node refuses or does not answer.
+        """
         answer = self._must(LssCommand.CONFIGURE_NODE_ID, bytes((node_id,)), f"node-ID {node_id}")
         _require_done(answer, f"node-ID {node_id}")
 
     def set_bit_rate(self, bitrate_bps: int) -> None:
-        """It counts from the node's next power-on on, if stored. Raises LssFailed, ValueError for a bit rate
-        that CiA 301 does not have."""
+        """Set the bit rate that the node has after its next power-on, if it is stored.
+
+        Raises:
+            LssFailed: if the node refuses or does not answer.
+            ValueError: if CiA 301 does not define the bit rate.
+        """
         codes = {rate: code for code, rate in BIT_RATES_BPS.items()}
         if bitrate_bps not in codes:
             raise ValueError(f"bitrate: got {bitrate_bps}, must be one of {', '.join(map(str, codes))}")
@@ -192,12 +222,16 @@ class LssMaster:
         _require_done(self._must(LssCommand.CONFIGURE_BIT_TIMING, request, what), what)
 
     def store(self) -> None:
-        """Have the node keep its node-ID and bit rate over a power cycle. Raises LssFailed."""
+        """Make the node keep its node-ID and bit rate over a power cycle.
+
+        Raises:
+            LssFailed: if the node refuses or does not answer.
+        """
         answer = self._must(LssCommand.STORE, b"", "the store command", STORE_ANSWER_S)
         _require_done(answer, "the store command")
 
     def release(self) -> None:
-        """All nodes back to waiting; one that got its first node-ID boots."""
+        """Switch all nodes to waiting state; a node that got its first node-ID boots."""
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
     # --- frames
@@ -212,8 +246,11 @@ class LssMaster:
     def _ask(
         self, command: int, data: bytes = b"", wanted: bytes | None = None, answer_s: float = ANSWER_S
     ) -> bytes | None:
-        """The answer to a request, None where there is none in time: the first that begins with ``wanted``,
-        by default with the command itself. Others belong to a question before."""
+        """Send a request and return the first response in time that begins with ``wanted``.
+
+        By default that is the command. Other responses belong to earlier requests. Returns None if there is
+        none.
+        """
         wanted = bytes((command,)) if wanted is None else wanted
         while not self._answers.empty():
             self._answers.get()

@@ -1,4 +1,4 @@
-"""The mainline context: one thread that dispatches what is received on all buses."""
+"""The mainline: one thread that dispatches the frames received on all buses."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ from skinnode.host.link import BusLink
 from skinnode.transport import Receiver
 
 _WAIT_S: Final = 0.02
-"""How long it waits for a frame before it looks at the clock for scans that lack something."""
+"""Longest wait for a frame, after which pollers run, s."""
 
 
 class Mainline:
-    """Receives on ``links`` and makes them dispatch, from construction until :meth:`stop` or the end of a
-    ``with`` block. What goes wrong on one of them does not keep the others from it.
+    """Receives and dispatches on ``links``, from construction to :meth:`stop` or the end of a ``with`` block.
 
-    One thread for all: frames of all buses come at the same time, and waking costs as much as twenty of them.
-    Exceptions raised outside the service of a bus are reported to ``defects``, by default those of the first
-    bus.
+    A failure on one bus does not affect the others.
+
+    Threads: one for all buses, because their frames come at the same time, and waking costs as much as twenty
+    frames.
+
+    Args:
+        links: The buses.
+        defects: Gets exceptions raised outside the service of a bus; by default those of the first bus.
     """
 
     def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:
@@ -40,7 +44,7 @@ class Mainline:
         self._thread.start()
 
     def stop(self) -> None:
-        """End and join all threads; frames can still be sent. Stopping twice is fine."""
+        """End and join all threads; frames can still be sent. Stopping twice is allowed."""
         self._stop.set()
         self._thread.join()
         for link in self._links:

@@ -12,7 +12,7 @@ from skinnode.protocol.profile import PatchProfile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeFacts:
-    """What bring-up learned about a patch."""
+    """Facts about a patch, learned while its node was configured."""
 
     config: PatchConfig
     layout: PatchLayout
@@ -21,12 +21,12 @@ class NodeFacts:
     baseline_ohm: Float
     """(U, K) resistances at rest, as the node encodes with them."""
     serial: int | None
-    """None where nobody could ask."""
+    """Serial number; None if the host may not ask."""
     heartbeat_s: float
-    """How often the node sends one."""
+    """Heartbeat period of the node, s."""
     checked: bool = False
     """Whether the node is known to send a check with every scan; False if its revision could not be read."""
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """The same patch after a tare."""
+        """Return the facts after a tare."""
         return replace(self, baseline_ohm=baseline_ohm)

@@ -24,7 +24,7 @@ from skinnode.host.health import (
 _log = logging.getLogger(__name__)
 
 RESTART_MEMORY_NS: Final = 5_000_000_000
-"""How long after the last of its restarts a node that restarts in a loop is said to do so."""
+"""Time after the last restart during which a node counts as restarting in a loop."""
 
 SETTLED_NS: Final = 500_000_000
 """Time after the last restart in a loop during which a node counts as restarting although it is operational
@@ -32,16 +32,24 @@ again, ns."""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""A node that restarted by itself this often within this time does so in a loop."""
+"""Restarts of a node by itself, and the time within which they make a loop."""
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Two nodes with one node-ID send a heartbeat every half period on average; over a dozen, a single one that
-was held up and makes up for it does not come near."""
+"""Heartbeats observed, and the share of their expected duration below which two nodes send them. Two nodes
+with one node-ID send one every half period on average; a single node that catches up after a delay does not
+come near."""
 
 
 class NodeMonitor:
-    """Facts about one node, written by the mainline only."""
+    """Facts about one node. Written on the mainline; :meth:`health` may be called from any thread.
+
+    Args:
+        patch: Name of the patch.
+        node_id: Node-ID of its node.
+        on_reject: Called with each malformed heartbeat and EMCY.
+        watch: Evaluates the codes of the patch.
+    """
 
     def __init__(
         self,
@@ -55,7 +63,7 @@ class NodeMonitor:
         self._beats: deque[int] = deque(maxlen=BEATS)
         self._restarts: deque[int] = deque(maxlen=LOOP_RESTARTS)
         self.on_reject = on_reject
-        """Told of each heartbeat and EMCY of a length that they do not have."""
+        """Called with each malformed heartbeat and EMCY."""
         self.nmt_state: int | None = None
         self._t_heartbeat_ns: int | None = None
         self._t_scan_ns: int | None = None
@@ -68,32 +76,32 @@ class NodeMonitor:
         self.refusal: str | None = None
         self.defect: str | None = None
         self.complaint: str | None = None
-        """All three set by the supervisor."""
+        """Like ``refusal`` and ``defect``, set by the supervisor."""
 
     @property
     def boot_ups(self) -> int:
-        """Boot-up messages so far."""
+        """Number of boot-up messages."""
         return self._boot_ups
 
     @property
     def t_heartbeat_ns(self) -> int | None:
-        """When the newest heartbeat or boot-up was received."""
+        """Monotonic time of the newest heartbeat or boot-up; None before the first."""
         return self._t_heartbeat_ns
 
     @property
     def t_scan_ns(self) -> int | None:
-        """When the last frame of the newest scan was received."""
+        """Monotonic time of the last frame of the newest scan; None before the first."""
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Heartbeat or boot-up. One of another length than a byte is rejected."""
+        """Take a heartbeat or boot-up; reject it if it is not one byte long."""
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
         state = data[0] & STATE_MASK  # bit 7 is the toggle bit of node guarding
         if state == NmtState.INITIALISING:
             self._boot_ups += 1
-            self._on_register(0)  # as after any reset; an error that is still there is told anew
+            self._on_register(0)  # as after any reset; an error that persists is reported again
             if self.running:
                 self._restarts.append(t_ns)
                 _log.warning("node %d (%s) restarted by itself", self.node_id, self.patch)
@@ -103,7 +111,10 @@ class NodeMonitor:
         self._t_heartbeat_ns = t_ns
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
-        """EMCY: u16 code, u8 error register, five bytes of the maker. Code 0 says that the error is gone."""
+        """Take an EMCY: u16 code, u8 error register, five manufacturer bytes.
+
+        Code 0 means that the error is gone.
+        """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))
             return
@@ -116,17 +127,21 @@ class NodeMonitor:
 
     @property
     def error_register(self) -> int:
-        """As the node said last."""
+        """Error register as last reported."""
         return self._error_register
 
     @property
     def registers_said(self) -> int:
-        """How often it said so."""
+        """Number of times the error register was reported."""
         return self._registers_said
 
     def on_register_read(self, register: int, said: int) -> None:
-        """The answer to who asked for the error register when it had been said ``said`` times: void if an
-        emergency or a boot-up came since, which may be newer."""
+        """Take an error register read by SDO, unless a newer report came since the request.
+
+        Args:
+            register: The value read.
+            said: :attr:`registers_said` at the time of the request.
+        """
         if said == self._registers_said:
             self._on_register(register)
 
@@ -135,11 +150,12 @@ class NodeMonitor:
         self._registers_said += 1
 
     def said_since(self, state: int, t_ns: int) -> bool:
-        """Whether the newest heartbeat came after ``t_ns`` and carried ``state``."""
+        """Return whether the newest heartbeat came after ``t_ns`` and reported ``state``."""
         heard_ns = self._t_heartbeat_ns
         return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
 
     def on_scan(self, t_ns: int) -> None:
+        """Note that a scan ended at monotonic time ``t_ns``."""
         self._t_scan_ns = t_ns
 
     def health(
@@ -150,9 +166,16 @@ class NodeMonitor:
         conflicts: int = 0,
         t_passed_ns: int | None = None,
     ) -> PatchHealth:
-        """Return the health at ``now_ns`` of a node with these heartbeat and scan periods.
-        ``t_passed_ns``: monotonic time at which the newest scan that was not withheld was received; 0 before
-        the first, None if scans are never withheld."""
+        """Return the health of the patch.
+
+        Args:
+            now_ns: Monotonic time.
+            heartbeat_s: Heartbeat period of the node, s.
+            scan_s: Scan period, s.
+            conflicts: Frames that contradict others of their scan.
+            t_passed_ns: Monotonic time at which the newest scan that was not withheld was received; 0 before
+                the first, None if scans are never withheld.
+        """
 
         def age_s(t_ns: int | None) -> float | None:
             return None if t_ns is None else max(0, now_ns - t_ns) * 1e-9
@@ -185,7 +208,9 @@ class NodeMonitor:
             boot_ups=self._boot_ups,
             emergencies=self._emergencies,
             last_emergency=None if self._last_emergency is None else self._last_emergency[0],
-            emergency_text="" if self._last_emergency is None else self._told(*self._last_emergency),
+            emergency_text=""
+            if self._last_emergency is None
+            else self._emergency_text(*self._last_emergency),
             error_register=self._error_register,
             rejoins=self.rejoins,
             slow_overruns=self._slow_overruns,
@@ -202,9 +227,11 @@ class NodeMonitor:
             and scan_age_s <= SCANS_MISSED * scan_s,
         )
 
-    def _told(self, code: int, detail: bytes) -> str:
-        """Return the text of an emergency: that of a skinnode patch, unless the node is refused, because it
-        may be another device."""
+    def _emergency_text(self, code: int, detail: bytes) -> str:
+        """Return the text of an emergency, that of a skinnode patch unless the node is refused.
+
+        A refused node may be another device.
+        """
         return error_text(code, detail, ours=self.refusal is None)
 
     def _in_a_loop(self, now_ns: int) -> bool:
@@ -214,7 +241,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Two nodes send twice as many heartbeats as one."""
+        """Return whether heartbeats come as often as two nodes send them."""
         beats, period_ns = list(self._beats), heartbeat_s * 1e9
         if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
             return False

@@ -20,20 +20,20 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""How long a node may take to say that it is operational: four heartbeats."""
+"""Longest time to a heartbeat that reports operational after the start command, s: four heartbeats."""
 
 _PROBE_NS: Final = 250_000_000
-"""A node that is not there is asked for this often: its boot-up may have been lost, and one that sends no
-heartbeat would never be noticed. 0.1 % of a bus for four."""
+"""Interval of requests to an absent node: its boot-up may have been lost, and a node without a heartbeat
+would never be noticed. For four nodes 0.1 % of a bus."""
 
 _SEARCH_NS: Final = 1_000_000_000
-"""Pause between two searches by LSS for a node that is not there."""
+"""Interval of searches by LSS for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Silence after which a node is no longer reported as refused or faulty, ns."""
+"""Silence after which a node is no longer reported as refused or faulty."""
 
 _MUTE_NS: Final = 1_000_000_000
-"""Minimum time between two readings of the configuration of a node that sends no scans."""
+"""Minimum interval between two readings of the configuration of a node that sends no scans."""
 
 
 class NodeSupervision:
@@ -47,6 +47,7 @@ class NodeSupervision:
         self._baselines = BaselineWatch(pool)
 
     def look(self, node: Supervised, now_ns: int) -> None:
+        """Decide what happens to a node now, at monotonic time ``now_ns``."""
         count = node.remote.defects.count
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
@@ -79,7 +80,7 @@ class NodeSupervision:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            with contextlib.suppress(BusError):  # a bus that is away, or full: asked again
+            with contextlib.suppress(BusError):  # the bus is away or full; the next turn tries again
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
         if remote.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
@@ -87,7 +88,10 @@ class NodeSupervision:
             node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
-        """Have the node brought up, once no job talks to it any more: asked for again until then."""
+        """Start configuring the node, once no other job uses it.
+
+        A job that still uses it is aborted, and the next turn tries again.
+        """
         if node.job is not None and not node.job.done():
             node.abandon.set()
             return
@@ -105,7 +109,7 @@ class NodeSupervision:
         remote, job = node.remote, node.job
         assert job is not None  # of this phase
         if remote.monitor.boot_ups != remote.boot_ups:
-            node.abandon.set()  # it booted again meanwhile: what was done so far is gone
+            node.abandon.set()  # it booted again: what was written so far is lost
         if not job.done():
             return
         if node.abandon.is_set():
@@ -128,7 +132,7 @@ class NodeSupervision:
             remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if remote.has_other_master:  # another master starts it when it likes
+        if remote.has_other_master:  # its own master starts it
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:
@@ -158,14 +162,14 @@ class NodeSupervision:
 
     def _fail(self, node: Supervised, complaint: str, now_ns: int, *, refused: bool) -> None:
         if complaint != node.complaint:
-            _log.warning("%s; tried again", complaint)
+            _log.warning("%s; retrying", complaint)
         node.failures += 1
         node.complaint = complaint
         monitor = node.remote.monitor
         monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
-        monitor.running = monitor.running and not refused  # it may be somebody else's now
-        self._await_again(node, now_ns, was_silent=True)  # or refused: it may be another node by now
+        monitor.running = monitor.running and not refused  # another host may use it now
+        self._await_again(node, now_ns, was_silent=True)  # also if refused: it may be another node by now
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Make a patch faulty after a defect. Repeated at the next turn if it raises."""

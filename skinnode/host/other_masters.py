@@ -1,4 +1,4 @@
-"""Who else acts as a master on a bus: the host does not hear its own frames, so these are somebody else's."""
+"""Detect other masters on a bus: the host does not receive its own frames, so these come from elsewhere."""
 
 from __future__ import annotations
 
@@ -20,20 +20,24 @@ SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes",
 
 @dataclass(frozen=True, slots=True)
 class OtherMasterStats:
-    """Frames that only a master sends, from others than this host. A guest expects the first two."""
+    """Frames that only a master sends, from senders other than this host.
+
+    On a bus that another master runs, the first two counters are expected to be 0: they are not counted
+    there.
+    """
 
     syncs: int
     nmt_commands: int
     sdo_requests: int
-    """To nodes of the hand: a second host, or a technician's tool."""
+    """To nodes of the hand, by a second host or a technician's tool."""
     heartbeats: int
     """With the node-ID of the host."""
     last_ns: int | None
-    """When the newest of them was received, monotonic."""
+    """Monotonic time of the newest of them."""
 
 
 class OtherMasters:
-    """Counts them on one bus, and says once that they are there. Mainline only."""
+    """Counts the frames of other masters on one bus, and logs each kind once. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -41,7 +45,13 @@ class OtherMasters:
         self._last_ns: dict[str, int] = {}
 
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
-        """For the frames that only a master sends; of a guest those that its master does not."""
+        """Return handlers for frames that only a master sends.
+
+        If another master runs the bus, those that it sends itself are left out.
+
+        Args:
+            node_ids: Node-IDs of the hand on this bus.
+        """
 
         def heard(what: str) -> Callable[[bytes, int], None]:
             return lambda data, t_ns: self._on(what, t_ns)
@@ -54,6 +64,7 @@ class OtherMasters:
         return handlers
 
     def stats(self) -> OtherMasterStats:
+        """Return all counters. Any thread."""
         counts = self._counts
         last_ns = max(self._last_ns.values(), default=None)
         return OtherMasterStats(counts[SYNC], counts[NMT], counts[SDO], counts[HEARTBEAT], last_ns)
@@ -64,4 +75,4 @@ class OtherMasters:
         self._last_ns[what] = t_ns
         expected = self._bus.role == "guest" and what == SDO
         if not expected and (before_ns is None or t_ns - before_ns > QUIET_NS):
-            _log.warning("%s: somebody else sends %s: a second host or master?", self._bus.name, what)
+            _log.warning("%s: another node sends %s: is there a second host or master?", self._bus.name, what)

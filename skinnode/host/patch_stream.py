@@ -33,32 +33,35 @@ _log = logging.getLogger(__name__)
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 WATCH_AFTER_NS: Final = 5_000_000
-"""How long after its last frame a scan is looked at for what is wrong with it: the fields that a program
-waits for come first, and those of all patches of one SYNC are due together."""
+"""Delay after the last frame of a scan before its codes are evaluated for faults: fields that a program waits
+for come first, and those of all patches of one SYNC are due together."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamStats:
-    """What became of a patch's scans: those assembled = ``offered`` + ``withheld`` + ``partial``, and
-    ``offered`` = ``solved`` + ``failed`` + ``skipped`` + at most two in work."""
+    """Counters of a patch's scans.
+
+    ``offered`` + ``withheld`` + ``partial`` are the assembled scans; ``solved`` + ``failed`` + ``skipped`` +
+    at most two in work are the offered ones.
+    """
 
     frames: int
-    """Chunks and summaries handed to the stream, whatever became of them."""
+    """Chunks and summaries passed to the stream."""
     offered: int
     withheld: int
-    """Came while the patch was being brought up or its baseline being read: nobody could decode them."""
+    """Scans that came while the patch was brought up or its baseline was read, and could not be decoded."""
     partial: int
-    """Scans that were not complete and therefore withheld, as ``stream.partial`` of the hand file demands."""
+    """Incomplete scans withheld because of ``stream.partial`` in the hand file."""
     solved: int
     skipped: int
-    """Overtaken by a newer scan before a worker was free."""
+    """Scans replaced by a newer one before a worker was free."""
     untrusted: int
     """Fields in which a wire did not converge."""
     invalid_codes: int
-    """Codes that were over range, short, open or missing, over all scans solved."""
+    """Codes over range, short, open or missing, in all solved scans."""
     assembler: AssemblerStats
     failed: int = 0
-    """Scans whose decoding or solving raised an exception: a defect."""
+    """Scans whose decoding or solving raised an exception."""
 
 
 class StreamTap(Protocol):
@@ -144,21 +147,21 @@ class PatchStream:
     # --- mainline
 
     def on_chunk(self, data: bytes, t_ns: int) -> None:
-        """TPDO1."""
+        """Take a chunk (TPDO1)."""
         self._frames += 1
         scan = self._assembler.on_chunk(data, t_ns)
         if scan is not None:
             self._offer(scan)
 
     def on_summary(self, data: bytes, t_ns: int) -> None:
-        """TPDO2."""
+        """Take a summary (TPDO2)."""
         self._frames += 1
         scan = self._assembler.on_summary(data, t_ns)
         if scan is not None:
             self._offer(scan)
 
     def poll(self, t_ns: int) -> None:
-        """Let a scan go that has waited long enough for what it lacks."""
+        """End a scan that has waited long enough for missing frames; evaluate earlier scans for faults."""
         while self._unwatched and t_ns >= self._unwatched[0][0]:
             self._options.watch(self._unwatched.popleft()[1])
         deadline_ns = self._assembler.next_deadline_ns()
@@ -171,7 +174,7 @@ class PatchStream:
             self._offer(scan)
 
     def withhold(self) -> int:
-        """Let no scan through from now on, the one under way included. Returns ``withholdings``."""
+        """Pass no scan on from now on, including the one being assembled. Returns ``withholdings``."""
         self._solver = None
         self.withholdings += 1
         if self.tap is not None:
@@ -180,13 +183,18 @@ class PatchStream:
 
     @property
     def withholding(self) -> bool:
-        """Whether no scan is let through."""
+        """Whether no scan is passed on."""
         return self._solver is None
 
     def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
-        """Let scans through from now on, decoded and solved by ``solver``; unless there was another reason to
-        withhold them since there were ``withholdings``. ``anew``: the node was started, and what was
-        assembled before belongs to another stream."""
+        """Pass scans on from now on, decoded and solved by ``solver``.
+
+        Args:
+            solver: Decodes and solves the scans.
+            withholdings: Number of withholdings known to the caller; if there were more since, nothing
+                happens.
+            anew: Whether the node was started, so that frames received before belong to another stream.
+        """
         if withholdings != self.withholdings:
             return
         self._solver = solver
@@ -199,13 +207,13 @@ class PatchStream:
         if self.tap is not None:
             self.tap.resumed(self._patch, solver, anew=anew)
 
-    def tell_tap(self) -> None:
-        """Tell a tap that has come late whether scans are let through."""
+    def inform_tap(self) -> None:
+        """Pass to a new tap whether scans are passed on."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
     def close(self) -> None:
-        """Take no scan that is still in the box. Called when the mainline has ended."""
+        """Discard the scan that waits for a worker. Called once the mainline has ended."""
         self._box.clear()
         while self._unwatched:
             scan = self._unwatched.popleft()[1]
@@ -252,9 +260,14 @@ class PatchStream:
         self._call_worker()
 
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
-        """Skip the scans whose last frames came at these times, or so little off, as those that were
-        overtaken when a recording was made. Their numbers would not do: after a pause the halves of a scan
-        may be two of one number."""
+        """Skip the scans that a newer one overtook when a recording was made.
+
+        Scan numbers would not do: after a pause, the two halves of a scan may be two scans of one number.
+
+        Args:
+            times_ns: Monotonic times at which their last frames came.
+            within_ns: Tolerance of these times.
+        """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
 
     def _is_left_out(self, t_ns: int) -> bool:
@@ -264,7 +277,7 @@ class PatchStream:
         return i < len(self._left_out) and self._left_out[i] <= t_ns + self._left_out_within_ns
 
     def settled(self, scan: int) -> bool:
-        """Whether ``scan`` or a newer one has come, or none is let through, and nothing is left to solve."""
+        """Return whether no scan is left to solve, and ``scan`` has come or scans are withheld."""
         return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 
     # --- worker
@@ -306,13 +319,15 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle a worker that could not start."""
+        """Handle a job that could not start."""
         self._report(error)
         self._leave()
 
     def _leave(self) -> None:
-        """Release the stream to the next worker, at once if a scan is waiting. Never raises: the holder must
-        return the token exactly once."""
+        """Release the stream to the next worker, at once if a scan is waiting.
+
+        Never raises: the holder must return the token exactly once.
+        """
         self._token.append(None)
         try:
             if self._box:
@@ -330,7 +345,10 @@ class PatchStream:
         self._publisher.fail(failure)
 
     def stats(self) -> StreamStats:
-        """Counters. Read in this order, no scan counts as skipped that may still be solved."""
+        """Return all counters.
+
+        They are read in an order in which no scan that may still be solved counts as skipped.
+        """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(
             frames=self._frames,

@@ -1,4 +1,4 @@
-"""From the workers to whoever listens: a bounded queue for each. A slow one loses its own data, counted."""
+"""Pass fields from the workers to subscribers, each with a bounded queue."""
 
 from __future__ import annotations
 
@@ -19,23 +19,30 @@ from skinnode.model.frames import FieldFrame
 
 
 def check_timeout(timeout_s: float | None) -> None:
-    """Raises ValueError for one that nobody can wait for."""
+    """Check a timeout.
+
+    Raises:
+        ValueError: if it is negative, not a number, or too long for the system.
+    """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
 
 
 def check_capacity(capacity: int) -> None:
-    """Raises ValueError for one that is no number of items."""
+    """Check the capacity of a queue.
+
+    Raises:
+        ValueError: if it is not an integer from 1.
+    """
     if not isinstance(capacity, int) or capacity < 1:
         raise ValueError(f"capacity: got {capacity!r}, must be at least 1, an integer")
 
 
 class Subscription:
-    """The fields of a running host, newest last. Iterate over it with ``for`` or ``async for``, or ask with
-    :meth:`get`.
+    """The fields of a running host, newest last. Iterate with ``for`` or ``async for``, or use :meth:`get`.
 
-    A full queue loses its oldest field; ``dropped`` counts. The subscription ends with :meth:`close`, at the
-    end of a ``with`` block, or when the last reference to it goes.
+    A full queue drops its oldest field; ``dropped`` counts. The subscription ends with :meth:`close`, at the
+    end of a ``with`` block, or when the last reference to it is deleted. Any thread or event loop may read.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
@@ -52,9 +59,16 @@ class Subscription:
         return sum(self._dropped.values())
 
     def get(self, timeout_s: float | None = None) -> FieldFrame | None:
-        """The next field, or None after ``timeout_s``, or None at once when the host has closed.
+        """Return the next field, or None.
 
-        Raises the SkinError that stopped the host, if one did.
+        Args:
+            timeout_s: Longest wait, s; None waits without limit.
+
+        Returns:
+            None if no field came in time, or at once if the host has closed.
+
+        Raises:
+            SkinError: that stopped the host, if one did.
         """
         try:
             return self.take(timeout_s)
@@ -62,13 +76,17 @@ class Subscription:
             return None
 
     def take(self, timeout_s: float | None) -> FieldFrame | None:
-        """The next field, or None when the host has closed. Raises queue.Empty after ``timeout_s`` and the
-        SkinError that stopped the host, if one did."""
+        """Return the next field, or None if the host has closed.
+
+        Raises:
+            queue.Empty: if no field came within ``timeout_s``.
+            SkinError: that stopped the host, if one did.
+        """
         check_timeout(timeout_s)
         return self._open(self._queue.get(timeout_s))
 
     async def take_async(self, timeout_s: float | None) -> FieldFrame | None:
-        """As :meth:`take`, in an event loop."""
+        """Return the next field as :meth:`take` does, in an event loop."""
         check_timeout(timeout_s)
         loop, arrived, key = asyncio.get_running_loop(), asyncio.Event(), object()
 
@@ -95,17 +113,21 @@ class Subscription:
             del self._wakers[key]
 
     def close(self) -> None:
-        """Want no more. Fields still queued are gone."""
+        """Take no more fields. Fields still queued are lost."""
         self._wanted = frozenset()
 
     def end(self) -> None:
-        """Want no more, and end the loop that reads, in whatever thread, after the fields still queued."""
+        """Take no more fields, and end the reading loop, on any thread, after the fields still queued."""
         self.close()
         self.offer(End(), "")
 
     def __iter__(self) -> Iterator[FieldFrame]:
-        """Fields until the host closes. Raises TimeoutError when none came for the subscription's timeout and
-        the SkinError that stopped the host, if one did."""
+        """Yield fields until the host closes.
+
+        Raises:
+            TimeoutError: if no field came for the subscription's timeout.
+            SkinError: that stopped the host, if one did.
+        """
         while True:
             try:
                 field = self.take(self._timeout_s)
@@ -116,7 +138,7 @@ class Subscription:
             yield field
 
     async def __aiter__(self) -> AsyncIterator[FieldFrame]:
-        """As ``for``, in an event loop."""
+        """Yield fields in an event loop, as ``for`` does."""
         while True:
             try:
                 field = await self.take_async(self._timeout_s)
@@ -158,8 +180,13 @@ class Subscription:
 
 
 class Publisher:
-    """All subscriptions of a host, and the newest field of each patch. An exception while passing a field to
-    a subscriber is reported to ``defects``, and that subscriber loses the field."""
+    """All subscriptions of a host, and the newest field of each patch.
+
+    An exception while passing a field to a subscriber is reported to ``defects``, and that subscriber loses
+    the field.
+
+    Threads: workers publish, each patch from one at a time; any thread may call the rest.
+    """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
         self._patches = frozenset(patches)
@@ -170,8 +197,11 @@ class Publisher:
         self._last: End | None = None
 
     def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
-        """A subscription to one patch, or to all. Raises ValueError for a capacity below 1, a timeout that is
-        none, or no patch."""
+        """Create a subscription to one patch, or to all.
+
+        Raises:
+            ValueError: if the capacity is below 1, the timeout is out of range, or there is no such patch.
+        """
         check_capacity(capacity)
         check_timeout(timeout_s)
         if patch is not None and patch not in self._patches:
@@ -187,28 +217,32 @@ class Publisher:
         return subscription
 
     def latest(self, patch: str) -> FieldFrame | None:
-        """The newest field of a patch, None before the first. Raises ValueError for no such patch."""
+        """Return the newest field of a patch, or None before the first.
+
+        Raises:
+            ValueError: if there is no such patch.
+        """
         if patch not in self._patches:
             raise ValueError(f"patch: got {patch!r}, must be one of {', '.join(sorted(self._patches))}")
         return self._latest.get(patch)
 
     def publish(self, field: FieldFrame, patch: str) -> None:
-        """Hand a field to everyone who wants it. Called by the worker that owns the patch; never blocks."""
+        """Pass a field to its subscribers. Called by the worker that owns the patch; never blocks."""
         self._latest[patch] = field
         self._offer(field, patch)
 
     @property
     def failure(self) -> SkinError | None:
-        """What stopped the host, if something did."""
+        """The error that stopped the host, or None."""
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """The host cannot go on: every subscriber hears why, after the fields it has queued."""
+        """End every subscription with ``error``, after the fields it has queued: the host cannot continue."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """The host has closed: every subscriber's loop ends, after the fields it has queued."""
+        """End every subscription, after the fields it has queued: the host has closed."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

@@ -1,5 +1,7 @@
-"""Who on the host gets which frames of a bus. The same for frames that come off the bus and for recorded
-ones: nothing here sends, waits or has a thread."""
+"""Connect the handlers of a host to the frames of a bus: which COB-ID goes where.
+
+Nothing here sends, waits or has a thread, so a replay uses it with recorded frames.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,13 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""How long a summary is waited for at least, when all chunks are there; half a period where that is longer.
-On a full bus it gives way to the chunks of all other patches."""
+"""Minimum time to wait for a summary when all chunks are there; half a period if that is longer. On a full
+bus the summary gives way to the chunks of all other patches."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReception:
-    """A patch on the receiving side."""
+    """What receives the frames of a patch."""
 
     stream: PatchStream
     monitor: NodeMonitor
@@ -36,14 +38,14 @@ class PatchReception:
 
 @dataclass(frozen=True, slots=True)
 class BusReception:
-    """Who else is listened to on a bus: other masters, and the SYNC of one."""
+    """What receives the frames of other senders on a bus: other masters, and their SYNC."""
 
     other_masters: OtherMasters
     follower: SyncFollower
 
 
 def receive_bus(hand: HandConfig, dispatcher: Dispatcher, ticks: Ticks) -> BusReception:
-    """From now on other masters are heard."""
+    """Listen for other masters on a bus, and for their SYNC, from now on."""
     config = dispatcher.config
     other_masters, follower = OtherMasters(config), SyncFollower(ticks)
     for cob_id, handler in other_masters.handlers(
@@ -66,8 +68,15 @@ def receive_patch(
     """Pass the frames of a patch to its monitor and its stream from now on.
 
     The stream withholds scans until it has a solver, because a node that an earlier host left operational may
-    be sending already. Exceptions there are reported to ``defects``; without ``defects`` they are raised, and
-    the publisher fails.
+    be sending already.
+
+    Args:
+        patch: The patch.
+        hand: Its hand.
+        dispatcher: Dispatches the frames of its bus.
+        ticks: The SYNC counters of its bus.
+        output: Where scans are solved. With its ``defects``, exceptions are reported there; without, they are
+            raised, and the publisher fails.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)
@@ -102,7 +111,7 @@ def receive_patch(
     def on_heartbeat(data: bytes, t_ns: int) -> None:
         monitor.on_heartbeat(data, t_ns)
         if len(data) == 1 and data[0] & STATE_MASK == NmtState.INITIALISING:
-            stream.withhold()  # what it sends from here on is not as it was configured
+            stream.withhold()  # its configuration is lost
 
     dispatcher.handle(od.heartbeat_cob_id(patch.node_id), on_heartbeat, output.defects)
     dispatcher.handle(od.emcy_cob_id(patch.node_id), monitor.on_emergency, output.defects)
@@ -113,4 +122,4 @@ def receive_patch(
 
 
 def _ignore(data: bytes, t_ns: int) -> None:
-    """Frames of the robot's own master to its nodes."""
+    """Ignore NMT commands of another master to its nodes."""

@@ -1,4 +1,4 @@
-"""A patch as its host sees it: the node on its bus, what is known of it, and the stream of its scans."""
+"""A remote node: a patch as the host sees it, with its SDO client, its facts and its stream."""
 
 from __future__ import annotations
 
@@ -22,21 +22,25 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""How long the mainline may take to do a small job; it turns fifty times a second unless its bus is away."""
+"""Longest wait for a small job on the mainline, which takes a turn fifty times a second unless its bus is
+away, s."""
 
 _ANSWER_S: Final = 0.05
-"""Wait for the answers to a single SDO request, s. A failed bring-up is delayed by two of them if the node
-is alone."""
+"""Wait for the responses to a single SDO request, s. It delays a failed bring-up twice if the node is alone.
+"""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
 """Time and SYNC periods without a scan after which the configuration of a node is read back: the stream must
-be back within a second."""
+recover within a second."""
 
 
 class RemoteNode:
-    """One patch. Its methods without a mark may be called by one thread at a time, which is not the mainline:
-    whoever brings the node up."""
+    """One patch and its node.
+
+    Threads: one thread at a time may bring the node up, not the mainline; it calls all methods except those
+    for which any thread is mentioned.
+    """
 
     def __init__(
         self,
@@ -54,11 +58,11 @@ class RemoteNode:
         """Whether nothing at all may be sent to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
-        """Boot-up messages when its bring-up began: more of them, and it has to be done again."""
+        """Number of boot-up messages when its bring-up began; if there are more, it must be repeated."""
         self.t_answer_ns = 0
-        """When it last answered an SDO request."""
+        """Monotonic time of its newest SDO response."""
         self._answers = 0
-        """SDO answers with its node-ID so far."""
+        """Number of SDO responses with its node-ID."""
         self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
@@ -73,12 +77,12 @@ class RemoteNode:
 
     @property
     def heard(self) -> bool:
-        """Whether anything of the node was heard since the host opened its bus."""
+        """Whether any frame of the node was received since the host opened its bus."""
         return self.monitor.t_heartbeat_ns is not None or self.stream.stats().withheld > 0
 
     @property
     def heartbeat_s(self) -> float:
-        """How often the node says that it is there."""
+        """Heartbeat period of the node, s."""
         return self._hand.bring_up.heartbeat_s if self.facts is None else self.facts.heartbeat_s
 
     def configure(
@@ -87,14 +91,26 @@ class RemoteNode:
         abandoned: Callable[[], bool],
         on_answer: Callable[[PatchConfig], None] | None = None,
     ) -> ScanSolver:
-        """Bring the node up and learn what it is; scans are withheld meanwhile. Raises as
-        :meth:`Configurator.configure`."""
+        """Configure the node; scans are withheld meanwhile.
+
+        Args:
+            deadline_s: Longest time to its first response, s.
+            abandoned: Called repeatedly; once it returns True, configuring ends with Abandoned.
+            on_answer: Called when the node has answered.
+
+        Returns:
+            The solver of its scans.
+
+        Raises:
+            NodeError: if its electrodes cannot be solved, or one node-ID belongs to two nodes.
+            SkinError: as :meth:`Configurator.configure`.
+        """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
             nmt_master.stand_by(self.link.send, self.patch.node_id)  # a stopped node does not answer SDO
 
         def answered(patch: PatchConfig) -> None:
-            self.boot_ups = self.monitor.boot_ups  # those of before were waited for
+            self.boot_ups = self.monitor.boot_ups  # earlier boot-ups were awaited
             if on_answer is not None:
                 on_answer(patch)
 
@@ -112,12 +128,20 @@ class RemoteNode:
             raise kind(node_id, f"{text}; {why}") from error
         try:
             return ScanSolver(self.facts, self._hand.solver)
-        except ValueError as error:  # of electrodes that only the node knew
+        except ValueError as error:  # the electrodes were read from the node
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
     def start(self, solver: ScanSolver, withholdings: int) -> None:
-        """Let scans through to ``solver`` and, as master, tell the node to send them. Raises BusError."""
-        # What a guest finds running goes on, heard since its bus was opened, unless the node has booted.
+        """Pass scans on to ``solver`` and, as master, start the node.
+
+        Args:
+            solver: Decodes and solves the scans.
+            withholdings: As returned by :meth:`withhold`.
+
+        Raises:
+            BusError: if the command cannot be sent.
+        """
+        # The stream of a node that another master runs goes on from the opening of the bus, unless it booted.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
         self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
         if not self.has_other_master:
@@ -125,10 +149,16 @@ class RemoteNode:
         self.monitor.running = True
 
     def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> ScanSolver | None:
-        """A solver with the baseline that the node has now; None where that is the one known and scans go
-        through. Raises as :meth:`Configurator.settle_baseline`."""
+        """Read the baseline that the node has now.
+
+        Returns:
+            A solver with it; None if it is the known one and scans are passed on.
+
+        Raises:
+            SkinError: as :meth:`Configurator.settle_baseline`.
+        """
         facts = self.facts
-        assert facts is not None  # asked of nodes that run
+        assert facts is not None  # only called for running nodes
         configurator = self._configurator(deadline_s, abandoned, lambda patch: None)
         with self._remote.abort_if(abandoned):
             baseline_ohm = configurator.settle_baseline(self.patch, self._profile, self._remote)
@@ -136,44 +166,61 @@ class RemoteNode:
             return None
         facts = facts.with_baseline(baseline_ohm)
         solver = ScanSolver(facts, self._hand.solver)
-        self.facts = facts  # only now: if there is no solver, the baseline in use is the old one
+        self.facts = facts  # last: if there is no solver, the old baseline stays in use
         return solver
 
     def renew_register(self) -> None:
-        """Ask the node for its error register: the emergency that takes an error back may have been lost.
-        Raises as :class:`RemoteOd`."""
+        """Read the error register: the emergency that clears an error may have been lost.
+
+        Raises:
+            NodeError: as :class:`RemoteOd` raises it.
+        """
         said = self.monitor.registers_said
         register = self._remote.read(od.ERROR_REGISTER, 0, "u8")
         self.link.call(lambda: self.monitor.on_register_read(register, said), self.defects)
 
     def is_mute(self, since_ns: int) -> bool:
-        """Whether the node, operational since ``since_ns``, has sent no scan for so long that it may have
-        lost its configuration. False on the bus of another master, who alone may restore it."""
+        """Return whether an operational node sends no scans, so that it may have lost its configuration.
+
+        Always False on a bus of another master, which alone may restore the configuration.
+
+        Args:
+            since_ns: Monotonic time since which the node is operational.
+        """
         scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
         patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
         return not self.has_other_master and self.link.t_dispatched_ns > scan_ns + patience_ns
 
     def is_configured(self) -> bool:
-        """As :func:`~skinnode.host.configurator.is_configured`."""
+        """Return whether the node is configured, as :func:`~skinnode.host.configurator.is_configured`."""
         return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
-        """Tell the node to take what it feels now for its baseline. Any thread. Raises as
-        :meth:`Host.tare`."""
+        """Tell the node to take its present resistances as its baseline. Any thread.
+
+        Raises:
+            SkinError: as :meth:`Host.tare`.
+        """
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:
-            raise NodeError(node_id, f"{said}: the host is a guest there")
-        if self.patch.baseline is not None:  # it would be written back at once
+            raise NodeError(node_id, f"{said}: another master runs the bus")
+        if self.patch.baseline is not None:  # the host would restore that one at once
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if (
             not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
-        ):  # PDOs are heard by no other
+        ):  # only operational nodes receive PDOs
             raise NodeError(node_id, f"{said}: it is not operational")
         self.link.send(od.command_cob_id(node_id), pack_command(tare=True))
 
     def withhold(self) -> int:
-        """Have the mainline withhold scans; returns the number that :meth:`start` wants. Raises NodeTimeout
-        where the mainline is held up, as while the bus is away."""
+        """Make the mainline withhold scans.
+
+        Returns:
+            The number that :meth:`start` needs.
+
+        Raises:
+            NodeTimeout: if the mainline is delayed, for example while the bus is away.
+        """
         answer: queue.SimpleQueue[int] = queue.SimpleQueue()
         self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
         try:
@@ -184,13 +231,19 @@ class RemoteNode:
             ) from None
 
     def probe(self) -> None:
-        """Ask the node for its device type, without waiting for the answer. Raises BusError."""
+        """Ask the node for its device type, without waiting for the response.
+
+        Raises:
+            BusError: if the request cannot be sent.
+        """
         request = b"\x40" + od.DEVICE_TYPE.to_bytes(2, "little") + bytes(5)
         self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
 
     def _answers_to_one_question(self) -> int:
-        """Return how many answers a single SDO request gets: two if two nodes have this node-ID. The smaller
-        count of two requests, because an answer to an earlier request may be late. Raises BusError."""
+        """Return how many responses a single SDO request gets: two if two nodes have this node-ID.
+
+        It is the smaller count of two requests, because a response to an earlier request may be late.
+        """
         time.sleep(_ANSWER_S)
         counts = []
         for _ in range(2):
@@ -204,12 +257,14 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the hand file has its serial number, and the host is not a guest."""
+        """Whether the hand file has its serial number and the host is the master of its bus."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Look for the patch by its serial number, if there is one; whether it was found. It will boot at its
-        node-ID."""
+        """Search for the patch by its serial number, if there is one. Returns whether it was found.
+
+        It will boot at its node-ID.
+        """
         if self.has_other_master or self.patch.serial is None:
             return False
         try:

@@ -19,7 +19,13 @@ from skinnode.solve.tracker import Tracker
 
 
 class ScanSolver:
-    """Scans of one patch to fields. Owned by one thread at a time. ``clock`` says when a field is ready."""
+    """Decodes and solves scans of one patch. Owned by one thread at a time.
+
+    Args:
+        facts: The patch: layout, scale of its codes, baseline.
+        config: Settings of the solver.
+        clock: Returns the monotonic time at which a field is ready, ns.
+    """
 
     def __init__(
         self, facts: NodeFacts, config: SolverConfig, clock: Callable[[], int] = time.monotonic_ns
@@ -55,15 +61,18 @@ class ScanSolver:
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Resistances of a scan, NaN where there is none."""
+        """Return the resistances of a scan, NaN where a code is no measurement."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._codes.gain is not None:
             resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Field of a scan, stamped, its arrays read-only, and how many codes were no measurement. The noise
-        is that of the front end and of the codes together."""
+        """Solve a scan. The noise is that of the front end and of the codes together.
+
+        Returns:
+            The field with its stamp, its arrays read-only, and the number of codes that are no measurement.
+        """
         if self._tracker.method == "posterior":
             frame, codes = self.decode(scan, stamp), self._codes
             noise = np.hypot(codes.relative_noise, codes.rounding_ohm / frame.resistance_ohm)
@@ -76,8 +85,13 @@ class ScanSolver:
 
 
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
-    """Raise ConfigError for a layout that can be sensed but not solved. The first call compiles the kernels,
-    or reads them from the cache: not while a node waits."""
+    """Check that a layout can be solved, and compile the kernels or load them from the cache.
+
+    Call it before a node waits for the host.
+
+    Raises:
+        ConfigError: if the layout can be sensed but not solved.
+    """
     layout = patch.layout.build()
     try:
         Tracker(layout, method=config.method, operator=config.operator).update(

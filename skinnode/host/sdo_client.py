@@ -1,7 +1,10 @@
-"""SDO, the way to a node's object dictionary: canopen's client over our own port.
+"""SDO client: read and write the object dictionary of a remote node.
 
-canopen's client waits in the thread that asks; the mainline feeds it the answers through
-:meth:`SkinNetwork.notify`. One thread at a time may ask a node; different nodes may be asked side by side.
+canopen's client waits in the thread that asks; the mainline feeds it the responses through
+:meth:`SkinNetwork.notify`. Why limits by hand: canopen's client reads as many bytes as a server sends, for as
+long as it sends; a faulty node could fill the memory or hold a thread forever.
+
+Threads: one thread at a time may use a node; different nodes may be used side by side.
 """
 
 from __future__ import annotations
@@ -26,10 +29,10 @@ from skinnode.host.sdo_streams import BlockDownload, BlockUpload, Client, Downlo
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Tries of a transfer that was not answered or whose answer belongs to an earlier one."""
+"""Number of attempts of a transfer without a response, or with the response to an earlier one."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""What canopen says where nothing came, the second after it asked for segments again."""
+"""Messages of canopen if no response came, the second after it requested segments again."""
 
 _OUT_OF_STEP: Final = (
     AbortCode.TOGGLE_BIT,
@@ -39,7 +42,8 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes of a node that missed a frame of the transfer, which is then retried."""
+"""SDO abort codes of a node that missed a frame of the transfer, which is then retried: toggle bit, time-out,
+command specifier, block size, sequence number, CRC."""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
 """Maximum length of a value in bytes: the baseline of the largest patch."""
@@ -51,7 +55,7 @@ _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""A transfer may take 5 s, and 20 ms for each segment of the longest value allowed."""
+"""Maximum duration of a transfer: 5 s, and 20 ms for each segment of the longest value allowed."""
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
@@ -61,22 +65,26 @@ logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
 class Abandoned(Exception):
-    """The caller no longer wants the result; the transfer was aborted."""
+    """The caller no longer needs the result; the transfer was aborted."""
 
 
 class _UploadTooLong(Exception):
-    """The node sends more than a value can have, or takes too long over it."""
+    """The node sends more than a value can have, or takes too long."""
 
 
 class SkinNetwork(canopen.Network):
-    """canopen's network over a port of ours: ``send`` is where its frames go."""
+    """canopen's network over a port of skinnode; its frames go to ``send``."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
         self._send = send
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send a data frame. The host never requests by RTR."""
+        """Send a data frame.
+
+        Raises:
+            ValueError: if ``remote``, because the host sends data frames only.
+        """
         if remote:
             raise ValueError("remote: got True, the host sends data frames only")
         self._send(can_id, bytes(data))
@@ -85,13 +93,21 @@ class SkinNetwork(canopen.Network):
 class RemoteOd:
     """The object dictionary of a node, read and written by SDO.
 
-    Values have one of the types ``u8 u16 u32 f32``. Raises NodeTimeout where the node does not answer,
-    SdoAbort if it refuses, NodeError if its response is malformed, longer than allowed, or has no end. A
-    transfer is also retried after an exception that is not a response of the node; ``on_defect`` is then
-    called with it.
+    Values have one of the types ``u8 u16 u32 f32``. If ``abandoned`` returns True, which is called after each
+    segment, the transfer is aborted and Abandoned raised. A transfer is also retried after an exception that
+    is not a response of the node.
 
-    ``abandoned`` is asked after each segment. If it returns True, the transfer is aborted and Abandoned
-    raised.
+    Threads: one at a time.
+
+    Args:
+        network: Sends the requests.
+        node_id: Node-ID of the server.
+        on_defect: Called with each exception that is not a response of the node.
+
+    Raises:
+        NodeTimeout: from all methods, if the node does not answer.
+        SdoAbort: from all methods, if it refuses.
+        NodeError: from all methods, if a response is malformed, longer than allowed, or has no end.
     """
 
     def __init__(
@@ -114,7 +130,7 @@ class RemoteOd:
             self.abandoned = before
 
     def answers(self) -> bool:
-        """Whether the node answers at all, be it with an abort. One try."""
+        """Return whether the node answers at all, even with an abort. One attempt."""
         try:
             self._upload(DEVICE_TYPE, 0, _MAX_NUMBER_BYTES)
         except SdoAbortedError:
@@ -135,11 +151,11 @@ class RemoteOd:
         return True
 
     def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
-        """The value as it came, of at most ``most`` bytes."""
+        """Return the value as received, of at most ``most`` bytes."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
     def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """A value of many bytes, at most ``most``, by block transfer with CRC."""
+        """Read a long value, of at most ``most`` bytes, by block transfer with CRC."""
 
         def ask() -> bytes:
             with BlockUpload(self._client, index) as stream:  # type: ignore[no-untyped-call]
@@ -148,14 +164,14 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """By block transfer, or segment by segment from a node that refuses that."""
+        """Read a long value by block transfer, or by segments if the node refuses that."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
             return self.read_bytes(index, 0, most)
 
     def write_block(self, index: int, data: bytes) -> None:
-        """Write a value of many bytes by block transfer with CRC."""
+        """Write a long value by block transfer with CRC."""
 
         def ask() -> None:
             with BlockDownload(self._client, index, data) as stream:
@@ -165,7 +181,7 @@ class RemoteOd:
         self._transfer(index, 0, "block write", ask)
 
     def read(self, index: int, subindex: int, kind: str) -> Any:
-        """The value, decoded."""
+        """Return the value, decoded as type ``kind``."""
         layout = struct.Struct(_PLAIN[kind])
         data = self.read_bytes(index, subindex, _MAX_NUMBER_BYTES)
         if len(data) != layout.size:
@@ -177,11 +193,11 @@ class RemoteOd:
         return layout.unpack(data)[0]
 
     def write(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write and believe it."""
+        """Write the value without reading it back."""
         self.write_bytes(index, subindex, struct.pack(_PLAIN[kind], value))
 
     def write_bytes(self, index: int, subindex: int, data: bytes) -> None:
-        """Write the value as it is to travel."""
+        """Write the encoded value."""
 
         def ask() -> None:
             with Download(self._client, index, subindex, len(data)) as stream:  # type: ignore[no-untyped-call]
@@ -190,12 +206,16 @@ class RemoteOd:
         self._transfer(index, subindex, "write", ask)
 
     def write_if_different(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write, and read back, only what differs."""
+        """Write the value, and read it back, if the node has another one."""
         if self.read(index, subindex, kind) != value:
             self.write_checked(index, subindex, kind, value)
 
     def write_checked(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write and read back. Raises NodeError where the node kept something else."""
+        """Write the value and read it back.
+
+        Raises:
+            NodeError: if the node kept another value.
+        """
         self.write(index, subindex, kind, value)
         kept = self.read(index, subindex, kind)
         if kept != value:
@@ -210,7 +230,7 @@ class RemoteOd:
         for _ in range(ATTEMPTS):
             try:
                 return ask()
-            except SkinError:  # the interface does not take the request
+            except SkinError:  # the request could not be sent
                 raise
             except _UploadTooLong as endless:
                 self._client.give_up(index, subindex)
@@ -234,8 +254,11 @@ class RemoteOd:
             return self._whole(stream, most)
 
     def _whole(self, stream: Any, most: int) -> bytes:
-        """Read a stream to its end. Raises SdoCommunicationError if the data is not as long as announced,
-        _UploadTooLong if it is longer than ``most`` or takes too long, and Abandoned."""
+        """Read a stream to its end.
+
+        Raises SdoCommunicationError if the data is not as long as announced, _UploadTooLong if it is longer
+        than ``most`` or takes too long, and Abandoned.
+        """
         if stream.size is not None and stream.size > most:
             raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, allowed: {most} at most")
         limit_s = _TRANSFER_S + _SEGMENT_S * most / SEGMENT_BYTES
@@ -264,7 +287,9 @@ class RemoteOd:
         if any(silence in str(failure) for silence in _SILENCES):
             waited_s = ATTEMPTS * self._client.RESPONSE_TIMEOUT
             return NodeTimeout(self.node_id, f"{where}: got no answer, allowed: one within {waited_s:.1f} s")
-        if "returned a value for" in str(failure):  # to a question that was not ours, or from another node
+        if "returned a value for" in str(
+            failure
+        ):  # the response to another client's request, or from another node
             got = f"{where}: got the answer for another object, allowed: that for this one"
             why = f"two nodes answer with node-ID {self.node_id}, or another SDO client asks it"
             return NodeError(self.node_id, f"{got}; {why}")

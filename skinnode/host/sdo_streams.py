@@ -60,9 +60,14 @@ class Client(SdoClient):
         self._abort_code = abort_code
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return the response. For a request that begins a transfer, that is the first
-        response that names its object: a slow node may still send frames of the previous transfer. Raises
-        SdoError if there is no response, or an abort."""
+        """Send a request and return the response.
+
+        For a request that begins a transfer, that is the first response that names its object: a slow node
+        may still send frames of the previous transfer.
+
+        Raises:
+            SdoError: if there is no response, or it is an abort.
+        """
         begins = sdo_request[0] >> 5 in (1, 2) or (sdo_request[0] >> 5, sdo_request[0] & 1) in (
             (5, 0),
             (6, 0),
@@ -87,8 +92,11 @@ class Client(SdoClient):
             late = response
 
     def give_up(self, index: int, subindex: int) -> None:
-        """Abort the transfer of this object at the node, and discard late responses. Raises BusError if the
-        abort cannot be sent."""
+        """Abort the transfer of this object at the node, and discard late responses.
+
+        Raises:
+            BusError: if the abort cannot be sent.
+        """
         code, self._abort_code = self._abort_code, AbortCode.TIMED_OUT
         self.send_request(struct.pack("<BHBI", ABORT, index, subindex, code))  # type: ignore[no-untyped-call]
         end_s = time.monotonic() + _SETTLE_S
@@ -98,9 +106,12 @@ class Client(SdoClient):
 
 
 class BlockUpload(BlockUploadStream):
-    """A block upload. canopen 2.4 requests a late segment twice and drops the first response, so every pause
-    longer than its time-out ended in a wrong CRC. It requests a segment that is out of order only once, so a
-    late segment is made to look out of order."""
+    """A block upload.
+
+    canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than its
+    time-out ended in a wrong CRC. It requests a segment that is out of order only once, so a late segment is
+    made to look out of order.
+    """
 
     def read(self, size: int = -1) -> bytes:
         """Read one segment, as canopen does."""
@@ -140,8 +151,11 @@ class BlockDownload(BlockDownloadStream):
         io.RawIOBase.close(self)
 
     def finish(self) -> None:
-        """Send the CRC and wait for the end of the transfer. Raises SdoError if the node does not confirm
-        it."""
+        """Send the CRC and wait for the end of the transfer.
+
+        Raises:
+            SdoError: if the node does not confirm it.
+        """
         super().close()  # type: ignore[no-untyped-call]
 
     def _retransmit(self, ackseq: int, blksize: int) -> None:

@@ -1,4 +1,4 @@
-"""The start of a host: all nodes side by side from whatever they are to operational."""
+"""Start of a host: configure all nodes side by side, and make them operational."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from skinnode.host.sdo_client import Abandoned
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
-"""Nodes brought up at the same time; more would only queue for the bus."""
+"""Nodes configured at the same time; more would only wait for the bus."""
 
 _BRING_UPS: Final = 3
-"""Maximum attempts to bring up a node that boots meanwhile, as nodes just found by LSS do, or whose bring-up
-raises an unforeseen exception."""
+"""Maximum attempts to configure a node that boots meanwhile, as nodes just found by LSS do, or whose
+configuration raises an unforeseen exception."""
 
 _START_AGAIN_NAPS: Final = 50
-"""Naps (a quarter of a second in all) after which an unconfirmed start command is sent again, because it may
+"""Naps, a quarter of a second in all, after which an unconfirmed start command is sent again, because it may
 have been lost."""
 
 _POLL_S: Final = 0.005
 
 
 class BringUpCancelled(SkinError):
-    """Bring-up was called off by whoever asked for it."""
+    """Bring-up was cancelled by the caller."""
 
 
 class _Defective(NodeError):
-    """The host had a defect at each bring-up of the node."""
+    """The host had a defect at each attempt to configure the node."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
-    """Raise BringUpCancelled if it was."""
+    """Raise BringUpCancelled if ``cancelled`` returns True."""
     if cancelled():
         raise BringUpCancelled("bring-up was cancelled")
 
@@ -148,8 +148,13 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """NMT start where the host is master, and each node says in a heartbeat that it is operational. Raises
-    NodeTimeout. The deadline is counted in naps: nobody is late while this machine stands still."""
+    """Start all nodes where the host is the master, and wait for heartbeats that report operational.
+
+    The deadline is counted in naps, so that no node is late while the host's machine stands still.
+
+    Raises:
+        NodeTimeout: if a node does not report operational in time.
+    """
     t_start_ns = time.monotonic_ns()
     for node, solver in ready.items():
         node.start(solver, node.stream.withholdings)
@@ -171,7 +176,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a sign of a node that may not be asked. Raises NodeTimeout."""
+    """Wait for a frame of a node that must not be asked; raise NodeTimeout after the deadline."""
     end_s = time.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
@@ -179,7 +184,8 @@ def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) 
         if time.monotonic() > end_s:
             patch = node.patch
             raise NodeTimeout(
-                patch.node_id, f"patch {patch.name!r} on {patch.bus}: heard nothing within {deadline_s:g} s"
+                patch.node_id,
+                f"patch {patch.name!r} on {patch.bus}: received nothing within {deadline_s:g} s",
             )
         time.sleep(_POLL_S)
 
@@ -187,7 +193,10 @@ def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) 
 def _silence(
     node: RemoteNode, nodes: Sequence[RemoteNode], answered: list[PatchConfig], deadline_s: float
 ) -> BusError:
-    """The error for a silent ``node``. If all are silent it is the cable, the supply or the bit rate."""
+    """Return the error for a silent node.
+
+    If all nodes of a bus are silent, suspect cable, supply or bit rate.
+    """
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]
     silent = [other for other in on_bus if other not in answered]

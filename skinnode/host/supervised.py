@@ -14,10 +14,10 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
 
 JOIN_DEADLINE_S: Final = 1.0
-"""How long a node that was heard may take to answer SDO, and to tare itself."""
+"""Longest time of a node that was heard to its first SDO response, and to tare itself, s."""
 
 LEAST_NS: Final = 300_000_000
-"""Least time from one bring-up of a node to the next, for nodes that restart in a loop."""
+"""Minimum time from one bring-up of a node to the next, for nodes that restart in a loop."""
 
 
 class Phase(enum.StrEnum):

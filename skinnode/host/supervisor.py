@@ -1,24 +1,24 @@
-"""Keeps the nodes of a running hand running: who comes back is brought up again, whoever comes late is taken
-up, whose baseline changed is read again. Each for itself; the others do not notice.
+"""Keep the nodes of a running hand running.
 
-One thread looks fifty times a second at what the mainline has written down and decides. What waits for a
-node (bring-up, reading a baseline) is done by a pool, one job a node at a time, and looked at when it is
-done. So all state here has one owner.
+A node that comes back, or comes late, is configured and started; a changed baseline is read again. Nodes do
+not affect each other. One thread decides fifty times a second what to do, from the facts that the mainline
+collected. What waits for a node (configuring, reading a baseline) runs on a pool, one job a node at a time;
+the thread takes the result when the job is done. So all state has one owner.
 
 =========  ========================================  =========================================
 phase      means                                     left when
 =========  ========================================  =========================================
-AWAITED    not there, or not taken up                it is heard, or answers: JOINING
-JOINING    a job brings it up                        done: STARTING; failed: AWAITED
-STARTING   told to go operational                    it says so: RUNNING; too late: AWAITED
-RUNNING    its scans go through                      booted, or in another state: JOINING;
+AWAITED    absent, or not configured                 it is heard, or answers: JOINING
+JOINING    a job configures it                       done: STARTING; failed: AWAITED
+STARTING   it got the start command                  it is operational: RUNNING; too late: AWAITED
+RUNNING    its scans are passed on                   it booted, or left operational: JOINING;
                                                      no heartbeat: AWAITED
 =========  ========================================  =========================================
 
-A defect is an exception raised while serving a patch that is STARTING or RUNNING, or during its bring-up. It
+A defect is an exception raised while serving a patch that is STARTING or RUNNING, or while configuring it. It
 makes the patch faulty: its scans are withheld, and it is AWAITED for a pause of 0.1 s to 1 s that grows with
-each defect. A node whose bring-up failed is AWAITED likewise. Its boot-up ends the pause; after silence or a
-refusal, any frame from it does.
+each defect. A node that could not be configured is AWAITED likewise. Its boot-up ends the pause; after
+silence or a refusal, any frame from it does.
 """
 
 from __future__ import annotations
@@ -42,16 +42,23 @@ from skinnode.host.supervised import LEAST_NS, NodeStats, Phase, Supervised
 _log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Nodes brought up at the same time after the start; more would only queue for the bus."""
+"""Nodes configured at the same time after the start; more would only wait for the bus."""
 
 _TURN_S: Final = 0.02
+"""Interval between two decisions, s."""
 
 
 class Supervisor:
-    """Supervises ``nodes``, those of ``running`` from where they are, from construction to :meth:`close`.
+    """Supervises ``nodes`` from construction to :meth:`close`.
 
-    Exceptions raised while serving no patch are reported to ``defects``. The supervisor also sends the
-    heartbeats of masters that have one.
+    It also sends the heartbeats of the host. Threads: one decides; a pool runs jobs that wait for nodes; any
+    thread may call :meth:`stats`.
+
+    Args:
+        nodes: All nodes of the hand.
+        running: Those that run already.
+        heartbeat_s: Period of the host's heartbeat, s.
+        defects: Gets exceptions raised while serving no particular patch.
     """
 
     def __init__(
@@ -87,7 +94,7 @@ class Supervisor:
         self._thread.start()
 
     def stats(self) -> dict[str, NodeStats]:
-        """By patch."""
+        """Return the statistics of each node, by patch."""
         return {
             node.remote.patch.name: NodeStats(
                 node.phase, node.rejoins, node.failures, node.baselines, node.complaint
@@ -96,7 +103,7 @@ class Supervisor:
         }
 
     def close(self) -> None:
-        """Begin nothing any more; end and join all threads."""
+        """Begin nothing more; end and join all threads."""
         self._stop.set()
         self._thread.join()
         for node in self._nodes:
@@ -129,7 +136,7 @@ class Supervisor:
         return True
 
     def _beat(self, now_ns: int) -> None:
-        """The heartbeat of a master, on the buses where it has one."""
+        """Send the host's heartbeat on the buses where it has a node-ID."""
         if now_ns < self._beat_ns:
             return
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)

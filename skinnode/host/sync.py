@@ -1,4 +1,4 @@
-"""The timer context: SYNC with a counter, at a fixed rate without drift."""
+"""SYNC: a producer with a counter at a fixed rate without drift, and a follower of another producer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skinnode.host.containment import Defects, keep_on
 
 
 class Tick(NamedTuple):
-    """One SYNC. ``number`` counts from 1 without wrapping; ``t_ns`` is when it was sent, monotonic."""
+    """One SYNC."""
 
     number: int
     t_ns: int
@@ -23,24 +23,27 @@ class Tick(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SyncStats:
-    """What the SYNC producer did."""
+    """Counters of SYNC, sent and received."""
 
     sent: int
     missed: int
-    """Periods that passed before its thread got to run."""
+    """Periods that passed before the thread ran."""
     failed: int
-    """SYNCs that a bus did not take."""
+    """SYNC messages that a bus did not take."""
     latest_ns: int
-    """The longest delay of a SYNC behind its due time."""
+    """Longest delay of a SYNC after its due time."""
     received: int = 0
-    """Of another's, on buses where the host is a guest."""
+    """SYNC messages of other producers on buses that another master runs."""
     irregular: int = 0
-    """Those of them whose counter did not follow the one before, or is none: lost, or of a second
+    """Those of them whose counter is missing or does not follow the previous one: lost, or from a second
     producer."""
 
 
 class Ticks:
-    """The newest SYNC of each counter value. Written by the timer context, read by the mainline."""
+    """The newest SYNC of each counter value.
+
+    Written by the thread that sends or follows SYNC, read by the mainline.
+    """
 
     def __init__(self, counter_overflow: int) -> None:
         self.counter_overflow = counter_overflow
@@ -49,28 +52,28 @@ class Ticks:
         """Number of the newest SYNC, 0 before the first."""
 
     def note(self, number: int, t_ns: int) -> int:
-        """Remember SYNC ``number`` and return its counter, 1 to ``counter_overflow``."""
+        """Store the time of SYNC ``number``. Returns its counter, 1 to ``counter_overflow``."""
         counter = (number - 1) % self.counter_overflow + 1
         self._ticks[counter] = Tick(number, t_ns)
         self.newest = number
         return counter
 
     def find(self, counter: int) -> Tick | None:
-        """The newest SYNC that carried ``counter``, None if none did."""
+        """Return the newest SYNC with this counter, or None if there was none."""
         return self._ticks[counter] if 0 < counter <= self.counter_overflow else None
 
 
 class SyncFollower:
-    """Takes the SYNC of another producer for ``ticks``. Mainline only."""
+    """Numbers the SYNC messages of another producer for ``ticks``. Mainline only."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
         self.received = self.irregular = 0
         self.t_newest_ns = 0
-        """When the newest was received; 0 before the first."""
+        """Monotonic time of the newest SYNC; 0 before the first."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """A SYNC came. Without a counter, where there should be one, it cannot be numbered."""
+        """Take a SYNC. If its counter is missing or out of range, it cannot be numbered."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -92,12 +95,19 @@ Send = Callable[[int, bytes], None]
 
 
 class SyncProducer:
-    """Sends SYNC on every bus, from construction until :meth:`close`, on its own thread: at the same instant,
-    or on each bus ``stagger_s`` after the one before.
+    """Sends SYNC on every bus from construction until :meth:`close`: at the same instant, or staggered.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
-    first; a thread that wakes too late for a whole period skips it rather than send two in a row. No bus is
-    left out of a SYNC that was begun. An exception while sending on a bus is reported to its ``defects``.
+    first; if the thread wakes a whole period late, it skips that period and does not send two in a row. Every
+    SYNC that was begun goes to all buses.
+
+    Threads: one of its own sends.
+
+    Args:
+        buses: For each bus, the function that sends and the SYNC counters.
+        period_s: SYNC period, s.
+        stagger_s: Delay from one bus to the next, s.
+        defects: For each bus, gets the exceptions raised while sending there.
     """
 
     def __init__(
@@ -117,10 +127,11 @@ class SyncProducer:
         self._thread.start()
 
     def stats(self) -> SyncStats:
+        """Return the counters. Any thread."""
         return SyncStats(self._sent, self._missed, self._failed, self._latest_ns)
 
     def close(self) -> None:
-        """Send no more, end and join the thread."""
+        """Send no more; end and join the thread."""
         self._stop.set()
         self._thread.join()
 
@@ -167,5 +178,5 @@ class SyncProducer:
         send(SYNC_COB_ID, payload)
 
     def _wait(self, until_ns: int) -> bool:
-        """Until then, or at once when there are to be no more; whether that is so."""
+        """Wait until ``until_ns``, or until :meth:`close`. Returns whether to end."""
         return self._stop.wait(max(0.0, (until_ns - time.monotonic_ns()) * 1e-9))

@@ -1,4 +1,4 @@
-"""Where somebody who writes down what passes through a host is let in."""
+"""Taps: let a recorder see everything that passes through a host."""
 
 from __future__ import annotations
 
@@ -14,38 +14,46 @@ from skinnode.transport import Frame
 
 
 class HostTap(StreamTap, Protocol):
-    """Who writes down all frames and what else decides what a host makes of them. Never waits."""
+    """Records all frames, and what else decides what a host makes of them. Never waits."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """A batch that is about to be dispatched. On the mainline of the bus, as what a stream says is."""
+        """Take a batch that is about to be dispatched, on the mainline."""
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """A frame that the interface has taken. On whatever thread sent it."""
+        """Take a frame that the interface accepted, on the thread that sent it."""
 
 
 class ContainedTap:
-    """A wrapper of ``tap`` that never raises: an exception is reported to ``defects``, and the tap loses that
-    entry."""
+    """Wraps a tap and never raises.
+
+    An exception is reported to ``defects``, and the tap loses that entry.
+    """
 
     def __init__(self, tap: HostTap, defects: Defects) -> None:
         self._tap, self._defects = tap, defects
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
+        """As :meth:`HostTap.received`."""
         self._do(lambda: self._tap.received(bus, frames))
 
     def sent(self, bus: str, frame: Frame) -> None:
+        """As :meth:`HostTap.sent`."""
         self._do(lambda: self._tap.sent(bus, frame))
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
+        """As :meth:`StreamTap.resumed`."""
         self._do(lambda: self._tap.resumed(patch, solver, anew=anew))
 
     def withheld(self, patch: str) -> None:
+        """As :meth:`StreamTap.withheld`."""
         self._do(lambda: self._tap.withheld(patch))
 
     def polled(self, patch: str, t_ns: int) -> None:
+        """As :meth:`StreamTap.polled`."""
         self._do(lambda: self._tap.polled(patch, t_ns))
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
+        """As :meth:`StreamTap.overtaken`."""
         self._do(lambda: self._tap.overtaken(patch, scan, t_receive_ns))
 
     def _do(self, entry: Callable[[], None]) -> None:
@@ -56,8 +64,11 @@ class ContainedTap:
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
-    """From now on ``tap`` hears of every frame, until what is returned is called. Both on the mainline, or
-    before it runs."""
+    """Pass every frame to ``tap`` from now on. On the mainline, or before it runs.
+
+    Returns:
+        A function that ends this, to be called under the same condition.
+    """
     received = functools.partial(tap.received, link.config.name)
     sent = functools.partial(tap.sent, link.config.name)
     link.listen(received)
@@ -82,7 +93,7 @@ def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Call
         ends.append(tap_link(tap, link))
         for stream in streams:
             stream.tap = tap
-            stream.tell_tap()
+            stream.inform_tap()
 
     def end() -> None:
         for stream in streams:

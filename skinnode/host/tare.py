@@ -1,4 +1,4 @@
-"""Tares a patch and waits: the node takes a new baseline, the host reads it and solves with it."""
+"""Tare a patch: the node takes a new baseline, the host reads it and solves with it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from skinnode.host.health import PatchHealth
 from skinnode.host.remote_node import RemoteNode
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default deadline of a tare, in s, in addition to the SYNC periods below: 16 readings take milliseconds,
-reading a baseline 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
+"""Default deadline of a tare without the SYNC periods below, s: 16 readings take milliseconds, reading a
+baseline 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
 
 TARE_DEADLINE_SYNCS: Final = 3
 """SYNC periods added to the deadline, because the summary of the next scan announces the new baseline."""
@@ -25,8 +25,15 @@ def tare(
 ) -> None:
     """Tare a patch and return once its scans are solved with the new baseline.
 
-    ``baselines`` returns how many baselines have been read. Raises NodeTimeout after ``deadline_s``, and
-    whatever :meth:`RemoteNode.tare` raises.
+    Args:
+        node: The node of the patch.
+        baselines: Returns how many baselines have been read.
+        health: Returns the health of the patch.
+        deadline_s: Longest wait, s.
+
+    Raises:
+        NodeTimeout: after ``deadline_s``.
+        SkinError: as :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies
     node.tare()

@@ -1,7 +1,8 @@
-"""The worker pool: threads that do the jobs they are handed, in order, as soon as one is free.
+"""A pool of worker threads that run submitted jobs in order.
 
-Submitting a job costs the mainline half a microsecond: no result object, no lock except that of the queue. An
-exception in a job goes to the function passed with it, and the thread continues with the next job.
+Why not ThreadPoolExecutor: submitting a job costs the mainline half a microsecond here: no result object, no
+lock except that of the queue. An exception in a job goes to the function passed with it, and the thread
+continues with the next job.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ OnError = Callable[[Exception], object]
 
 
 class Workers:
-    """``count`` threads, from construction to :meth:`close`. Exceptions raised outside jobs are reported to
-    ``defects``."""
+    """A pool of ``count`` threads, from construction to :meth:`close`.
+
+    Threads: any thread may submit. Exceptions raised outside jobs are reported to ``defects``.
+    """
 
     def __init__(self, count: int, name: str, defects: Defects | None = None) -> None:
         self._jobs: queue.SimpleQueue[tuple[Job, OnError] | None] = queue.SimpleQueue()  # None: end
@@ -33,11 +36,11 @@ class Workers:
             thread.start()
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Have ``job`` done by the next thread that is free."""
+        """Run ``job`` on the next free thread; ``on_error`` gets its exception."""
         self._jobs.put((job, on_error))
 
     def close(self) -> None:
-        """Do the jobs that were handed in, end and join the threads."""
+        """Run the jobs already submitted, then end and join the threads."""
         for _ in self._threads:
             self._jobs.put(None)
         for thread in self._threads:
@@ -68,9 +71,10 @@ class Workers:
 
 
 class Inline:
-    """In place of :class:`Workers`: each job is done when it is handed in, by the thread that does so."""
+    """Stands in for :class:`Workers` and runs each job at once, on the thread that submits it."""
 
     def submit(self, job: Job, on_error: OnError) -> None:
+        """Run ``job``; ``on_error`` gets its exception."""
         try:
             job()
         except Exception as error:

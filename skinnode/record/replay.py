@@ -21,7 +21,7 @@ from skinnode.canopen.indices import SYNC_COB_ID
 from skinnode.config import BusConfig
 from skinnode.errors import ConfigError
 from skinnode.host.containment import Defects
-from skinnode.host.dispatcher import BusStats, Dispatcher
+from skinnode.host.dispatcher import BusStats, Dispatcher, PortCounters
 from skinnode.host.health import PatchHealth
 from skinnode.host.patch_stream import StreamOutput, StreamStats
 from skinnode.host.publish import Publisher
@@ -277,7 +277,7 @@ class _Bus:
             self._happen(self._events.popleft())
 
     def stats(self) -> BusStats:
-        return self._dispatcher.count(sent=self._sent)
+        return self._dispatcher.count(PortCounters(sent=self._sent))
 
     def _is_due(self, event: dict[str, Any], t_ns: int, *, whole: bool) -> bool:
         if whole:

@@ -46,7 +46,7 @@ def test_sums_that_agree() -> None:
 @pytest.mark.parametrize("change", [-1, 1])
 def test_each_counter_of_a_bus_is_in_its_sum(counter: str, change: int) -> None:
     got, must = 31 + change * (counter == "read"), 31 + change * (counter != "read")
-    line = f"can0: frames read: got {got}, must be the {must} of those told of"
+    line = f"can0: frames read: got {got}, must be the {must} of those counted"
     assert found({counter: BUS[counter] + change}, {}, {}) == [line]
 
 

@@ -264,8 +264,8 @@ def test_a_second_master_is_named(
         other_masters = host.stats().other_masters["can0"]
         assert (other_masters.syncs, other_masters.nmt_commands, other_masters.heartbeats) == (3, 0, 0)
     assert [record.getMessage() for record in caplog.records] == [
-        "can0: somebody else sends SYNC: a second host or master?",
-        "can0: somebody else sends SDO requests to our nodes: a second host or master?",
+        "can0: another node sends SYNC: is there a second host or master?",
+        "can0: another node sends SDO requests to our nodes: is there a second host or master?",
     ]
 
 

@@ -41,7 +41,7 @@ def test_a_guest_does_not_tare(make_hand: Callable[..., HandConfig], rack_of: Ca
     hand = make_hand(1, sync={"period_ms": 25, "counter_overflow": 0}, buses=[bus])
     rack_of(hand).plug("p0")
     with Host.from_config(hand) as host:
-        with pytest.raises(NodeError, match=r"p0.*not tared: the host is a guest"):
+        with pytest.raises(NodeError, match=r"p0.*not tared: another master runs the bus"):
             host.tare("p0")
         with pytest.raises(KeyError):
             host.tare("thumb")

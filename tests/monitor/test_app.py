@@ -136,7 +136,9 @@ def test_a_guest_says_that_it_does_not_tare() -> None:
 
         async def play(pilot: Pilot[Any]) -> None:
             await press(pilot, "t", "y")
-            assert await eventually(pilot, lambda: "not tared: the host is a guest" in screen_of(pilot))
+            assert await eventually(
+                pilot, lambda: "not tared: another master runs the bus" in screen_of(pilot)
+            )
 
         in_app(source, play)
 

@@ -39,7 +39,6 @@ _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_B
 """A frame and its time in their usual form: identifier, length, 8 bytes, software and hardware time."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
-_FLAGS: Final = _EXTENDED | _REMOTE | _ERROR
 
 _OLDEST_NS: Final = 10_000_000_000
 """Maximum age of a frame. An older stamp was taken before the wall clock was set, so the time of reading is

@@ -121,13 +121,13 @@ class Configurator:
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
         """Check the identity of the node. Returns its serial number and revision number."""
-        for subindex, what, wanted in (
+        for subindex, what, expected in (
             (od.IDENTITY_VENDOR, "vendor-ID", od.VENDOR_ID),
             (od.IDENTITY_PRODUCT, "product code", od.PRODUCT_CODE),
         ):
             got = remote.read(od.IDENTITY, subindex, "u32")
-            if got != wanted:
-                raise _mismatch(patch, what, f"0x{got:08X}", f"0x{wanted:08X} (a skinnode patch)")
+            if got != expected:
+                raise _mismatch(patch, what, f"0x{got:08X}", f"0x{expected:08X} (a skinnode patch)")
         revision = int(remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32"))
         if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision names the CANopen behaviour
             allowed = f"{od.REVISION_NUMBER >> 16}.x"
@@ -138,7 +138,7 @@ class Configurator:
         return serial, revision
 
     def _check_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        for subindex, what, wanted in (
+        for subindex, what, expected in (
             (od.ROWS, "upper wires", profile.rows),
             (od.COLUMNS, "lower wires", profile.columns),
             (od.UPPER_ELECTRODES, "electrodes of an upper wire", profile.upper_electrodes),
@@ -147,15 +147,15 @@ class Configurator:
             (od.PDO_BYTES, "bytes of a PDO", profile.pdo_bytes),
         ):
             got = remote.read(od.DESCRIPTOR, subindex, "u8")
-            if got != wanted:
-                raise _mismatch(patch, what, str(got), f"{wanted} as in the hand file")
+            if got != expected:
+                raise _mismatch(patch, what, str(got), f"{expected} as in the hand file")
         got = remote.read(od.DESCRIPTOR, od.LAYOUT_HASH, "u32")
         layout, source = patch.layout.build(), "as in the hand file"
         if patch.layout.coordinates == "node":
             layout, source = self._read_layout(patch, profile, remote), "of the node's own coordinates"
         if got != layout.layout_hash:
-            wanted_hash = f"0x{layout.layout_hash:08X} ({layout.name} {source})"
-            raise _mismatch(patch, "layout hash", f"0x{got:08X}", wanted_hash)
+            expected_hash = f"0x{layout.layout_hash:08X} ({layout.name} {source})"
+            raise _mismatch(patch, "layout hash", f"0x{got:08X}", expected_hash)
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
@@ -214,28 +214,28 @@ class Configurator:
             (od.TPDO2_PARAMETER, od.summary_cob_id(patch.node_id), 1, 0),
         ):
             self._go_on()
-            wanted = (
+            expected = (
                 (od.PDO_TYPE, "u8", kind),
                 (od.PDO_INHIBIT_TIME, "u16", inhibit),
                 (od.PDO_EVENT_TIMER, "u16", 0),
                 (od.PDO_COB_ID, "u32", cob_id),
             )
-            if not master and all(remote.read(index, sub, size) == value for sub, size, value in wanted):
+            if not master and all(remote.read(index, sub, size) == value for sub, size, value in expected):
                 continue
             remote.write_checked(index, od.PDO_COB_ID, "u32", cob_id | od.PDO_INVALID)
-            for sub, size, value in wanted:
+            for sub, size, value in expected:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
         """Check that the PDOs have the mapping of the node's revision, the only one the decoder supports."""
-        wanted = {item.index: item for item in profile.objects()}
+        expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
-            count = int(wanted[index][0].default or 0)
+            count = int(expected[index][0].default or 0)
             got = remote.read(index, 0, "u8")
             if got != count:
                 raise _mismatch(patch, f"entries mapped in 0x{index:04X}", str(got), str(count))
             for subindex in range(1, count + 1):
-                entry, mapped = wanted[index][subindex].default, remote.read(index, subindex, "u32")
+                entry, mapped = expected[index][subindex].default, remote.read(index, subindex, "u32")
                 if mapped != entry:
                     what = f"object mapped by 0x{index:04X}:{subindex}"
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
@@ -252,17 +252,17 @@ class Configurator:
             NodeError: if the node does not keep the baseline, or it is not positive.
             SkinError: as :meth:`configure`.
         """
-        wanted = None if patch.baseline is None else load_baseline(patch.baseline, profile)
+        expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = time.monotonic() + self.boot_deadline_s
         while True:
             self._go_on()
             baseline = self._read_baseline(patch, profile, remote)
-            if wanted is not None and not np.array_equal(baseline, wanted):
-                remote.write_block(od.BASELINE_DOMAIN, wanted.astype("<f4").tobytes())
+            if expected is not None and not np.array_equal(baseline, expected):
+                remote.write_block(od.BASELINE_DOMAIN, expected.astype("<f4").tobytes())
                 baseline = self._read_baseline(patch, profile, remote)
-                if not np.array_equal(baseline, wanted):
-                    wanted_from = f"those of {patch.baseline}"
-                    raise _mismatch(patch, "baseline (0x2301)", "other values back", wanted_from)
+                if not np.array_equal(baseline, expected):
+                    expected_from = f"those of {patch.baseline}"
+                    raise _mismatch(patch, "baseline (0x2301)", "other values back", expected_from)
             if baseline.any() or time.monotonic() > end_s:
                 break
             time.sleep(_POLL_S)
@@ -314,12 +314,12 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
     Raises:
         NodeError: as :class:`RemoteOd` raises it.
     """
-    wanted = (
+    expected = (
         (od.SYNC_COUNTER_OVERFLOW, 0, "u8", hand.sync.counter_overflow),
         (od.TPDO1_PARAMETER, od.PDO_COB_ID, "u32", od.chunk_cob_id(patch.node_id)),
         (od.TPDO2_PARAMETER, od.PDO_COB_ID, "u32", od.summary_cob_id(patch.node_id)),
     )
-    return all(remote.read(index, subindex, kind) == value for index, subindex, kind, value in wanted)
+    return all(remote.read(index, subindex, kind) == value for index, subindex, kind, value in expected)
 
 
 def _open_window(remote: RemoteOd) -> None:

@@ -110,8 +110,8 @@ class LssMaster:
         Sends *identify non-configured remote slave* and the first request of fastscan, because some stacks
         (CANopenNode) support fastscan only.
         """
-        wanted = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
-        if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, wanted=wanted) for _ in range(_TRIES)):
+        expected = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
+        if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, expected=expected) for _ in range(_TRIES)):
             return True
         return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
@@ -244,14 +244,14 @@ class LssMaster:
         return answer
 
     def _ask(
-        self, command: int, data: bytes = b"", wanted: bytes | None = None, answer_s: float = ANSWER_S
+        self, command: int, data: bytes = b"", expected: bytes | None = None, answer_s: float = ANSWER_S
     ) -> bytes | None:
-        """Send a request and return the first response in time that begins with ``wanted``.
+        """Send a request and return the first response in time that begins with ``expected``.
 
         By default that is the command. Other responses belong to earlier requests. Returns None if there is
         none.
         """
-        wanted = bytes((command,)) if wanted is None else wanted
+        expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():
             self._answers.get()
         self._request(command, data)
@@ -259,7 +259,7 @@ class LssMaster:
         while (left_s := end_s - time.monotonic()) > 0:
             with contextlib.suppress(queue.Empty):
                 answer = self._answers.get(timeout=left_s)
-                if answer.startswith(wanted):
+                if answer.startswith(expected):
                     return answer
         return None
 

@@ -13,7 +13,7 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Silence after which another master that is heard again is logged again, ns."""
+"""Silence after which another master that sends again is logged again, ns."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
 
@@ -53,14 +53,14 @@ class OtherMasters:
             node_ids: Node-IDs of the hand on this bus.
         """
 
-        def heard(what: str) -> Callable[[bytes, int], None]:
+        def counter_of(what: str) -> Callable[[bytes, int], None]:
             return lambda data, t_ns: self._on(what, t_ns)
 
-        handlers = {od.sdo_request_cob_id(node_id): heard(SDO) for node_id in node_ids}
+        handlers = {od.sdo_request_cob_id(node_id): counter_of(SDO) for node_id in node_ids}
         if self._bus.role == "master":
-            handlers |= {od.SYNC_COB_ID: heard(SYNC), od.NMT_COB_ID: heard(NMT)}
+            handlers |= {od.SYNC_COB_ID: counter_of(SYNC), od.NMT_COB_ID: counter_of(NMT)}
         if self._bus.heartbeat_node_id is not None:
-            handlers[od.heartbeat_cob_id(self._bus.heartbeat_node_id)] = heard(HEARTBEAT)
+            handlers[od.heartbeat_cob_id(self._bus.heartbeat_node_id)] = counter_of(HEARTBEAT)
         return handlers
 
     def stats(self) -> OtherMasterStats:

@@ -48,7 +48,7 @@ class Subscription:
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
-        self._wanted = patches
+        self._subscribed = patches
         # One counter a patch: a patch has one worker at a time, so each has a single writer.
         self._dropped = dict.fromkeys([*patches, ""], 0)
         self._wakers: dict[object, Callable[[], object]] = {}  # of event loops that wait
@@ -114,7 +114,7 @@ class Subscription:
 
     def close(self) -> None:
         """Take no more fields. Fields still queued are lost."""
-        self._wanted = frozenset()
+        self._subscribed = frozenset()
 
     def end(self) -> None:
         """Take no more fields, and end the reading loop, on any thread, after the fields still queued."""
@@ -160,8 +160,8 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue a field of ``patch``, unless it is not wanted, or an end. Never blocks; any thread."""
-        if patch and patch not in self._wanted:
+        """Queue an end, or a field of ``patch`` if it is subscribed to. Never blocks; any thread."""
+        if patch and patch not in self._subscribed:
             return
         self._dropped[patch] += self._queue.put(item)
         self._wake()
@@ -206,8 +206,8 @@ class Publisher:
         check_timeout(timeout_s)
         if patch is not None and patch not in self._patches:
             raise ValueError(f"patch: got {patch!r}, must be one of {', '.join(sorted(self._patches))}")
-        wanted = self._patches if patch is None else frozenset([patch])
-        subscription = Subscription(capacity, timeout_s, wanted)
+        chosen = self._patches if patch is None else frozenset([patch])
+        subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
         # Item assignment and removal of a dict are atomic, and readers take a copy: no lock is needed.
         forget = self._subscriptions

@@ -60,7 +60,7 @@ _SEGMENT_S: Final = 0.02
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
 # What goes wrong in a transfer is raised here with the node and the object; the library's own log lines
-# would reach a terminal as well, because Python prints warnings that nobody handles.
+# would reach a terminal as well, because Python prints warnings that are not handled.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 

@@ -28,14 +28,14 @@ ASSEMBLED = {
     "scans_torn": 2,
     "scans_unchecked": 1,
 }
-LANE = {"frames": 13, "offered": 5, "withheld": 2, "partial": 1, "solved": 4, "failed": 0, "skipped": 1}
+STREAM = {"frames": 13, "offered": 5, "withheld": 2, "partial": 1, "solved": 4, "failed": 0, "skipped": 1}
 SHARES = ["withheld", "partial", "solved", "failed", "skipped"]
 
 
 def found(bus: dict[str, int], stream: dict[str, int], assembled: dict[str, int]) -> list[str]:
-    lane_stats = SimpleNamespace(**LANE | stream, assembler=SimpleNamespace(**ASSEMBLED | assembled))
+    stream_stats = SimpleNamespace(**STREAM | stream, assembler=SimpleNamespace(**ASSEMBLED | assembled))
     bus_stats = SimpleNamespace(**{"foreign": 4, "malformed": 3} | BUS | bus)
-    return discrepancies(SimpleNamespace(buses={"can0": bus_stats}, patches={"palm": lane_stats}))  # type: ignore[arg-type]
+    return discrepancies(SimpleNamespace(buses={"can0": bus_stats}, patches={"palm": stream_stats}))  # type: ignore[arg-type]
 
 
 def test_sums_that_agree() -> None:
@@ -54,7 +54,7 @@ def test_each_counter_of_a_bus_is_in_its_sum(counter: str, change: int) -> None:
 def test_each_counter_of_an_assembler_is_in_its_sum(counter: str) -> None:
     of_scans = counter.startswith("scans")
     name, got = ("scans offered or withheld", 8) if of_scans else ("frames", 13)
-    must = f"{got + 1} of those {'assembled' if of_scans else 'told of'}"
+    must = f"{got + 1} of those {'assembled' if of_scans else 'counted'}"
     lines = found({"malformed": 4}, {}, {counter: ASSEMBLED[counter] + 1})
     assert lines == [f"palm: {name}: got {got}, must be the {must}"]
 
@@ -63,7 +63,7 @@ def test_each_counter_of_an_assembler_is_in_its_sum(counter: str) -> None:
     "counter", [name for name in SHARES if name in {f.name for f in fields(StreamStats)}]
 )
 def test_each_counter_of_a_patch_is_in_its_sum(counter: str) -> None:
-    (line,) = found({}, {counter: LANE[counter] + 1}, {})
+    (line,) = found({}, {counter: STREAM[counter] + 1}, {})
     assert line.startswith("palm: scans offered")
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from skinnode.model.status import Status
     from skinnode.record import Recorder, replay
     from skinnode.solve.operators.system import solve_system
+    from skinnode.solve.options import PosteriorOptions, TrackerOptions
     from skinnode.solve.paths.path import PathResult, solve_path
     from skinnode.solve.paths.step_control import Adaptive, Periodic, Uniform
     from skinnode.solve.posterior.posterior import Posterior
@@ -45,8 +46,10 @@ _HOME = {
     "PathResult": "skinnode.solve.paths.path",
     "solve_path": "skinnode.solve.paths.path",
     "Posterior": "skinnode.solve.posterior.posterior",
+    "PosteriorOptions": "skinnode.solve.options",
     "solve_system": "skinnode.solve.operators.system",
     "Tracker": "skinnode.solve.tracker",
+    "TrackerOptions": "skinnode.solve.options",
 }
 
 __all__ = [
@@ -59,6 +62,7 @@ __all__ = [
     "PathResult",
     "Periodic",
     "Posterior",
+    "PosteriorOptions",
     "Recorder",
     "ResistanceFrame",
     "Rubber",
@@ -66,6 +70,7 @@ __all__ = [
     "SolveStats",
     "Status",
     "Tracker",
+    "TrackerOptions",
     "Uniform",
     "__version__",
     "jacobian",

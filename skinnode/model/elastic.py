@@ -33,11 +33,12 @@ class Rubber:
     """A linear elastic, isotropic material.
 
     Args:
-        young_pa: Young's modulus. The default is that of a soft silicone of about 20 Shore A.
-        poisson: Poisson's ratio. Rubber keeps its volume, so the default is 0.5; then normal and tangential
-            loads do not couple on the surface and Hertz's theory is exact under friction as well.
+        young_pa: Young's modulus, Pa. The default is that of a soft silicone of about 20 Shore A.
+        poisson: Poisson's ratio. Rubber keeps its volume, so the default is 0.5. Normal and tangential loads
+            then do not couple on the surface, and Hertz's theory is exact under friction as well.
 
-    Raises ValueError for a modulus that is not positive and a ratio outside 0 … 0.5.
+    Raises:
+        ValueError: If the modulus is not positive and finite or the ratio is outside 0 … 0.5.
     """
 
     young_pa: float = 0.7e6
@@ -51,26 +52,30 @@ class Rubber:
 
     @property
     def shear_modulus_pa(self) -> float:
-        """G = E / 2(1 + ν)."""
+        """Shear modulus G = E / 2(1 + ν), Pa."""
         return self.young_pa / (2 * (1 + self.poisson))
 
     @property
     def contact_modulus_pa(self) -> float:
-        """E* = E / (1 − ν²), of the rubber against something rigid (Johnson eq. 4.17)."""
+        """Contact modulus E* = E / (1 − ν²), Pa, of the rubber and a rigid body (Johnson eq. 4.17)."""
         return self.young_pa / (1 - self.poisson**2)
 
 
 def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float = 0.0) -> Float:
-    """Displacement of surface points per unit point load, m/N.
+    """Return the displacement of surface points per unit point load.
 
     Args:
+        rubber: The material.
         offset_m: (P, 2) from the load to each point, metres.
-        softening_m: ε in r → √(r² + ε²); spreads the load over a spot of about that radius, so that the
-            displacement stays finite at the load. 0 is the point load itself.
+        softening_m: ε in r → √(r² + ε²), metres; spreads the load over a spot of about that radius, so that
+            the displacement stays finite at the load. 0 is the point load itself.
 
-    Returns (P, 3, 3), last axis: component of the load, the axis before: component of the displacement. Inf
-    and NaN at the load itself where nothing softens it.
-    Raises ValueError for an array of the wrong shape or with NaN, and a negative softening.
+    Returns:
+        (P, 3, 3), m/N. The last axis is the component of the load, the axis before the component of the
+        displacement. Inf and NaN at the load itself if ``softening_m`` is 0.
+
+    Raises:
+        ValueError: If the array has the wrong shape or NaN, or the softening is negative.
     """
     offset = require_array("offset_m", offset_m, ("P", 2))
     if not (math.isfinite(softening_m) and softening_m >= 0):
@@ -84,18 +89,22 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 
 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
-    """Displacement of surface points per unit traction on a rectangle, m/Pa. Finite everywhere.
+    """Return the displacement of surface points per unit traction on a rectangle. It is finite everywhere.
 
     The closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the normal part;
     Johnson eq. 3.25): each kernel of the module's matrix has an elementary antiderivative in x and y, taken
     between the corners.
 
     Args:
+        rubber: The material.
         offset_m: (P, 2) from the centre of the rectangle to each point, metres.
-        size_m: lengths of the rectangle in x and y, metres.
+        size_m: Lengths of the rectangle in x and y, metres.
 
-    Returns (P, 3, 3), axes as in :func:`point_compliance`.
-    Raises ValueError for an array of the wrong shape or with NaN, and lengths that are not positive.
+    Returns:
+        (P, 3, 3), m/Pa, axes as in :func:`point_compliance`.
+
+    Raises:
+        ValueError: If the array has the wrong shape or NaN, or a length is not positive.
     """
     offset = require_array("offset_m", offset_m, ("P", 2))
     if not all(math.isfinite(length) and length > 0 for length in size_m):
@@ -110,7 +119,7 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
 
 
 def _antiderivatives(x: Float, y: Float) -> Float:
-    """Functions whose mixed derivative ∂²/∂x∂y is x²/r³, y²/r³, xy/r³, x/r² and y/r²: (5, P)."""
+    """(5, P) functions whose mixed derivatives ∂²/∂x∂y are x²/r³, y²/r³, xy/r³, x/r² and y/r²."""
     r = np.hypot(x, y)
     ax, ay = np.abs(x), np.abs(y)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -125,10 +134,10 @@ def _antiderivatives(x: Float, y: Float) -> Float:
     return np.stack([xx, yy, -r, x_r2, y_r2])
 
 
-def _compliance(
+def _compliance(  # noqa: PLR0913 - the six functions of r in the matrix
     rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
 ) -> Float:
-    """The matrix of the module's docstring from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
+    """(P, 3, 3) the module's matrix from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
     nu = rubber.poisson
     matrix = np.empty((*inverse.shape, 3, 3))
     matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx
@@ -153,14 +162,16 @@ class HertzContact:
     leaves the pressure alone is exact for incompressible rubber and an approximation below (Johnson 7.1).
 
     Args:
-        radius_m: of the sphere.
-        indentation_m: approach δ of the sphere, which is the normal displacement at the centre of a contact
-            without shear (with ν = 0.5: of any). 0 is no contact.
-        center_m: (x, y) of the contact circle.
-        traction_ratio: (t_x, t_y) shear the rubber feels as a share of the pressure; the coefficient of
-            friction along the direction in which the sphere slides.
+        rubber: The material.
+        radius_m: Radius of the sphere, metres.
+        indentation_m: Approach δ of the sphere, metres: the normal displacement at the centre of a contact
+            without shear (with ν = 0.5, of any contact). 0 is no contact.
+        center_m: (x, y) of the contact circle, metres.
+        traction_ratio: (t_x, t_y) shear on the rubber over the pressure: the coefficient of friction along
+            the direction in which the sphere slides.
 
-    Raises ValueError for values that are not finite, a radius that is not positive, a negative indentation.
+    Raises:
+        ValueError: If a value is not finite, the radius is not positive, or the indentation is negative.
     """
 
     rubber: Rubber
@@ -180,22 +191,26 @@ class HertzContact:
 
     @property
     def contact_radius_m(self) -> float:
-        """a = √(R δ) (Johnson eq. 4.23)."""
+        """Contact radius a = √(R δ), metres (Johnson eq. 4.23)."""
         return math.sqrt(self.radius_m * self.indentation_m)
 
     @property
     def peak_pressure_pa(self) -> float:
-        """p₀ = 2 E* a / πR (Johnson eqs. 4.22 and 4.24)."""
+        """Peak pressure p₀ = 2 E* a / πR, Pa (Johnson eqs. 4.22 and 4.24)."""
         return 2 * self.rubber.contact_modulus_pa * self.contact_radius_m / (math.pi * self.radius_m)
 
     @functools.cached_property
     def force_n(self) -> tuple[float, float, float]:
-        """Total load on the rubber; its normal part is −4/3 E* √R δ^{3/2}."""
+        """Total load on the rubber, N; its normal part is −4/3 E* √R δ^{3/2}."""
         normal = 2 / 3 * math.pi * self.peak_pressure_pa * self.contact_radius_m**2
         return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
 
     def traction_pa(self, points_m: ArrayLike) -> Float:
-        """(P, 3) load per area on the rubber at the surface points (P, 2). Zero outside the contact."""
+        """Return the load per area (P, 3), Pa, at surface points (P, 2), metres; 0 outside the contact.
+
+        Raises:
+            ValueError: If the array has the wrong shape or NaN.
+        """
         offset = require_array("points_m", points_m, ("P", 2)) - self.center_m
         a = self.contact_radius_m
         if a == 0:
@@ -205,9 +220,10 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """(P, 3) displacement of the surface points (P, 2); exactly zero where there is no contact.
+        """Return the displacement (P, 3) of surface points (P, 2), metres; exactly 0 without a contact.
 
-        Raises ValueError for an array of the wrong shape or with NaN.
+        Raises:
+            ValueError: If the array has the wrong shape or NaN.
         """
         offset = require_array("points_m", points_m, ("P", 2)) - self.center_m
         if self.indentation_m == 0:

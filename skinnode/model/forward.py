@@ -5,7 +5,7 @@ parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 201
 lower wire's M unit charges summed over the N electrodes of the upper wire, and
 ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
 
-These functions say what the compiled twins in ``kernels`` must compute; they are written for reading.
+These functions define what the compiled ones in ``kernels`` must compute; they are written for reading.
 """
 
 from __future__ import annotations
@@ -23,24 +23,44 @@ def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """F, (U, K) in 1/m. Inf where two electrodes coincide."""
+    """Return F (U, K), 1/m, for electrodes at ``upper_m`` (U, N, 3), metres; inf if two coincide.
+
+    Raises:
+        ValueError: If the array has the wrong shape or NaN.
+    """
     distance = np.linalg.norm(_offsets(layout, upper_m), axis=-1)
     with np.errstate(divide="ignore"):
         return np.asarray((1.0 / distance).sum(axis=(2, 3)))
 
 
 def resistance_ohm(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Wire-to-wire resistances R = ρ / F, (U, K) in ohm, for electrodes at ``upper_m`` (U, N, 3) in metres.
+    """Return the wire-to-wire resistances R = ρ / F of a patch (Xu et al. 2018, eq. 2).
 
-    Raises ValueError for an array of the wrong shape or with NaN.
+    Args:
+        layout: The patch.
+        upper_m: (U, N, 3) positions of the upper electrodes, metres.
+
+    Returns:
+        (U, K) resistances, ohm.
+
+    Raises:
+        ValueError: If the array has the wrong shape or NaN.
     """
     return layout.resistivity_ohm_per_m / potential_per_m(layout, upper_m)
 
 
 def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """∂F/∂x, (U, K, N, 3) in 1/m², of F = ρ / R for electrodes at ``upper_m`` (U, N, 3) in metres.
+    """Return the Jacobian ∂F/∂x of F = ρ / R.
 
-    Raises ValueError for an array of the wrong shape or with NaN.
+    Args:
+        layout: The patch.
+        upper_m: (U, N, 3) positions of the upper electrodes, metres.
+
+    Returns:
+        (U, K, N, 3), 1/m².
+
+    Raises:
+        ValueError: If the array has the wrong shape or NaN.
     """
     offset = _offsets(layout, upper_m)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
-"""Compiled twins of ``forward`` for one wire, in structure-of-arrays order.
+"""The forward model of one wire, compiled, in structure-of-arrays order.
 
 Lower electrodes are (3, M, K) and the Jacobian is kept as its transpose (3N, K): a vector of neighbouring
-lower wires k is read and written as it lies, and its sums stay in registers. The distances are what costs: a
+lower wires k is read and written as it lies, and its sums stay in registers. The distances cost most: a
 square root and a division a pair keep one slow unit of the processor busy, so 1/√ is made of multiplications
 instead. Lengths are in any one unit; F is in its inverse.
 """
@@ -16,7 +16,7 @@ from skinnode.model.layout import Float
 
 
 def lower_rows(lower: Float) -> Float:
-    """(K, M, 3) lower electrodes as the (3, M, K) rows the kernels read."""
+    """Return lower electrodes (K, M, 3) as the rows (3, M, K) that the kernels read."""
     return np.ascontiguousarray(lower.transpose(2, 1, 0))
 
 
@@ -37,7 +37,10 @@ def _inverse_root(square: Lanes) -> Lanes:
 
 @njit
 def potential(x: Float, lower: Float, f: Float) -> None:
-    """F of one wire into ``f`` (K,): electrodes ``x`` (3N,) as x₁ y₁ z₁ x₂ …, ``lower`` (3, M, K)."""
+    """Write F of one wire into ``f`` (K,).
+
+    ``x`` (3N,) holds its electrodes as x₁ y₁ z₁ x₂ …, ``lower`` (3, M, K) the lower ones.
+    """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
         count = wires - k
@@ -54,7 +57,7 @@ def potential(x: Float, lower: Float, f: Float) -> None:
 
 @njit
 def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
-    """F and its Jacobian of one wire: ``f`` (K,) as in :func:`potential`, ``jt`` (3N, K) = (∂F/∂x)ᵀ."""
+    """Write F of one wire into ``f`` (K,), as :func:`potential`, and (∂F/∂x)ᵀ into ``jt`` (3N, K)."""
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
         count = wires - k

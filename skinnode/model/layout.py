@@ -1,4 +1,4 @@
-"""The geometry of a patch: where the electrodes are at rest. No other file states a matrix size.
+"""Geometry of a patch: positions of its electrodes at rest. No other file states a matrix size.
 
 Axes: x along an upper wire, y across the upper wires, z out of the skin; the lower layer lies at z = 0.
 """
@@ -20,21 +20,28 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Upper electrodes of a patch, such as 32 × 32: a covariance of their 3072 coordinates takes 75 MB, and the
-posterior holds several."""
+"""Maximum upper electrodes of a patch, such as 32 × 32: a covariance of their 3072 coordinates takes 75 MB,
+and the posterior holds several."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Pairs of an upper and a lower electrode: the distances between them take 100 MB, and each evaluation of all
-wires computes that many."""
+"""Maximum pairs of an upper and a lower electrode: the distances between them take 100 MB, and each
+evaluation of all wires computes that many."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Two layouts whose electrodes agree to a nanometre are the same layout."""
+"""Resolution of coordinates in the hash, m: layouts whose electrodes agree to a nanometre are the same."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
-    """``value`` as a C-ordered float64 array of ``shape``; a letter in ``shape`` stands for any length.
+    """Return a value as a C-ordered float64 array.
 
-    Raises ValueError naming the argument, what it was and what it must be.
+    Args:
+        name: Name of the argument, for the message.
+        value: The value; not copied if it is such an array already.
+        shape: Its shape; a letter stands for any length of at least 1.
+        finite: Whether every number must be finite.
+
+    Raises:
+        ValueError: If it is not such an array; with the argument, its value and what it must be.
     """
     if (  # as from every frame of a host
         type(value) is np.ndarray
@@ -66,7 +73,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
 
 
 def _require_size(upper_wires: int, upper_electrodes: int, lower_wires: int, lower_electrodes: int) -> None:
-    """Raises ValueError for more than can be solved."""
+    """Raise ValueError if a patch is too large to be solved."""
     upper, lower = upper_wires * upper_electrodes, lower_wires * lower_electrodes
     if upper > MOST_ELECTRODES:
         name, got = "upper_wires × upper_electrodes", f"{upper_wires} × {upper_electrodes}"
@@ -85,11 +92,13 @@ class PatchLayout:
     Args:
         upper_m: (U, N, 3) electrodes of the U upper wires, metres. They move with the surface.
         lower_m: (K, M, 3) electrodes of the K lower wires, metres. They do not move.
-        resistivity_ohm_per_m: resistance of the rubber per metre between two electrodes, the paper's g.
-        name: a preset's name or anything else.
+        resistivity_ohm_per_m: Resistance of the rubber per metre between two electrodes, the paper's g.
+        name: A preset's name or any other.
 
-    Raises ValueError for wrong shapes, NaN, a resistivity that is not positive, an upper electrode on top of
-    a lower one, or more than :data:`MOST_ELECTRODES` or :data:`MOST_PAIRS`.
+    Raises:
+        ValueError: If a shape is wrong, a coordinate is NaN, the resistivity is not positive, an upper
+            electrode lies on a lower one, or there are more than :data:`MOST_ELECTRODES` or
+            :data:`MOST_PAIRS`.
     """
 
     upper_m: Float
@@ -124,7 +133,7 @@ class PatchLayout:
         )
 
     @classmethod
-    def preset(
+    def preset(  # noqa: PLR0913 - the sizes of a patch, by keyword
         cls,
         name: str,
         *,
@@ -136,14 +145,26 @@ class PatchLayout:
         lower_electrodes: int | None = None,
         resistivity_ohm_per_m: float = 1e7,
     ) -> PatchLayout:
-        """A named flat layout. ``lower_wires`` defaults to 3 per electrode of an upper wire (square systems),
-        ``lower_electrodes`` to one per upper wire.
+        """Return a flat layout by name.
 
         ``aligned``    straight wires along y, x over the patch, electrodes a quarter pitch off the upper
                        wires: the plain reading of the paper's figure
         ``symmetric``  as ``aligned`` without the quarter pitch; its Jacobian is close to singular
         ``staggered``  half a pitch wider than the patch, electrode pitch 1.2, wires shifted in y by
                        0.43 (k mod 3 − 1) pitches: measured to be up to a thousand times better conditioned
+
+        Args:
+            name: ``aligned``, ``symmetric`` or ``staggered``.
+            pitch_m: Distance of neighbouring upper electrodes, metres.
+            height_m: Height of the upper electrodes above the lower layer, metres.
+            upper_wires: Number of upper wires, U.
+            upper_electrodes: Number of electrodes of an upper wire, N.
+            lower_wires: Number of lower wires, K; default 3 N, for square systems.
+            lower_electrodes: Number of electrodes of a lower wire, M; default U.
+            resistivity_ohm_per_m: ρ of the resistor ρ d between two electrodes at distance d, ohm/m.
+
+        Raises:
+            ValueError: If the name is unknown, or a number is out of its range.
         """
         if name not in PRESETS:
             raise ValueError(f"name: got {name!r}, must be one of {', '.join(PRESETS)}")
@@ -180,19 +201,22 @@ class PatchLayout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(U, K), the shape of a frame."""
+        """Shape of a frame, (U, K)."""
         return self.upper_m.shape[0], self.lower_m.shape[0]
 
     @property
     def unknowns(self) -> int:
-        """3 N, the coordinates of one upper wire."""
+        """Number of coordinates of one upper wire, 3 N."""
         electrodes: int = self.upper_m.shape[1]
         return 3 * electrodes
 
     @functools.cached_property
     def pitch_m(self) -> float:
-        """Length scale of the patch: the median distance between neighbours on an upper wire, or, for wires
-        of a single electrode, from an upper electrode to the nearest lower one."""
+        """Length scale of the patch, metres.
+
+        It is the median distance between neighbours on an upper wire or, if a wire has a single electrode,
+        from an upper electrode to the nearest lower one.
+        """
         steps = np.linalg.norm(np.diff(self.upper_m, axis=1), axis=2)
         if steps.size:
             return float(np.median(steps))
@@ -206,7 +230,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and all coordinates in nanometres: in object 0x2000, checked by the host."""
+        """CRC-32 of the sizes and all coordinates in nanometres; nodes have it in 0x2000, hosts check it."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

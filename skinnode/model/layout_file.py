@@ -28,10 +28,14 @@ _MOST_HEADER_BYTES: Final = 10_240
 
 
 def read_npz(path: Path) -> PatchLayout:
-    """A layout of the arrays ``upper_m`` (U, N, 3), ``lower_m`` (K, M, 3), metres, and, if it is there,
-    ``resistivity_ohm_per_m``, a number. Nothing in the file is executed.
+    """Read a layout from an NPZ file. Nothing in the file is executed.
 
-    Raises ConfigError for a file that is none of this.
+    Args:
+        path: File with the arrays ``upper_m`` (U, N, 3) and ``lower_m`` (K, M, 3), metres, and optionally the
+            number ``resistivity_ohm_per_m``.
+
+    Raises:
+        ConfigError: If the file is not an NPZ file, or not one of a layout.
     """
     try:
         data = io.BytesIO(read_input("layout file", path, _MOST_NPZ_BYTES))
@@ -48,8 +52,12 @@ def read_npz(path: Path) -> PatchLayout:
 
 
 def _require_sizes(data: io.BytesIO, path: Path) -> None:
-    """Check what the members of an NPZ file claim to be, before one is unpacked: a file of some megabytes can
-    hold gigabytes. Raises ConfigError; and what zipfile and NumPy raise if it is no NPZ file."""
+    """Check the headers of an NPZ file before a member is unpacked: some megabytes can unpack to gigabytes.
+
+    Raises:
+        ConfigError: If a member is unknown, double, compressed otherwise or too large. zipfile and NumPy
+            raise their own errors if it is not an NPZ file.
+    """
     with zipfile.ZipFile(data) as members:
         seen: set[str] = set()
         for member in members.infolist():
@@ -82,12 +90,16 @@ def _require_size(key: str, got: str, size: int, most: int, path: Path) -> None:
 
 
 def has_electrodes(table: Mapping[str, Any]) -> bool:
-    """Whether a TOML layout file says where each electrode is, rather than name a preset."""
+    """Return whether the table of a TOML layout file has electrodes, instead of the keys of a preset."""
     return any(key in table for key in _ARRAYS)
 
 
 def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
-    """A layout of the same keys as in :func:`read_npz`. Raises ConfigError."""
+    """Make a layout of a table with the keys of :func:`read_npz`.
+
+    Raises:
+        ConfigError: If a key is missing or unknown, or a value is not possible; ``path`` is named.
+    """
     for key in _ARRAYS:
         if key not in table:
             raise ConfigError(key, NOTHING, "an array of electrodes, metres", where=str(path))
@@ -104,7 +116,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
 
 
 def impossible(error: ValueError, table: str = "", where: str = "") -> ConfigError:
-    """What :class:`PatchLayout` says of a key, as an error of the ``table`` in which that is."""
+    """Return an error of :class:`PatchLayout` as a ConfigError of the key in its ``table``."""
     key, _, what = str(error).partition(": ")
     got, _, allowed = what.partition(", must be ")
     key = f"{table}.{key}" if table else key

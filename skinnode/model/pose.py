@@ -1,4 +1,4 @@
-"""Where a patch sits on the hand, and what it feels in the hand's frame."""
+"""Pose of a patch on the hand, and its vectors and points in the hand's frame."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""A quaternion that is further from length 1 is a mistake, not rounding."""
+"""Largest distance of a quaternion's length from 1 that can be rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and orientation of a patch's frame (x along its upper wires, z out of the skin) in that of the
-    hand.
+    """Position and orientation of a patch's frame in the frame of the hand.
+
+    The patch's x is along its upper wires, its z out of the skin.
 
     Args:
-        position_m: origin of the patch's frame, metres.
-        quaternion_xyzw: its orientation, real part last.
+        position_m: Origin of the patch's frame, metres.
+        quaternion_xyzw: Orientation of the patch's frame, real part last.
 
-    Raises ValueError for numbers that are not finite and a quaternion that is not of unit length.
+    Raises:
+        ValueError: If a number is not finite, or the quaternion is not of unit length.
     """
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -40,7 +42,14 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Roll, pitch and yaw about the fixed axes x, y, z of the hand, in this order, radians (as URDF)."""
+        """Make a pose of roll, pitch and yaw about the fixed axes x, y, z of the hand, in this order.
+
+        This is the convention of URDF.
+
+        Args:
+            position_m: Origin of the patch's frame, metres.
+            rpy_rad: Roll, pitch and yaw, radians.
+        """
         (sr, sp, sy), (cr, cp, cy) = (
             tuple(function(angle / 2) for angle in rpy_rad) for function in (math.sin, math.cos)
         )
@@ -56,7 +65,7 @@ class Pose:
 
     @property
     def rotation(self) -> Float:
-        """(3, 3) matrix that turns vectors of the patch's frame into the hand's."""
+        """(3, 3) matrix that turns vectors in the patch's frame into vectors in the hand's."""
         x, y, z, w = np.array(self.quaternion_xyzw) / math.hypot(*self.quaternion_xyzw)
         return np.array(
             [
@@ -67,16 +76,16 @@ class Pose:
         )
 
     def vectors(self, of_patch: ArrayLike) -> Float:
-        """(..., 3) displacements, forces or normals of the patch's frame in the hand's."""
+        """Return displacements, forces or normals (..., 3) of the patch's frame in the hand's frame."""
         turned: Float = np.asarray(of_patch, np.float64) @ self.rotation.T
         return turned
 
     def points_m(self, of_patch_m: ArrayLike) -> Float:
-        """(..., 3) points of the patch's frame in the hand's, metres."""
+        """Return points (..., 3), metres, of the patch's frame in the hand's frame."""
         points: Float = self.vectors(of_patch_m) + np.array(self.position_m)
         return points
 
 
 def positions_in_hand_m(field: FieldFrame, layout: PatchLayout, pose: Pose) -> Float:
-    """(U, N, 3) where the electrodes of the upper wires are, in the frame of the hand, metres."""
+    """Return the positions (U, N, 3), metres, of the upper electrodes in the hand's frame."""
     return pose.points_m(layout.upper_m + field.displacement_m)

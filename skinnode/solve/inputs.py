@@ -1,4 +1,4 @@
-"""Checks of what a tracker is given: shapes raise, numbers never do."""
+"""Checks of a tracker's arguments: a wrong shape raises, a number never does."""
 
 from __future__ import annotations
 
@@ -11,28 +11,35 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""A relative deviation above is no knowledge, and its square must not overflow."""
+"""Largest relative noise of a resistance that is used; its square must not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeMap:
-    """What the codes of a converter mean: R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
+    """Meaning of a converter's codes: R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
 
     baseline_ohm: Float
-    """(U, K) R0; a code whose R0 is not positive and finite is no measurement."""
+    """(U, K) ohm, R0; a code whose R0 is not positive and finite is no measurement."""
     lo: float
+    """R / R0 of code 0."""
     step: float
+    """Change of R / R0 by a code."""
     steps: int
+    """Largest code that is a measurement."""
     rounding_ohm: Float
-    """(U, K) standard deviation of a code, as a resistance."""
+    """(U, K) ohm, standard deviation of a code's rounding."""
     relative_noise: float
-    """Of what comes before the converter."""
+    """Relative standard deviation of the signal before the converter."""
     gain: Float | None = None
-    """(U, K), or (U, 1)."""
+    """(U, K) or (U, 1) gain of the front end; None for 1."""
 
 
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
-    """(U, K) deviations. ValueError for another shape than that or a number."""
+    """Return a noise as an array (U, K).
+
+    Raises:
+        ValueError: If it is neither a number nor of that shape.
+    """
     if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
         return np.asarray(relative_noise, np.float64)  # as from every frame of a host
     try:
@@ -43,7 +50,11 @@ def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
 
 
 def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
-    """(U, K) deviations. ValueError unless they are positive and finite and of that shape or a number."""
+    """Return a noise as an array (U, K).
+
+    Raises:
+        ValueError: If it is neither a number nor of that shape, or a value is not positive and finite.
+    """
     noise = broadcast_noise(relative_noise, layout)
     if not ((noise > 0) & (noise < np.inf)).all():
         worst = noise[~((noise > 0) & (noise < np.inf))][0]
@@ -52,7 +63,11 @@ def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
 
 
 def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
-    """``valid`` as an array. ValueError unless it is bool and has the shape of a frame."""
+    """Return a mask as an array (U, K).
+
+    Raises:
+        ValueError: If it is not bool or not of that shape.
+    """
     mask = np.asarray(valid)
     if mask.dtype != np.bool_ or mask.shape != layout.shape:
         got = f"{mask.dtype} of shape {mask.shape}"
@@ -61,7 +76,11 @@ def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
 
 
 def checked_codes(codes: Any, layout: PatchLayout) -> NDArray[np.uint32]:
-    """``codes`` as they are. ValueError unless they are uint32 and have the shape of a frame."""
+    """Return codes as they are.
+
+    Raises:
+        ValueError: If they are not uint32 or not of shape (U, K).
+    """
     if getattr(codes, "dtype", None) != np.uint32 or codes.shape != layout.shape:
         got = f"{codes.dtype} of shape {codes.shape}" if isinstance(codes, np.ndarray) else f"{codes!r:.40}"
         raise ValueError(f"codes: got {got}, must be uint32 of shape {layout.shape}")

@@ -201,6 +201,11 @@ def still_confirmed(displacement: Float, confirmed: Float) -> Mask:
 
 
 def beyond_prior(nuisances: Float, variance: Float, deviations: float) -> bool:
-    """Return whether a nuisance (p,) is beyond so many of its prior deviations: it replaces something
-    else."""
+    """Return whether a nuisance is so unlikely that it replaces something else.
+
+    Args:
+        nuisances: (p,) estimates.
+        variance: (p,) prior variances.
+        deviations: Prior standard deviations that are still likely.
+    """
     return bool((np.abs(nuisances) > deviations * np.sqrt(variance)).any())

@@ -54,8 +54,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """(U, n, n) C and its whitening for displacements of ``size``; a tenth or ten times of it matters
-    little."""
+    """(U, n, n) C and its whitening for displacements of ``size``, pitches, which hardly matters."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

@@ -54,7 +54,7 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
 
 
 @njit
-def _follow_noise(
+def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name, sums as loops
     x: Float,
     rest: Float,
     lower: Float,

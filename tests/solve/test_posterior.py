@@ -17,7 +17,7 @@ import pytest
 
 import skinnode as sk
 from skinnode.model.elastic import HertzContact, Rubber
-from skinnode.solve.posterior import estimate, posterior
+from skinnode.solve.posterior import map_estimate, posterior
 
 from .press import frame_ohm, hertz_press
 
@@ -516,7 +516,7 @@ def test_deadline_gives_up_in_time_and_recovers(staggered, monkeypatch):
         now += step
         return now
 
-    monkeypatch.setattr(estimate, "perf_counter", clock)
+    monkeypatch.setattr(map_estimate, "perf_counter", clock)
     monkeypatch.setattr(posterior, "perf_counter", clock)
     tracker = sk.Posterior(staggered, deadline_us=3000.0)
     rest = tracker.update(noisy(frame_ohm(staggered, np.zeros_like(staggered.upper_m)), rng))
@@ -551,7 +551,7 @@ def test_covariance_belongs_to_the_field(small):
         std = np.sqrt(np.diag(covariance))
         ratio = (field.displacement_std_m.ravel() / std).reshape(5, -1)
         assert (ratio >= 1 - 1e-9).all()
-        assert (ratio <= np.sqrt(estimate.PRIOR_DOUBT)).all()
+        assert (ratio <= np.sqrt(map_estimate.PRIOR_DOUBT)).all()
         assert (ratio[[0, 1, 3, 4]] <= loose).all()
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12 * covariance.max())
         assert np.linalg.eigvalsh(covariance / np.outer(std, std)).min() > 0

@@ -268,7 +268,7 @@ def test_what_a_confirmation_left_open_stays_while_a_wire_is_held():
 
 def doubt_of_the_first_wire(tracker: sk.Tracker) -> Callable[[], bool]:
     def doubtful() -> bool:
-        tracker._lost[:], tracker._unsure[:] = False, [True, False, False, False]
+        tracker._gate._lost[:], tracker._gate._unsure[:] = False, [True, False, False, False]
         return True
 
     return doubtful
@@ -283,7 +283,7 @@ def test_a_posterior_that_cannot_answer_by_the_deadline_is_not_asked(layout, mon
         tracker._posterior.from_rest_s = shortest_s
         asked, ask = [], tracker._posterior.update
         monkeypatch.setattr(tracker._posterior, "update", lambda *args: asked.append(1) or ask(*args))  # noqa: B023
-        monkeypatch.setattr(tracker, "_doubtful", doubt_of_the_first_wire(tracker))
+        monkeypatch.setattr(tracker._gate, "_doubtful", doubt_of_the_first_wire(tracker))
         for _ in range(3):
             field = tracker.update(frame_ohm(layout, moved))
             assert field.trusted == (asks > 0)
@@ -302,7 +302,7 @@ def test_a_posterior_that_missed_the_deadline_is_not_asked_again_at_once(layout,
         return field if answers else dataclasses.replace(field, status=(sk.Status.DEADLINE,) * 4)
 
     monkeypatch.setattr(tracker._posterior, "update", update)
-    monkeypatch.setattr(tracker, "_doubtful", doubt_of_the_first_wire(tracker))
+    monkeypatch.setattr(tracker._gate, "_doubtful", doubt_of_the_first_wire(tracker))
     moved = hertz_press(layout, 0.1, centre_m=(6e-3, 6e-3))
     for number in range(40):
         answers = number >= 32
@@ -369,9 +369,9 @@ def code_map(layout: sk.PatchLayout) -> CodeMap:
 
 def test_codes_that_mean_nothing_are_refused(layout: sk.PatchLayout) -> None:
     codes = np.zeros(layout.shape, np.uint32)
-    with pytest.raises(ValueError, match="method: got 'posterior', must be exact and told"):
+    with pytest.raises(ValueError, match="method: got 'posterior', must be exact to take codes"):
         sk.Tracker(layout, method="posterior", codes=code_map(layout)).update_codes(codes)
-    with pytest.raises(ValueError, match="codes: got none, must be exact and told what codes mean"):
+    with pytest.raises(ValueError, match="codes: got none, must be given on construction"):
         sk.Tracker(layout, method="exact").update_codes(codes)
     tracker = sk.Tracker(layout, method="exact", codes=code_map(layout))
     for wrong in (codes[:1], codes.astype(np.int64), codes.tolist(), codes.T, None):

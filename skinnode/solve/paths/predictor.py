@@ -31,7 +31,7 @@ def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
 
 
 @njit
-def secant(
+def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the limit and the output
     x_before: Float, a_before: Float, x: Float, a: Float, a_next: Float, reach: float, out: Float
 ) -> None:
     """Predict positions on the secant through the last two points solved.

@@ -1,11 +1,11 @@
-"""Loads on the skin and the contacts they form, from the posterior of the displacement.
+"""Contacts on the skin, from the posterior of the loads.
 
 The prior's loads q ~ N(0, s² D) move the electrodes by u = G q + slack. Given the displacement their mean is
 D Gᵀ C⁻¹ u; after the frame the variance of any sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the notation of
-solve/posterior/innovation.py.
+:mod:`skinnode.solve.posterior.measurement_update`.
 
-Single cells are noisy and their neighbours make up for it, so contacts are looked for in sums of 3 × 3 cells:
-those that press significantly, and not much less than the strongest, form contacts with their neighbours.
+Single cells are noisy and their neighbours make up for it, so contacts are found in sums of 3 × 3 cells. The
+cells that press significantly, and not much less than the strongest, form contacts with their neighbours.
 """
 
 from __future__ import annotations
@@ -19,20 +19,26 @@ from skinnode.compiled.jit import njit
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.posterior.estimate import PRIOR_DOUBT, Estimator
+from skinnode.solve.posterior.load_posterior import LoadPosterior
+from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 from skinnode.solve.posterior.prior import ElasticPrior
 
 SIGNIFICANT: Final = 5.0
-"""Deviations by which a sum of cells must press to be part of a contact: with 200 sums a frame, noise does so
-once in some ten thousand frames."""
+"""Standard deviations by which a sum of cells must press to be part of a contact: with 200 sums a frame,
+noise does so once in some ten thousand frames."""
 RELEVANT: Final = 0.25
-"""Share of the strongest sum that another must reach: the flanks of a contact ring at a tenth."""
+"""Share of the strongest sum that another sum must reach: the flanks of a contact ring at a tenth."""
 HERTZ_SPREAD: Final = 2.5
 """a² over the mean of r² under Hertz's pressure √(1 − r²/a²)."""
 
 
 class ContactFinder:
-    """The constants of a patch, and the deviations of its sums of cells."""
+    """Finds the contacts of one patch, frame by frame.
+
+    Args:
+        prior: Elasticity of the patch.
+        layout: The patch.
+    """
 
     def __init__(self, prior: ElasticPrior, layout: PatchLayout) -> None:
         self._prior = prior
@@ -48,38 +54,45 @@ class ContactFinder:
         self._made_by = -1
         self._box_std = np.full(cells, np.nan)
 
-    def find(self, estimator: Estimator) -> tuple[Float, tuple[Contact, ...]]:
-        """(U, N, 3) forces on the cells of the electrodes, N, and the contacts, the strongest first."""
-        q = estimator.loads()
+    def find(self, loads: LoadPosterior) -> tuple[Float, tuple[Contact, ...]]:
+        """Return the loads on the electrodes and the contacts.
+
+        Args:
+            loads: Posterior of the loads.
+
+        Returns:
+            (U, N, 3) forces on the cells of the electrodes, N; and the contacts, strongest first.
+        """
+        q = loads.mean()
         force = np.einsum("qt,qti->qi", q[self._own] * self._prior.load_n, self._own_frame)
         pressing = -np.append(q[:, 2], 0.0)[self._near].sum(axis=1)
         strong = np.flatnonzero(pressing > RELEVANT * max(float(pressing.max()), 0.0))
-        seed = strong[pressing[strong] > SIGNIFICANT * self._deviations(strong, estimator)]
+        seed = strong[pressing[strong] > SIGNIFICANT * self._deviations(strong, loads)]
         count = _number_regions(self._near, seed, self._label, self._region, self._stack)
         found = [
             contact
             for number in range(1, count + 1)
-            if (contact := self._contact(np.flatnonzero(self._region == number), q, estimator)) is not None
+            if (contact := self._contact(np.flatnonzero(self._region == number), q, loads)) is not None
         ]
         found.sort(key=lambda contact: -contact.normal_force_n)
         return force.reshape(self._electrodes), tuple(found)
 
-    def warm_up(self, estimator: Estimator) -> None:
-        """Compile what a contact needs."""
-        self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), estimator)
+    def warm_up(self, posterior: LoadPosterior) -> None:
+        """Compile the kernels that a contact needs."""
+        self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), posterior)
 
-    def _deviations(self, boxes: Index, estimator: Estimator) -> Float:
-        """(B,) deviations of these sums; each is worked out once for a set of factors."""
-        if self._made_by != estimator.factors:
-            self._made_by = estimator.factors
+    def _deviations(self, boxes: Index, posterior: LoadPosterior) -> Float:
+        """(B,) standard deviations of these sums; each is computed once for a set of factors."""
+        if self._made_by != posterior.factors:
+            self._made_by = posterior.factors
             self._box_std[:] = np.nan
         new = boxes[np.isnan(self._box_std[boxes])]
         if new.size:
             near = self._near[new]
-            self._box_std[new] = estimator.load_std(3 * np.maximum(near, 0) + 2, (near >= 0).astype(float))
+            self._box_std[new] = posterior.std(3 * np.maximum(near, 0) + 2, (near >= 0).astype(float))
         return self._box_std[boxes]
 
-    def _contact(self, region: Index, q: Float, estimator: Estimator) -> Contact | None:
+    def _contact(self, region: Index, q: Float, posterior: LoadPosterior) -> Contact | None:
         """The contact on the cells ``region``."""
         loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
         centroid, shear = np.empty((2, 3))
@@ -88,8 +101,8 @@ class ContactFinder:
         )
         if not force > 0:
             return None
-        # how a contact's load is shared out to its cells is for the most part the prior's word
-        std = math.sqrt(PRIOR_DOUBT) * estimator.load_std(loads, weights)
+        # the prior decides most of how a contact's load is spread over its cells
+        std = math.sqrt(PRIOR_DOUBT) * posterior.std(loads, weights)
         spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load all over its cell about the centre
         return Contact(
             centroid_m=centroid,
@@ -105,10 +118,10 @@ class ContactFinder:
 
 @njit
 def _number_regions(near: Index, seed: Index, label: Index, region: Index, stack: Index) -> int:
-    """Number the connected groups of the cells ``seed`` from 1 on into ``label`` (Q,), 0 elsewhere, and their
-    cells and neighbours into ``region`` (Q,), a cell between two groups to the first; how many there are.
+    """Number the connected groups of the cells ``seed``, and return how many there are.
 
-    ``stack`` (Q,) is scratch.
+    The numbers, from 1, go into ``label`` (Q,), 0 elsewhere. Those of the cells and their neighbours go into
+    ``region`` (Q,), a cell between two groups to the first. ``stack`` (Q,) is scratch.
     """
     label[:], region[:] = 0, 0
     for cell in seed:
@@ -133,7 +146,7 @@ def _number_regions(near: Index, seed: Index, label: Index, region: Index, stack
 
 
 @njit
-def _sum_region(
+def _sum_region(  # noqa: PLR0913 - a kernel: cells, loads and outputs by name
     region: Index,
     q: Float,
     load: Float,
@@ -143,11 +156,11 @@ def _sum_region(
     loads: Index,
     weights: Float,
 ) -> tuple[float, float]:
-    """Normal force, N, and mean r² of the pressure, m², on the cells ``region`` (n,); ``centroid`` (3,) and
-    ``shear`` (3,) force with them.
+    """Return the normal force, N, and the mean r² of the pressure, m², on the cells ``region`` (n,).
 
-    ``loads`` and ``weights`` (7, n) say how force, centroid, mean r² and shear change with the loads, to
-    first order (delta method). All but the force are undefined where that is not positive.
+    ``centroid`` (3,), m, and ``shear`` (3,), N, are written. So are ``loads`` and ``weights`` (7, n): how
+    force, centroid, mean r² and shear change with the loads, to first order (delta method). All but the
+    force are undefined if it is not positive.
     """
     force, mean = 0.0, 0.0
     for t in range(3):

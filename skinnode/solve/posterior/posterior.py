@@ -1,185 +1,127 @@
-"""The whole patch as one maximum a posteriori estimate, followed through a stream of frames.
+"""The posterior of a patch, followed through a stream of frames.
 
-touched   the wires whose resistances differ from those at rest by more than noise give the equations
-hold      where all of them are explained by the last field within noise, nothing is solved
-track     chord or Gauss-Newton steps from the last field; a jump is annealed from rest (``estimate``)
-scale     the prior's scale s, and if wanted the noise, follow the evidence (MacKay)
-judge     a wire whose residual no deformation explains is left out, named, and the rest solved again
+gate      the wires whose resistances differ from those at rest by more than noise give the equations
+hold      if the last field explains all of them within noise, nothing is solved
+track     chord or Gauss-Newton steps from the last field; a jump is annealed from rest (``map_estimate``)
+adapt     the prior's scale, the places of the loads and, if wanted, the noise follow the evidence
+refuse    a wire whose residual no deformation explains is INCONSISTENT and left out; the rest is solved again
 """
 
 from __future__ import annotations
 
 import math
 from time import perf_counter
-from typing import Final
+from typing import Final, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skinnode.model.elastic import Rubber
 from skinnode.model.forward import potential_per_m
 from skinnode.model.frames import Contact, FieldFrame, SolveStats
 from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
 from skinnode.solve import roots
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
-from skinnode.solve.posterior.estimate import Data, Estimator, Index
+from skinnode.solve.posterior.gating import Fit, Gate
+from skinnode.solve.posterior.hyperparameters import Hyperparameters
+from skinnode.solve.posterior.map_estimate import MapEstimator
+from skinnode.solve.posterior.observation import Observation, ObservationModel, Readings
 from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
-DRIFTS: Final = ("none", "patch", "wire")
-
-QUIET_CHANCE: Final = 0.005
-"""A wire at rest, or unmoved, is taken for moved with this chance a frame: χ² test."""
-QUIET_DEVIATIONS: Final = 3.7
-"""Or where a single coordinate would have to move by more than this: one in 15 unmoved frames of 300
-coordinates."""
 NOISE_LEAST: Final = 1e-6
 """Least relative noise: a fifth of a 16-bit code. Less forces the field onto a root of F = b, and there are
 wrong ones, on layouts with folds from ten times as much on; and the forward model is no better than that."""
 LEFT_OUT: Final = 3
-"""Most wires left out one after the other before the whole frame is called INCONSISTENT."""
-
-SCALE_WORTH: Final = 2.0
-"""The prior of s² counts as much as 2 of a hundred or two directions that the data determine."""
-SCALE_REST: Final = 0.005
-"""Scale, in clearances, that this prior expects: where presses of a tenth of the layer come out."""
-SCALE_MOST: Final = 1.0
-"""Greatest scale, in clearances: beyond, the surface would lie below the lower layer."""
-SCALE_STEP: Final = math.log(1.25)
-"""The scale is set anew when the evidence moves it by a quarter: the deviations change by less than that."""
-SCALE_LEAST: Final = 1.0
-"""Smallest scale: a field of it moves the resistances by their noise on the average. Less would go unnoticed,
-and must not be denied by the deviations of an untouched patch."""
-ADAPTIONS: Final = 5
-"""Most times a frame sets the prior or the noise anew."""
-REFINEMENTS: Final = 3
-"""Most times a frame refines where loads are expected; each costs as much as two solves."""
-KEPT: Final = 50
-"""Frames for which a wire that moved against what the others said has its equations used."""
-NOISE_WORTH: Final = 20.0
-"""The noise given counts as much as 20 resistances when it is estimated."""
-NOISE_STEP: Final = math.log(1.1)
-
+"""Maximum wires left out one after the other before the whole frame is called INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""An answer from rest takes as long as so many factorisations of all wires with their deviations, at the very
-least: 11 to 20 were measured for presses on 1 to 10 wires."""
+"""Least time of an answer from rest, in factorisations of all wires with their standard deviations: 11 to 20
+were measured for presses on 1 to 10 wires."""
+
+Mask = NDArray[np.bool_]
 
 
 class Posterior:
-    """Estimates one patch, frame by frame. One owner; the compiled parts hold no GIL.
+    """Estimates the displacement, loads and contacts of one patch, frame by frame.
+
+    One owner; the compiled parts hold no GIL. Compiles its kernels on construction.
 
     Args:
-        layout: the patch; any number of lower wires.
-        relative_noise: standard deviation of R relative to R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest; the resistivity and the gain then cancel.
-        rubber: of the skin. Displacement does not depend on its modulus, forces are proportional to it.
-        scale_m: RMS normal displacement that the prior expects; by default it is set from the data.
-        estimate_noise: set a factor on ``relative_noise`` from the data as well.
-        drift: ``patch``: all resistances may be off by one common gain, ``wire``: by one an upper wire, with
-            a prior deviation of ``drift_std``; ``none``.
-        model_error: share of the change of each resistance that the forward model may get wrong (thickness,
-            size of the electrodes, conductivity under strain): in common, and 0.7 of it each on its own.
-        normal_only: electrodes move along z only, which asks a third of the unknowns.
-        hold: solve only wires that were touched, and nothing where nothing moved.
-        contacts: give forces and contacts too.
-        deadline_us: an update returns after this time and at most one more factorisation; what could not be
-            solved by then is DEADLINE.
+        layout: The patch; any number of lower wires.
+        options: Options of the estimate; default :class:`skinnode.solve.options.PosteriorOptions()`.
+        **arguments: Options by name, in place of those in ``options``.
 
-    Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
+    Attributes:
+        layout: The patch.
+        options: The options in force.
+        from_rest_s: Least time that a touched frame takes from rest, s; 0 without a deadline.
+
+    Raises:
+        ValueError: If an option has the wrong shape or is out of its range.
     """
 
     def __init__(
         self,
         layout: PatchLayout,
-        *,
-        relative_noise: ArrayLike = 1e-5,
-        baseline_ohm: ArrayLike | None = None,
-        rubber: Rubber | None = None,
-        scale_m: float | None = None,
-        estimate_noise: bool = False,
-        drift: str = "none",
-        drift_std: float = 0.02,
-        model_error: float = 0.0,
-        normal_only: bool = False,
-        hold: bool = True,
-        contacts: bool = True,
-        deadline_us: float | None = None,
+        options: PosteriorOptions | None = None,
+        **arguments: Unpack[PosteriorArguments],
     ) -> None:
-        if drift not in DRIFTS:
-            raise ValueError(f"drift: got {drift!r}, must be one of {', '.join(DRIFTS)}")
-        if not (math.isfinite(drift_std) and drift_std > 0):
-            raise ValueError(f"drift_std: got {drift_std}, must be positive and finite")
-        if not (math.isfinite(model_error) and model_error >= 0):
-            raise ValueError(f"model_error: got {model_error}, must be finite and at least 0")
-        if deadline_us is not None and not (math.isfinite(deadline_us) and deadline_us > 0):
-            raise ValueError(f"deadline_us: got {deadline_us}, must be positive and finite")
-        if scale_m is not None and not (math.isfinite(scale_m) and scale_m > 0):
-            raise ValueError(f"scale_m: got {scale_m}, must be positive and finite")
+        self.options = options = merged(PosteriorOptions, options, arguments)
         self.layout = layout
-        self._problem = PatchProblem.of(layout, baseline_ohm)
-        self._noise = checked_noise(relative_noise, layout)
-        self._fixed_scale = None if scale_m is None else (scale_m / layout.pitch_m) ** 2
-        self._estimate_noise, self._drift, self._model_error = estimate_noise, drift, model_error
-        self._hold = hold
+        self._problem = PatchProblem.of(layout, options.baseline_ohm)
+        self._noise = checked_noise(options.relative_noise, layout)
         wires, electrodes = layout.upper_m.shape[:2]
-        self._free = np.arange(2, 3 * electrodes, 3) if normal_only else np.arange(3 * electrodes)
-        self._prior = ElasticPrior.of(layout, rubber)
-        self._seconds = math.inf if deadline_us is None else deadline_us * 1e-6
+        self._free = np.arange(2, 3 * electrodes, 3) if options.normal_only else np.arange(3 * electrodes)
+        elastic = ElasticPrior.of(layout, options.rubber)
+        self._seconds = options.deadline_s
         self._until = math.inf
-        self._gains = {"none": 0, "patch": 1, "wire": wires}[drift]
-        self._d = np.full(self._gains + (model_error > 0), drift_std**2)
-        if model_error > 0:
-            self._d[-1] = model_error**2
-        self._estimator = Estimator(self._problem, self._prior, self._free, self._d.size)
-        self._contacts = ContactFinder(self._prior, layout) if contacts else None
-        self._quiet, self._impossible = (
-            chi_square_limits(layout.shape[1], chance) for chance in (QUIET_CHANCE, roots.IMPOSSIBLE_CHANCE)
-        )
-        self._folded = float(roots.folded_wires(layout, normal_only).mean()) > 0.5
+        self._model = ObservationModel(self._problem, options.drift, options.drift_std, options.model_error)
+        self._estimator = MapEstimator(self._problem, elastic, self._free, self._model.variance.size)
+        self._contacts = ContactFinder(elastic, layout) if options.contacts else None
+        self._gate = Gate(wires, layout.shape[1])
+        self._folded = float(roots.folded_wires(layout, options.normal_only).mean()) > 0.5
         self._noise_least = roots.REFEREE_NOISE if self._folded else NOISE_LEAST
         self._far = roots.FAR * float(self._problem.clearance.min())
+        scale2 = None if options.scale_m is None else (options.scale_m / layout.pitch_m) ** 2
         height = float(np.median(self._problem.clearance))
-        self._scale_rest, self._scale_most = (SCALE_REST * height) ** 2, (SCALE_MOST * height) ** 2
-        self._signal = self._estimator.signal()
+        self._hyper = Hyperparameters(self._estimator, height, scale2, options.estimate_noise)
         self.reset()
         self._warm_up()
         self.reset()
         self.from_rest_s = 0.0
-        """A touched frame does not take less from rest on; 0 where there is no deadline."""
-        if deadline_us is not None:
+        if options.deadline_us is not None:
             a = self._problem.a_rest
-            at_rest = self._data(a, np.ones_like(a), np.ones_like(a, bool))
+            at_rest = self._observe(Readings(a, np.ones_like(a), np.ones_like(a, bool)))
             self.from_rest_s = LEAST_STEPS * self._estimator.step_s(at_rest)
             self.reset()
 
     def _warm_up(self) -> None:
-        """Solve a touched frame, lest the first touch of a stream wait for the compiler."""
+        """Solve a touched frame, so that the first touch of a stream does not wait for the compiler."""
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
         seconds, self._seconds = self._seconds, math.inf  # a deadline would leave kernels uncompiled
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # asked for where nothing touches
+        self._estimator.gamma()  # compiled by this call, otherwise on the first frame without a touch
         if self._contacts is not None:
-            self._contacts.warm_up(self._estimator)
+            self._contacts.warm_up(self._hyper.loads)
 
     def reset(self) -> None:
         """Forget the stream: the next frame is solved from the rest position."""
         wires = self.layout.shape[0]
-        self._estimator.reset(self._fixed_scale or self._scale_rest)
-        self._factor = 1.0  # estimated noise over the noise given
-        self._scale_least = self._scale_rest
+        self._hyper.reset()
+        self._gate.reset()
         self._members: Index = np.arange(0)
-        self._kept = np.zeros(wires, np.int64)
         self._trusted = np.zeros_like(self._estimator.moved)  # last field that passed, its nuisances
         self._trusted_g = np.zeros_like(self._estimator.g)
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
-        self._compared = np.zeros_like(self._trusted)  # field when it was last held against the annealed
+        self._compared = np.zeros_like(self._trusted)  # field when it was last compared with the annealed
         self._annealed = False  # whether the field at hand came from rest
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
@@ -189,56 +131,60 @@ class Posterior:
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
     ) -> FieldFrame:
-        """The displacement field of one frame, its loads and contacts.
+        """Estimate the displacement field of one frame, its loads and contacts.
+
+        No value raises. A wire without usable resistances is estimated from its neighbours, and its standard
+        deviation shows it. A wire that no deformation explains is INCONSISTENT and left out of the estimate.
+        A wire that no steps solve, not even on its own, is MAX_STEPS and left out too. If the whole frame
+        cannot be solved, the last trusted field is held with an infinite standard deviation.
 
         Args:
-            frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
-            valid: (U, K) bool, False where a chunk or wire is missing; default all.
-            relative_noise: as in the constructor, of this frame only; what is not positive and finite makes
-                its resistance unused.
+            frame_ohm: (U, K) resistances, ohm; a value that is not positive and finite is not used.
+            valid: (U, K) bool, False if a chunk or wire is missing; default all True.
+            relative_noise: A number or (U, K), noise of this frame only. A resistance whose noise is not
+                positive and finite is not used.
 
-        Never raises for numbers. A wire without usable resistances is estimated from its neighbours, and its
-        deviation says so. A wire that no deformation explains is INCONSISTENT and left out of the estimate,
-        and so is one that no steps lead to a deformation of, not even on its own: MAX_STEPS.
-        Where the whole frame cannot be solved, the last trusted field is held with an infinite deviation.
-        Raises ValueError for wrong shapes.
+        Returns:
+            The field, with one status a wire.
+
+        Raises:
+            ValueError: If a shape is wrong.
         """
         start = perf_counter()
-        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
-        noise = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
-        with np.errstate(over="ignore", invalid="ignore"):
-            a = frame * self._problem.gain
-        known = (noise > 0) & (noise < NOISE_MAX)
-        noise = np.where(known, np.maximum(noise, self._noise_least), 1.0)
-        usable = known & (a > A_MIN) & (a < A_MAX)
-        if valid is not None:
-            usable &= checked_mask(valid, self.layout)
-        a = np.where(usable, a, self._problem.a_rest)
+        readings = self._readings(frame_ohm, valid, relative_noise)
         estimator = self._estimator
         estimator.evaluations = estimator.factorisations = 0
         estimator.until = min(start + self._seconds, self._until)
         estimator.moved[:], estimator.g[:] = self._trusted, self._trusted_g
-        data = self._data(a, noise, usable)
-        self._set_least(data)
-        if self._is_quiet(data):
-            held = np.ones(len(a), bool)
-            status = np.full(len(a), Status.CONVERGED)
+        observation = self._observe(readings)
+        self._hyper.set_least(observation)
+        if self._is_quiet(observation):
+            held = np.ones(len(self._wires), bool)
+            status = np.full(len(self._wires), Status.CONVERGED)
         else:
             try:
-                status, held = self._solve(data, a, noise, usable)
+                status, held = self._solve(observation, readings)
             except TimeoutError:
-                start_known = self._known
+                known = self._known
                 status, held = self._give_up(Status.DEADLINE)
-                self._known = start_known  # the next frame starts where this one did
-            data = self._data(a, noise, usable)
-        return self._field(data, status, held, start)
+                self._known = known  # the next frame starts where this one did
+            observation = self._observe(readings)
+        return self._field(observation, status, held, start)
+
+    def stop_at(self, until: float) -> None:
+        """Let the next updates end at this time of :func:`time.perf_counter`, inf for never."""
+        self._until = until
 
     def covariance_m2(self) -> Float:
-        """(3UN, 3UN) covariance of the displacement of the last frame as the factors have it, without the
-        allowance for what the prior itself may get wrong (``PRIOR_DOUBT``); 0 for coordinates that are not
-        free.
+        """Return the covariance of the last frame's displacement, by its factors.
 
-        Raises RuntimeError where that frame was not solved.
+        It leaves out the allowance for what the prior itself may get wrong (``PRIOR_DOUBT``).
+
+        Returns:
+            (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
+
+        Raises:
+            RuntimeError: If the last frame was not solved.
         """
         if not np.isfinite(self._estimator.std).all():
             raise RuntimeError("covariance_m2: the last frame was not solved")
@@ -249,230 +195,182 @@ class Posterior:
         return full
 
     def energy(self, moved: Float) -> float:
-        """uᵀ (s² C)⁻¹ u of a displacement (U, 3N) in pitches, −2 log of its prior density to a constant, with
-        the prior as the last frame left it."""
-        return self._estimator.roughness(moved) / self._estimator.scale2
+        """Return uᵀ (s² C)⁻¹ u, −2 log of the prior density to a constant, with the last frame's prior.
 
-    def _data(self, a: Float, noise: Float, usable: NDArray[np.bool_]) -> Data:
-        change = a / self._problem.a_rest - 1.0
-        variance = (self._factor * noise) ** 2 + 0.5 * (self._model_error * change) ** 2
-        weight = np.where(usable, 1.0 / np.sqrt(variance), 0.0)
-        h = np.zeros((*a.shape, self._d.size))
-        if self._drift == "patch":
-            h[..., 0] = weight
-        elif self._drift == "wire":
-            h[self._wires, :, self._wires] = weight
-        if self._model_error > 0:
-            h[..., -1] = weight * change
-        return Data(a, weight, h, self._d)
+        Args:
+            moved: (U, 3N) displacement, pitches.
+        """
+        return self._estimator.roughness(moved) / self._estimator.load_prior.scale2
 
-    def stop_at(self, until: float) -> None:
-        """Let the next updates end at this time of :func:`time.perf_counter`, inf for never."""
-        self._until = until
+    # -- one frame -------------------------------------------------------------------------------------
 
-    def _set_least(self, data: Data) -> None:
-        """The smallest scale at the noise of the frame."""
-        power = float((data.weight**2 * self._signal).sum())
-        count = np.count_nonzero(data.weight)
-        least = SCALE_LEAST**2 * count / power if power > 0 else math.inf
-        self._scale_least = min(least, self._scale_most)
+    def _readings(
+        self, frame_ohm: ArrayLike, valid: ArrayLike | None, relative_noise: ArrayLike | None
+    ) -> Readings:
+        frame = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
+        noise = self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
+        with np.errstate(over="ignore", invalid="ignore"):
+            a = frame * self._problem.gain
+        known = (noise > 0) & (noise < NOISE_MAX)
+        noise = np.where(known, np.maximum(noise, self._noise_least), 1.0)
+        usable = known & (a > A_MIN) & (a < A_MAX)
+        if valid is not None:
+            usable &= checked_mask(valid, self.layout)
+        return Readings(np.where(usable, a, self._problem.a_rest), noise, usable)
 
-    def _is_quiet(self, data: Data) -> bool:
-        """Whether the last field explains the frame within noise. A member's residual is the difference of
-        two noises, its own and the one that was solved into the field."""
-        if not (self._hold and self._known and np.array_equal(data.weight > 0, self._seen)):
+    def _observe(self, readings: Readings) -> Observation:
+        return self._model.observe(readings, self._hyper.noise_factor)
+
+    def _beyond_prior(self, observation: Observation, deviations: float) -> bool:
+        return roots.beyond_prior(self._estimator.g, observation.d, deviations)
+
+    def _is_quiet(self, observation: Observation) -> bool:
+        """Whether the last field explains the frame within noise.
+
+        A member's residual is the difference of two noises, its own and the one solved into the field.
+        """
+        seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
+        if not (self.options.hold and seen_before):
             return False  # fewer resistances know less of the field, more know more
-        if self._strained(data, roots.SUSPICIOUS):
+        if self._beyond_prior(observation, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
         noises[self._members] = 2.0
-        stirred, self._overlooked, _ = self._stirred(data, self._trusted, noises)
-        return not stirred.any()
+        fit = self._estimator.fit(observation, self._trusted)
+        self._overlooked = fit.move
+        return not self._gate.moved(fit, observation.count, noises).any()
 
-    def _stirred(
-        self, data: Data, moved: Float | None, noises: float | Float = 1.0
-    ) -> tuple[NDArray[np.bool_], Float, Float]:
-        """(U,) wires whose residuals, at rest for None, are beyond noise of variance ``noises``; (U, f) how
-        far each coordinate seems to have moved, were it the only one; (U,) χ²."""
-        total, sharpest, move = self._estimator.surprise(data, moved)
-        limit = self._quiet[data.count]
-        stirred = (total > noises * limit) | (sharpest > QUIET_DEVIATIONS * np.sqrt(noises))
-        return stirred, move, total
-
-    def _touched(self, data: Data) -> Index:
-        """Wires whose resistances are not those at rest; one in the last solve stays a little longer."""
-        touched, _, total = self._stirred(data, None)
-        stay = np.zeros(len(total), bool)
-        stay[self._members] = True
-        touched |= stay & (total > data.count)
-        if touched.any():
-            touched |= self._kept > 0
-        return np.flatnonzero(touched)
-
-    def _solve(
-        self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _solve(self, observation: Observation, readings: Readings) -> tuple[NDArray[np.int64], Mask]:
         """(U,) statuses and wires not solved. Moves the estimator, and on success the trusted field."""
-        if not usable.any():
+        if not readings.usable.any():
             return self._give_up(Status.ILL_CONDITIONED)
-        estimator = self._estimator
-        status = np.full(len(a), int(Status.CONVERGED))
-        self._kept -= self._kept > 0
-        touched = self._touched(data)
+        status = np.full(len(self._wires), int(Status.CONVERGED))
+        self._gate.next_frame()
+        at_rest = self._estimator.fit(observation, None)
+        touched = self._gate.touched(at_rest, observation.count, self._members)
         # it takes all wires to say that nothing is there
-        wanted = touched if self._hold and touched.size else self._wires
-        seen, usable = usable, usable.copy()
+        wanted = touched if self.options.hold and touched.size else self._wires
+        seen = readings.usable
         for _ in range(LEFT_OUT + 3):
-            members = wanted[data.count[wanted] > 0]
-            if not self._converge(data, members):
-                lost = [u for u in members.tolist() if not self._converge(data, np.array([u]))]
-                if not lost or len(lost) > min(LEFT_OUT, len(a) - 1):
+            members = wanted[observation.count[wanted] > 0]
+            if not self._converge(observation, members):
+                lost = [u for u in members.tolist() if not self._converge(observation, np.array([u]))]
+                if not lost or len(lost) > min(LEFT_OUT, len(status) - 1):
                     return self._give_up(Status.MAX_STEPS)
-                status[lost], usable[lost] = Status.MAX_STEPS, False
-                data = self._data(a, noise, usable)
+                status[lost], readings = Status.MAX_STEPS, readings.without(lost)
+                observation = self._observe(readings)
                 continue
-            data = self._adapt(data, a, noise, usable, members, local=touched.size > 0)
-            if self._folded and self._annealed and touched.size and self._seconds == math.inf:
-                data = self._anneal_again(data, a, noise, usable, members)
-            if not np.isfinite(estimator.moved).all():
+            observation = self._refine(observation, readings, members, local=touched.size > 0)
+            if not np.isfinite(self._estimator.moved).all():
                 return self._give_up(Status.NON_FINITE)
-            stirred, _, total = self._stirred(data, estimator.moved)
-            stirred[wanted] = False
-            surprised = np.flatnonzero(stirred)
-            if surprised.size:  # moved, and not as the others say, or stayed where they say it moved
-                self._kept[surprised] = KEPT
-                wanted = np.union1d(wanted, surprised)
+            fit = self._estimator.fit(observation, self._estimator.moved)
+            joining = self._joining(fit, observation, wanted)
+            if joining.size:
+                wanted = np.union1d(wanted, joining)
                 continue
-            if self._strained(data, roots.BELIEVABLE):
+            if self._beyond_prior(observation, roots.BELIEVABLE):
                 return self._give_up(Status.INCONSISTENT)
-            excess = total / self._impossible[data.count]
+            excess = self._gate.excess(fit, observation.count)
             if (excess <= 1.0).all():
-                break
+                return self._accept(status, members, seen)
             worst = int(np.argmax(excess))
-            status[worst] = Status.INCONSISTENT
-            usable[worst] = False
-            data = self._data(a, noise, usable)
-        else:
-            return self._give_up(Status.INCONSISTENT)
+            status[worst], readings = Status.INCONSISTENT, readings.without([worst])
+            observation = self._observe(readings)
+        return self._give_up(Status.INCONSISTENT)
+
+    def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
+        """Wires that moved, and not as the others predict, or stayed where they predict a move; kept then."""
+        moved = self._gate.moved(fit, observation.count)
+        moved[wanted] = False
+        joining = np.flatnonzero(moved)
+        self._gate.keep(joining)
+        return joining
+
+    def _accept(
+        self, status: NDArray[np.int64], members: Index, seen: Mask
+    ) -> tuple[NDArray[np.int64], Mask]:
+        """Trust the field at hand, if it is within reach."""
+        estimator = self._estimator
         if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
             return self._give_up(Status.ILL_CONDITIONED)
         self._trusted[:] = estimator.moved
         self._trusted_g[:] = estimator.g
         self._members, self._known, self._seen = members, True, seen
-        held = np.ones(len(a), bool)
+        held = np.ones(len(status), bool)
         held[members] = False
-        held &= seen.any(axis=1)  # of a wire without resistances the frame says nothing
+        held &= seen.any(axis=1)  # the frame says nothing of a wire without resistances
         return status, held
 
-    def _converge(self, data: Data, members: Index) -> bool:
-        """From the last trusted field, else from rest by annealing."""
+    def _give_up(self, status: Status) -> tuple[NDArray[np.int64], Mask]:
+        self._known = False
+        self._seen = np.zeros_like(self._seen)
+        self._estimator.forget_factors()
+        return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
+
+    # -- maxima ----------------------------------------------------------------------------------------
+
+    def _converge(self, observation: Observation, members: Index) -> bool:
+        """Solve from the last trusted field, else from rest by annealing."""
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
         self._annealed = False
         hurry = self._seconds < math.inf  # annealing takes several frames' worth of time
-        if (self._known or hurry) and estimator.track(data, members):
+        if (self._known or hurry) and estimator.track(observation, members):
             gone = float(np.abs(estimator.moved - self._compared).max())
-            far = gone >= self._far or self._strained(data, roots.SUSPICIOUS)
-            if not far or hurry or self._anneal_and_compare(data, members):
+            far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
+            if not far or hurry or self._anneal_and_compare(observation, members):
                 return True
-        estimator.spread(self._fixed_scale or self._scale_rest)
-        if self._fixed_scale is None:
-            estimator.scale2 = self._bounded(estimator.guess_scale(data, members))
+        self._hyper.spread(observation, members)
         self._annealed = True
-        return estimator.anneal(data, members)
+        return estimator.anneal(observation, members)
 
-    def _strained(self, data: Data, deviations: float) -> bool:
-        """Whether a nuisance is beyond so many of its prior deviations: it then stands in for something
-        else."""
-        return roots.beyond_prior(self._estimator.g, data.d, deviations)
+    def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
+        """Keep the likelier of the field at hand and the annealed one.
 
-    def _anneal_and_compare(self, data: Data, members: Index) -> bool:
-        """Far from where that was last asked, the next maximum need not be the right one: the better of it
-        and the annealed."""
+        Far from where it was last compared, the maximum found by tracking need not be the right one.
+        """
         estimator = self._estimator
         self._compared[:] = estimator.moved
         tracked = estimator.moved.copy(), estimator.g.copy()
-        estimator.spread(self._fixed_scale or self._bounded(estimator.guess_scale(data, members)))
-        annealed = estimator.anneal(data, members)
-        self._annealed = annealed and estimator.objective(data) <= estimator.objective(data, *tracked)
+        self._hyper.spread_as_seen(observation, members)
+        annealed = estimator.anneal(observation, members)
+        self._annealed = annealed and (
+            estimator.objective(observation) <= estimator.objective(observation, *tracked)
+        )
         if self._annealed:
             return True
         estimator.moved[:], estimator.g[:] = tracked
-        return estimator.track(data, members)
+        return estimator.track(observation, members)
 
-    def _anneal_again(
-        self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_], members: Index
-    ) -> Data:
-        """With folds, loads expected all over the patch may have led to a wrong maximum: the better of that
-        and the one annealed with the loads expected where they were found."""
+    def _refine(
+        self, observation: Observation, readings: Readings, members: Index, *, local: bool
+    ) -> Observation:
+        """Adapt the hyperparameters; with folds, to the likelier of two maxima.
+
+        Loads expected all over the patch may have led to a wrong maximum. The field annealed with the loads
+        expected where they were found replaces it if it is likelier by :data:`skinnode.solve.roots.LIKELIER`.
+        """
+
+        def observe(noise_factor: float) -> Observation:
+            return self._model.observe(readings, noise_factor)
+
         estimator = self._estimator
-        first, before = (estimator.moved.copy(), estimator.g.copy()), estimator.objective(data)
-        if estimator.anneal(data, members) and estimator.objective(data) < before - roots.LIKELIER:
-            return self._adapt(data, a, noise, usable, members, local=True)
+        observation = self._hyper.adapt(observation, observe, members, local=local)
+        if not (self._folded and self._annealed and local and self._seconds == math.inf):
+            return observation
+        first, before = (estimator.moved.copy(), estimator.g.copy()), estimator.objective(observation)
+        annealed = estimator.anneal(observation, members)
+        if annealed and estimator.objective(observation) < before - roots.LIKELIER:
+            return self._hyper.adapt(observation, observe, members, local=True)
         estimator.moved[:], estimator.g[:] = first
-        estimator.track(data, members)
-        return data
+        estimator.track(observation, members)
+        return observation
 
-    def _bounded(self, scale2: float) -> float:
-        return min(max(scale2, self._scale_least), self._scale_most)
-
-    def _adapt(
-        self, data: Data, a: Float, noise: Float, usable: NDArray[np.bool_], members: Index, *, local: bool
-    ) -> Data:
-        """The field at the noise, the scale and, if ``local``, the places of the loads that it speaks for."""
-        estimator = self._estimator
-        if not local and self._fixed_scale is None and (estimator.share != 1.0).any():
-            estimator.spread(self._scale_rest)
-            estimator.track(data, members)
-        refinements = REFINEMENTS if local else 0
-        for _ in range(ADAPTIONS):
-            moved, g, scale2 = estimator.moved.copy(), estimator.g.copy(), estimator.scale2
-            share, factor, before = estimator.share.copy(), self._factor, data
-            changed = False
-            if self._fixed_scale is None:
-                if local:
-                    variance = np.minimum(estimator.expected(self._scale_least), self._scale_most)
-                    wanted = self._bounded(float(variance.mean()))
-                    changed = refinements > 0 and estimator.localise(variance)
-                    refinements -= 1
-                else:
-                    wanted = self._bounded(estimator.evidence_scale(SCALE_WORTH, self._scale_rest))
-                if not changed and abs(math.log(wanted / estimator.scale2)) > 2.0 * SCALE_STEP:
-                    estimator.scale2 = wanted
-                    changed = True
-            if self._estimate_noise:
-                factor = self._noise_factor(data, members)
-                if abs(math.log(factor / self._factor)) > NOISE_STEP:
-                    self._factor = factor
-                    data = self._data(a, noise, usable)
-                    changed = True
-            if not changed:
-                break
-            if not (estimator.track(data, members) or estimator.anneal(data, members)):
-                # not from there: back to the field that was found, and the prior it was found with
-                estimator.moved[:], estimator.g[:], self._factor, data = moved, g, factor, before
-                if not estimator.localise(scale2 * share):
-                    estimator.scale2 = scale2
-                estimator.track(data, members)
-                break
-        return data
-
-    def _noise_factor(self, data: Data, members: Index) -> float:
-        """The factor on the noise at which the residuals are what they should be (MacKay)."""
-        total = float((self._estimator.residuals(data)[members] ** 2).sum())
-        count = float(np.count_nonzero(data.weight[members]))
-        left = max(count - self._estimator.gamma(), 0.0)
-        return math.sqrt((self._factor**2 * total + NOISE_WORTH) / (left + NOISE_WORTH))
-
-    def _give_up(self, status: Status) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        self._known = False
-        self._seen[:] = False
-        self._estimator.forget_factors()
-        return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
+    # -- the field -------------------------------------------------------------------------------------
 
     def _field(
-        self, data: Data, status: NDArray[np.int64], held: NDArray[np.bool_], start: float
+        self, observation: Observation, status: NDArray[np.int64], held: Mask, start: float
     ) -> FieldFrame:
         estimator, problem, pitch = self._estimator, self._problem, self.layout.pitch_m
         displacement = problem.displacement_m(problem.rest + self._trusted)
@@ -482,11 +380,11 @@ class Posterior:
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():
-            self._force, self._contacts_found = self._contacts.find(estimator)
-        used = data.weight > 0
-        r = estimator.residuals(data, self._trusted) / np.where(used, data.weight, np.inf)
+            self._force, self._contacts_found = self._contacts.find(self._hyper.loads)
+        used = observation.weight > 0
+        r = estimator.residuals(observation, self._trusted) / np.where(used, observation.weight, np.inf)
         rms = np.sqrt((r**2).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
-        gains = self._trusted_g[: self._gains]
+        gains = self._trusted_g[: self._model.gains]
         return FieldFrame(
             displacement_m=displacement,
             displacement_std_m=(std * pitch).reshape(displacement.shape),
@@ -501,13 +399,6 @@ class Posterior:
             method="posterior",
             by_prior=np.asarray(~used.any(axis=1)),
             contacts=self._contacts_found if self._known else (),
-            gain=np.broadcast_to(gains, len(held)).copy() if self._gains else None,
-            noise_factor=self._factor,
+            gain=np.broadcast_to(gains, len(held)).copy() if self._model.gains else None,
+            noise_factor=self._hyper.noise_factor,
         )
-
-
-def chi_square_limits(most: int, chance: float) -> Float:
-    """(most + 1,) χ² of 0, 1, … degrees of freedom that is exceeded with ``chance``; tiny for none."""
-    from scipy.special import chdtri
-
-    return np.concatenate([[1e-300], chdtri(np.arange(1.0, most + 1.0), chance)])

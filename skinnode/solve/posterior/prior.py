@@ -1,4 +1,4 @@
-"""What elastic rubber is likely to do: the prior of the displacement field before any resistance is read.
+"""The elastic prior: the displacement of rubber before any resistance is read.
 
 Independent surface loads, one a cell of a pitch around each electrode site, displace the electrodes by the
 half-space's response G (Boussinesq, Cerruti; :func:`skinnode.model.elastic.rectangle_compliance`), so that
@@ -29,35 +29,39 @@ MARGIN: Final = 2
 """Rings of cells beyond the outermost electrodes. A third and fourth change the evidence of Hertz presses
 all over the patch and half off it by less than 1 in 800."""
 SHEAR_SHARE: Final = 0.4
-"""Deviation of the shear loads as a share of that of the normal ones: a contact that slides at a friction of
-0.6 lies at 1.5 deviations. From 0.25 to 0.4 the evidence changes by 2 %; below, layouts that hardly see the
-shear (`aligned`) promise more than they know."""
+"""Standard deviation of the shear loads over that of the normal loads: a contact that slides at a friction of
+0.6 lies at 1.5 standard deviations. From 0.25 to 0.4 the evidence changes by 2 %; below, layouts that hardly
+see the shear (`aligned`) promise more than they know."""
 SLACK: Final = 0.005
-"""ε as a share of the deviation of the normal displacement. From 0.001 to 0.02 it changes nothing; it keeps C
+"""ε over the standard deviation of the normal displacement. From 0.001 to 0.02 it changes nothing; it keeps C
 regular."""
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticPrior:
-    """The prior of one layout, in pitches, for s = 1: a median deviation of the normal displacement of 1."""
+    """The prior of one layout for s = 1.
+
+    The median standard deviation of the normal displacement is then one pitch.
+    """
 
     covariance: Float
     """(3UN, 3UN) C, pitch²."""
     response: Float
-    """(3UN, 3Q) displacement by the loads, each scaled to a deviation of 1 at s = 1; pitches."""
+    """(3UN, 3Q) pitches, displacement by the loads, each scaled to a standard deviation of 1 at s = 1."""
     load_n: Float
-    """(3,) newtons of such a load: along the wire, across, along the normal."""
+    """(3,) N, size of such a load: along the wire, across, along the normal."""
     cell_m: Float
-    """(Q, 3) centres of the cells."""
+    """(Q, 3) m, centres of the cells."""
     frame: Float
     """(Q, 3, 3) rows: tangent along the wire, tangent across, normal out of the skin."""
     cell_area_m2: float
+    """Area of a cell, m²."""
     shape: tuple[int, int]
     """Cells as a lattice, across and along the wires; Q is their product."""
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """The prior of ``layout`` on ``rubber``. Its modulus only scales the forces."""
+        """Make the prior of ``layout`` on ``rubber``, whose modulus only scales the forces."""
         rubber = Rubber() if rubber is None else rubber
         wires, electrodes = layout.upper_m.shape[:2]
         cell, along, across, normal = _lattice(layout)
@@ -93,14 +97,17 @@ class ElasticPrior:
         return cls(covariance, response, load_n, cell, frame, area, shape)
 
     def own_cells(self) -> NDArray[np.int64]:
-        """(U, N) index of the cell around each electrode."""
+        """Return the index (U, N) of the cell around each electrode."""
         index = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
         return index[MARGIN : self.shape[0] - MARGIN, MARGIN : self.shape[1] - MARGIN]
 
 
 def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
-    """Electrode sites carried on beyond the edges by :data:`MARGIN` (U+, N+, 3), m, their steps along and
-    across the wires and their normals, which point away from the lower layer."""
+    """Electrode sites (U+, N+, 3), m, with :data:`MARGIN` more beyond each edge, and their surface.
+
+    The surface is the steps along and across the wires and the normals, which point away from the lower
+    layer.
+    """
     site = layout.upper_m
     lower = layout.lower_m.reshape(-1, 3)
     nearest = np.argmin(((site[:, :, None] - lower) ** 2).sum(axis=-1), axis=-1)

@@ -1,4 +1,6 @@
-"""The linear algebra of one posterior step, in the space of the data.
+"""The measurement update: the linear algebra of one Gauss-Newton step of the posterior.
+
+It works in the space of the data, as a Kalman filter does.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
 g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, its model
@@ -8,6 +10,8 @@ g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, its 
 With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
     x⁺ = s² C Jᵀ S⁻¹ y,   g⁺ = −d Hᵀ S⁻¹ y,   y = J x − r,   S = I + s² J C Jᵀ + H d Hᵀ
+
+with S the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain,
 
 and the covariance there s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
 2005, 3.4). No eigenvalue of S is below 1, so that rounding costs ε ‖S‖ of a standard deviation: a thousandth
@@ -43,29 +47,32 @@ from skinnode.solve.linalg.factorisations import Index, dot, qr_factor, qr_proje
 
 
 class Buffers(NamedTuple):
-    """What the step of a patch writes to: U wires, K equations and f free coordinates each, p nuisances,
-    R = min(K, f + p) rows a wire after reduction."""
+    """Arrays that the step of a patch writes to.
+
+    U wires, K equations and f free coordinates each, p nuisances, R = min(K, f + p) rows a wire after
+    reduction.
+    """
 
     r: Float
     """(U, K) residuals."""
     jt: Float
     """(U, 3N, K) transposed Jacobians."""
     free_jt: Float
-    """(f + p, K) the rows of one wire's Jᵀ that are free, then its Hᵀ."""
+    """(f + p, K) free rows of one wire's Jᵀ, then its Hᵀ."""
     jacobian: Float
     """(U R, f) J of the wires in the step, one below the other."""
     nuisance: Float
-    """(U R, p) H of them."""
+    """(U R, p) H of the wires in the step."""
     y: Float
-    """(U R,)"""
-    gain: Float
-    """(U R, U f) s² J C."""
-    innovation: Float
-    """(U R, U R) S, then its factor L."""
+    """(U R,) J x − r."""
+    cross_covariance: Float
+    """(U R, U f) s² J C, of the data with the displacement."""
+    innovation_covariance: Float
+    """(U R, U R) S, then its Cholesky factor L."""
     whitened: Float
-    """(U R, U f) V."""
-    weights: Float
-    """(U R, U f) Kᵀ, what a unit of noise of each equation does to the estimate."""
+    """(U R, U f) V = L⁻¹ (s² J C)."""
+    kalman_gain_t: Float
+    """(U R, U f) Kᵀ, estimate by a unit of noise of each equation."""
     work: Float
     """(U R, U R) scratch."""
     gradient: Float
@@ -73,18 +80,21 @@ class Buffers(NamedTuple):
     v: Float
     """(U R,) scratch."""
     block: Float
-    """(f, K) Jᵀ of one wire in one piece."""
+    """(f, R) Jᵀ of one wire in one piece."""
     qr: Float
-    """(K, f + p)"""
+    """(K, f + p) QR of [J H] of one wire."""
     diagonal: Float
+    """(f + p,) of R."""
     beta: Float
+    """(f + p,) of the Householder vectors."""
     scratch: Float
+    """(f + p,)"""
     e: Float
     """(K,) scratch."""
 
 
-def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: int) -> Buffers:
-    """Zeroed buffers."""
+def make_buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: int) -> Buffers:
+    """Return zeroed buffers for a patch with these numbers of wires, equations a wire, and so on."""
     columns = free + nuisances
     rows = min(equations, columns)
     m, n = wires * rows, wires * free
@@ -92,23 +102,25 @@ def buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: 
         r=np.zeros((wires, equations)), jt=np.zeros((wires, coordinates, equations)),
         free_jt=np.zeros((columns, equations)), jacobian=np.zeros((m, free)),
         nuisance=np.zeros((m, nuisances)), y=np.zeros(m),
-        gain=np.zeros((m, n)), innovation=np.zeros((m, m)), whitened=np.zeros((m, n)),
-        weights=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
+        cross_covariance=np.zeros((m, n)), innovation_covariance=np.zeros((m, m)), whitened=np.zeros((m, n)),
+        kalman_gain_t=np.zeros((m, n)), work=np.zeros((m, m)), gradient=np.zeros(n), v=np.zeros(m),
         block=np.zeros((free, rows)), qr=np.zeros((equations, columns)), diagonal=np.zeros(columns),
         beta=np.zeros(columns), scratch=np.zeros(columns), e=np.zeros(equations),
     )  # fmt: skip
 
 
 @njit
-def linearise(members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+def linearise(  # noqa: PLR0913 - a kernel: arrays by name
+    members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float
+) -> None:
+    """Write r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
     potentials(members, x, lower, r, jt)
     weigh(members, a, weight, r, jt)
 
 
 @njit
 def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> None:
-    """F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    """Write F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N), for the wires ``members``."""
     for i in range(members.size):
         u = members[i]
         potential_jacobian(x[u], lower, f[u], jt[u])
@@ -116,7 +128,7 @@ def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> N
 
 @njit
 def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """In place of F and its Jacobian, r = w (a F − 1) and its own."""
+    """Replace F and its Jacobian by r = w (a F − 1) and the Jacobian of r."""
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
@@ -129,10 +141,10 @@ def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
 
 
 @njit
-def residuals(
+def residuals(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, lower: Float, a: Float, weight: Float, h: Float, g: Float, r: Float
 ) -> float:
-    """r − H g with r = w (a F − 1) of the wires ``members`` (P,) into ``r`` (U, K); the sum of squares."""
+    """Write r − H g with r = w (a F − 1) of the wires ``members`` (P,) into ``r`` (U, K); return Σ r²."""
     square = 0.0
     for i in range(members.size):
         u = members[i]
@@ -148,12 +160,15 @@ def residuals(
 
 
 @njit
-def surprises(
+def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
     free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
 ) -> None:
-    """r − H g in place of ``r`` (U, K), and how badly that fits: χ² of each wire into ``square_sum`` (U,); by
-    how much each coordinate alone would be off, |Jᵢᵀ r| / ‖Jᵢ‖², into ``move`` (U, f); and the largest of a
-    wire in its deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,)."""
+    """Measure how badly ``r`` (U, K) fits; r − H g replaces it.
+
+    χ² of each wire goes into ``square_sum`` (U,); by how much each coordinate alone would be off, |Jᵢᵀ r| /
+    ‖Jᵢ‖², into ``move`` (U, f); and the largest of a wire in its standard deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into
+    ``top`` (U,).
+    """
     for u in range(jt.shape[0]):
         r_u = r[u]
         for q in range(g.size):
@@ -171,42 +186,11 @@ def surprises(
                 top[u] = max(top[u], along / math.sqrt(square))
 
 
-@njit
-def load_squares(told: Float, loads: Index, weights: Float, out: Float) -> None:
-    """‖L⁻¹ J G w‖² of the sums w with ``weights`` (F, n) of the ``loads`` (F, n) into ``out`` (F,); ``told``
-    (m, 3Q) is L⁻¹ J G."""
-    for f in range(out.size):
-        out[f] = 0.0
-    for i in range(told.shape[0]):
-        row = told[i]
-        for f in range(out.size):
-            value, column, weight = 0.0, loads[f], weights[f]
-            for c in range(weight.size):
-                value += weight[c] * row[column[c]]
-            out[f] += value * value
-
-
-@njit
-def loads_found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
-    """Squares of the loads ``q`` (Q, 3), freed from their own prior variances ``own`` (Q,), into ``found``
-    (Q,): of a cell the largest that is significant, else 0; ``stiffness`` (3Q,). The largest square over its
-    noise."""
-    most = 0.0
-    for cell in range(found.size):
-        found[cell] = 0.0
-        for i in range(3):
-            k = stiffness[3 * cell + i]
-            alone = q[cell, i] / (own[cell] * k)
-            noise = max(1.0 / k - own[cell], 0.0)
-            if alone * alone > significant * noise:
-                found[cell] = max(found[cell], alone * alone - noise)
-                most = max(most, alone * alone / noise if noise > 0.0 else math.inf)
-    return most
-
-
 @njit_part
-def _reduce(u: int, top: int, free: Index, h: Float, x: Float, b: Buffers) -> None:
-    """J, H and y of wire ``u`` into the rows from ``top`` on, reduced to as many as there are columns."""
+def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
+    u: int, top: int, free: Index, h: Float, x: Float, b: Buffers
+) -> None:
+    """Write J, H and y of wire ``u`` into the rows from ``top`` on, at most as many rows as columns."""
     f, p = free.size, h.shape[2]
     equations = h.shape[1]
     y = b.e
@@ -243,13 +227,13 @@ def _reduce(u: int, top: int, free: Index, h: Float, x: Float, b: Buffers) -> No
 
 
 @njit
-def assemble(
+def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     members: Index, free: Index, c: Float, s2: float, h: Float, d: Float, x: Float, b: Buffers
 ) -> float:
-    """J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``; trace of s² J C Jᵀ.
+    """Write J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``.
 
     ``free`` (f,) coordinates of a wire that move; ``c`` (U f, U f) their prior; ``h`` (U, K, p), ``d`` (p,).
-    Of S the upper triangle is written.
+    Only the upper triangle of S is written. Returns the trace of s² J C Jᵀ.
     """
     f, p = free.size, h.shape[2]
     rows = b.jacobian.shape[0] // x.shape[0]
@@ -257,9 +241,9 @@ def assemble(
     for i in range(members.size):
         u, top = members[i], i * rows
         _reduce(u, top, free, h, x, b)
-        multiply(b.jacobian[top : top + rows], c[u * f : (u + 1) * f], b.gain[top : top + rows])
+        multiply(b.jacobian[top : top + rows], c[u * f : (u + 1) * f], b.cross_covariance[top : top + rows])
         for k in range(top, top + rows):
-            row = b.gain[k]
+            row = b.cross_covariance[k]
             for j in range(row.size):
                 row[j] *= s2
     for i in range(members.size):
@@ -271,35 +255,37 @@ def assemble(
         for q in range(i + 1):
             top = q * rows
             multiply(
-                b.gain[top : top + rows, u * f : (u + 1) * f],
+                b.cross_covariance[top : top + rows, u * f : (u + 1) * f],
                 b.block,
-                b.innovation[top : top + rows, left : left + rows],
+                b.innovation_covariance[top : top + rows, left : left + rows],
             )
         for k in range(left, left + rows):
-            trace += b.innovation[k, k]
+            trace += b.innovation_covariance[k, k]
             for q in range(p):
                 value = d[q] * b.nuisance[k, q]
                 if value != 0.0:
                     for t in range(k + 1):
-                        b.innovation[t, k] += value * b.nuisance[t, q]
-            b.innovation[k, k] += 1.0
+                        b.innovation_covariance[t, k] += value * b.nuisance[t, q]
+            b.innovation_covariance[k, k] += 1.0
     return trace
 
 
 @njit
-def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers) -> None:
-    """The Gauss-Newton step into ``x`` and ``g``, with L in place of S."""
+def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
+    members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers
+) -> None:
+    """Take the Gauss-Newton step into ``x`` (U, 3N) and ``g`` (p,), with L in place of S."""
     f = free.size
     rows = b.jacobian.shape[0] // x.shape[0]
     m = members.size * rows
     for k in range(m):
         b.v[k] = b.y[k]
-    solve_lower_vector(b.innovation, b.v, m)
-    solve_lower_transposed_vector(b.innovation, b.v, m)
+    solve_lower_vector(b.innovation_covariance, b.v, m)
+    solve_lower_transposed_vector(b.innovation_covariance, b.v, m)
     for j in range(b.gradient.size):
         b.gradient[j] = 0.0
     for k in range(m):
-        value, row = b.v[k], b.gain[k]
+        value, row = b.v[k], b.cross_covariance[k]
         for j in range(row.size):
             b.gradient[j] += value * row[j]
     for u in range(x.shape[0]):
@@ -313,25 +299,29 @@ def full_step(members: Index, free: Index, d: Float, x: Float, g: Float, b: Buff
 
 
 @njit
-def noise_variance(m: int, d: Float, b: Buffers, out: Float) -> None:
-    """What the noise of ``m`` equations and the nuisances put into the estimate, diag(K (I + H d Hᵀ) Kᵀ)
-    with Kᵀ = L⁻ᵀ V, into ``out`` (U f,). V and L are at hand."""
+def noise_variance(  # noqa: C901 - a kernel: sums as loops
+    m: int, d: Float, b: Buffers, out: Float
+) -> None:
+    """Write the variance that noise and nuisances put into the estimate into ``out`` (U f,), pitch².
+
+    It is diag(K (I + H d Hᵀ) Kᵀ) with Kᵀ = L⁻ᵀ V over ``m`` equations. V and L are at hand.
+    """
     n = out.size
     for k in range(m):
         for j in range(n):
-            b.weights[k, j] = b.whitened[k, j]
-    solve_lower_transposed(b.innovation, b.weights, m, n)
+            b.kalman_gain_t[k, j] = b.whitened[k, j]
+    solve_lower_transposed(b.innovation_covariance, b.kalman_gain_t, m, n)
     for j in range(n):
         out[j] = 0.0
     for k in range(m):
-        row = b.weights[k]
+        row = b.kalman_gain_t[k]
         for j in range(n):
             out[j] += row[j] * row[j]
     for q in range(d.size):
         for j in range(n):
             b.gradient[j] = 0.0
         for k in range(m):
-            value, row = b.nuisance[k, q], b.weights[k]
+            value, row = b.nuisance[k, q], b.kalman_gain_t[k]
             if value != 0.0:
                 for j in range(n):
                     b.gradient[j] += value * row[j]
@@ -340,28 +330,30 @@ def noise_variance(m: int, d: Float, b: Buffers, out: Float) -> None:
 
 
 @njit
-def deviations(
+def standard_deviations(  # noqa: PLR0913 - a kernel: arrays by name
     m: int, c: Float, s2: float, noise: Float, doubt: float, share: float, std: Float, core: Float, b: Buffers
 ) -> None:
-    """Deviations (U, f) from the variance of the posterior, s² C − Vᵀ V, V being at hand: what is ``noise``
-    (U f,) counts whole, the rest, which the prior alone speaks of, ``doubt`` times in ``std`` and ``share``
-    times in ``core``."""
+    """Write standard deviations (U, f) from the variance of the posterior, s² C − Vᵀ V, with V at hand.
+
+    The part of ``noise`` (U f,) counts whole. The rest, of which only the prior speaks, counts ``doubt``
+    times in ``std`` and ``share`` times in ``core``.
+    """
     n, f = noise.size, std.shape[1]
-    told = b.gradient
+    explained = b.gradient
     for j in range(n):
-        told[j] = 0.0
+        explained[j] = 0.0
     for k in range(m):
         row = b.whitened[k]
         for j in range(n):
-            told[j] += row[j] * row[j]
+            explained[j] += row[j] * row[j]
     for j in range(n):
-        unseen = max(max(s2 * c[j, j] - told[j], 0.0) - noise[j], 0.0)
+        unseen = max(max(s2 * c[j, j] - explained[j], 0.0) - noise[j], 0.0)
         std[j // f, j % f] = math.sqrt(noise[j] + doubt * unseen)
         core[j // f, j % f] = math.sqrt(noise[j] + share * unseen)
 
 
 @njit
-def chord_step(
+def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     members: Index,
     free: Index,
     c: Float,
@@ -373,8 +365,12 @@ def chord_step(
     step: Float,
     b: Buffers,
 ) -> tuple[float, float]:
-    """The chord step with the factors at hand: from r and Jᵀ at ``x`` in ``b`` to ``step`` (U f + p,); RMS
-    and largest of its U f coordinates."""
+    """Write the chord step with the factors at hand into ``step`` (U f + p,).
+
+    The buffers hold r and Jᵀ at ``x`` (U, 3N).
+
+    Returns the RMS and the largest of its U f coordinates, pitches.
+    """
     f, p = free.size, g.size
     equations = b.r.shape[1]
     rows = b.jacobian.shape[0] // x.shape[0]
@@ -410,10 +406,10 @@ def chord_step(
             for q in range(p):
                 value -= b.nuisance[k, q] * step[n + q]
             b.v[k] = value
-    solve_lower_vector(b.innovation, b.v, m)
-    solve_lower_transposed_vector(b.innovation, b.v, m)
+    solve_lower_vector(b.innovation_covariance, b.v, m)
+    solve_lower_transposed_vector(b.innovation_covariance, b.v, m)
     for k in range(m):
-        value, row = b.v[k], b.gain[k]
+        value, row = b.v[k], b.cross_covariance[k]
         for j in range(n):
             step[j] -= value * row[j]
     for q in range(p):

@@ -15,8 +15,9 @@ from scipy.optimize import least_squares
 
 import skinnode as sk
 from skinnode.solve.linalg.cholesky import cholesky
-from skinnode.solve.posterior import innovation
-from skinnode.solve.posterior.estimate import PRIOR_DOUBT, SMOOTH_SHARE, Data, Estimator
+from skinnode.solve.posterior import measurement_update as kernels
+from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT, SMOOTH_SHARE, MapEstimator
+from skinnode.solve.posterior.observation import Observation
 from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
@@ -35,7 +36,7 @@ class Case:
     prior: ElasticPrior
     free: np.ndarray
     scale2: float
-    data: Data
+    data: Observation
 
     @property
     def c(self) -> np.ndarray:
@@ -100,22 +101,20 @@ def case(
         h[..., 1:] = weight[..., None] * rng.normal(size=(*layout.shape, nuisances - 1))
     free = np.arange(2, 12, 3) if normal_only else np.arange(12)
     d = rng.uniform(0.5, 2.0, nuisances) * 1e-4
-    return Case(layout, problem, ElasticPrior.of(layout), free, 0.03**2, Data(a, weight, h, d))
+    return Case(layout, problem, ElasticPrior.of(layout), free, 0.03**2, Observation(a, weight, h, d))
 
 
-def factored(
-    case: Case, moved: np.ndarray, members: np.ndarray
-) -> tuple[innovation.Buffers, int, np.ndarray]:
+def factored(case: Case, moved: np.ndarray, members: np.ndarray) -> tuple[kernels.Buffers, int, np.ndarray]:
     """Buffers with the factor at ``moved``; rows in use; S before it was factored."""
     wires, equations = case.layout.shape
     p = case.data.d.size
-    b = innovation.buffers(wires, equations, case.layout.unknowns, case.free.size, p)
+    b = kernels.make_buffers(wires, equations, case.layout.unknowns, case.free.size, p)
     x = case.problem.rest + moved
-    innovation.linearise(members, x, case.problem.lower, case.data.a, case.data.weight, b.r, b.jt)
-    innovation.assemble(members, case.free, case.c, case.scale2, case.data.h, case.data.d, moved, b)
+    kernels.linearise(members, x, case.problem.lower, case.data.a, case.data.weight, b.r, b.jt)
+    kernels.assemble(members, case.free, case.c, case.scale2, case.data.h, case.data.d, moved, b)
     m = members.size * min(equations, case.free.size + p)
-    s = b.innovation[:m, :m].copy()
-    assert cholesky(b.innovation, m)
+    s = b.innovation_covariance[:m, :m].copy()
+    assert cholesky(b.innovation_covariance, m)
     return b, m, s
 
 
@@ -143,14 +142,14 @@ def test_full_step_is_the_textbooks(name, members):
     expected, nuisances, covariance = it.textbook(moved, members)
     b, m, s = factored(it, moved, members)
     x, g = moved.copy(), np.full(it.data.d.size, np.nan)
-    innovation.full_step(members, it.free, it.data.d, x, g, b)
+    kernels.gauss_newton_step(members, it.free, it.data.d, x, g, b)
     std = np.sqrt(np.diag(covariance))
     n = expected.size
     fixed = np.setdiff1d(np.arange(12), it.free)
     np.testing.assert_array_equal(x[:, fixed], 0.0)
     assert np.abs(x[:, it.free] - expected).max() < 1e-6 * std[:n].min()
     assert (np.abs(g - nuisances) < 1e-6 * std[n:]).all()
-    v = np.linalg.solve(np.linalg.cholesky(s, upper=True).T, b.gain[:m])
+    v = np.linalg.solve(np.linalg.cholesky(s, upper=True).T, b.cross_covariance[:m])
     np.testing.assert_allclose(
         it.scale2 * it.c - v.T @ v, covariance[:n, :n], rtol=0, atol=1e-6 * std[:n].max() ** 2
     )
@@ -183,7 +182,7 @@ def test_one_resistance_is_a_rank_one_update():
     row = j[1, 5].ravel()
     c_row = it.scale2 * it.c @ row
     expected = c_row * -r[1, 5] / (1.0 + row @ c_row)
-    innovation.full_step(np.array([1]), it.free, it.data.d, moved, np.zeros(0), b)
+    kernels.gauss_newton_step(np.array([1]), it.free, it.data.d, moved, np.zeros(0), b)
     np.testing.assert_allclose(moved.ravel(), expected, rtol=1e-9, atol=1e-16)
 
 
@@ -196,8 +195,8 @@ def test_chord_steps_with_old_factors_reach_the_maximum(name):
     step = np.zeros(3 * it.free.size + g.size)
     for _ in range(60):
         x = it.problem.rest + moved
-        innovation.linearise(members, x, it.problem.lower, it.data.a, it.data.weight, b.r, b.jt)
-        innovation.chord_step(members, it.free, it.c, it.scale2, it.data.h, it.data.d, moved, g, step, b)
+        kernels.linearise(members, x, it.problem.lower, it.data.a, it.data.weight, b.r, b.jt)
+        kernels.chord_step(members, it.free, it.c, it.scale2, it.data.h, it.data.d, moved, g, step, b)
         moved[:, it.free] += step[: 3 * it.free.size].reshape(3, -1)
         g += step[3 * it.free.size :]
     r, j, h = it.system(moved)
@@ -210,9 +209,9 @@ def test_chord_steps_with_old_factors_reach_the_maximum(name):
     assert np.abs(pull).max() > 1e-3  # there was a press
 
 
-def estimator(it: Case) -> Estimator:
-    found = Estimator(it.problem, it.prior, it.free, it.data.d.size)
-    found.spread(it.scale2)
+def estimator(it: Case) -> MapEstimator:
+    found = MapEstimator(it.problem, it.prior, it.free, it.data.d.size)
+    found.load_prior.spread(it.scale2)
     return found
 
 
@@ -283,15 +282,15 @@ def test_annealing_a_jump_ends_where_small_steps_lead(height, depth, noise, fram
     """A whole patch: annealed from rest, and followed through a press in steps small enough to track."""
     layout = sk.PatchLayout.preset("staggered", height_m=height * 4e-3)
     problem = PatchProblem.of(layout)
-    solvers = [Estimator(problem, ElasticPrior.of(layout), np.arange(30), 0) for _ in range(2)]
+    solvers = [MapEstimator(problem, ElasticPrior.of(layout), np.arange(30), 0) for _ in range(2)]
     jump, steps = solvers
     every = np.arange(10)
     for solver in solvers:
-        solver.spread(0.05**2 * height)
+        solver.load_prior.spread(0.05**2 * height)
     for share in np.linspace(1 / frames, 1.0, frames):
         moved = hertz_press(layout, depth * share)
         a = frame_ohm(layout, moved) * problem.gain
-        data = Data(a, np.full(a.shape, 1 / noise), np.zeros((*a.shape, 0)), np.zeros(0))
+        data = Observation(a, np.full(a.shape, 1 / noise), np.zeros((*a.shape, 0)), np.zeros(0))
         assert steps.track(data, every)
     assert jump.anneal(data, every)
     assert np.abs((jump.moved - steps.moved) / jump.std).max() < 0.1
@@ -304,7 +303,7 @@ def test_sharpest_is_the_wald_test_of_each_coordinate():
     it = case(lower=40, nuisances=0, missing=True)
     moved = np.zeros((3, 12))
     r, j, _ = it.system(moved)
-    total, sharpest, moves = estimator(it).surprise(it.data, moved)
+    total, sharpest, moves = estimator(it).fit(it.data, moved)
     for u in range(3):
         best = 0.0
         for i, column in enumerate(j[u, :, u].T):

@@ -1,0 +1,160 @@
+"""Hyperparameters of the posterior: the prior's scale s, where it expects loads, and the noise.
+
+They follow the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.posterior.load_posterior import LoadPosterior
+from skinnode.solve.posterior.map_estimate import MapEstimator
+from skinnode.solve.posterior.observation import Observation
+
+SCALE_WORTH: Final = 2.0
+"""Number of directions that the prior of s² is worth, of a hundred or two that the data determine."""
+SCALE_REST: Final = 0.005
+"""Scale, clearances, that this prior expects: where presses of a tenth of the layer come out."""
+SCALE_MOST: Final = 1.0
+"""Greatest scale, clearances: beyond, the surface would lie below the lower layer."""
+SCALE_STEP: Final = math.log(1.25)
+"""Logarithm of the change of scale at which it is set anew: the standard deviations change by less."""
+SCALE_LEAST: Final = 1.0
+"""Smallest scale, in that of a field that moves the resistances by their noise on the average. A smaller one
+would go unnoticed, and must not be denied by the standard deviations of an untouched patch."""
+ADAPTIONS: Final = 5
+"""Maximum times a frame sets the prior or the noise anew."""
+REFINEMENTS: Final = 3
+"""Maximum times a frame refines where loads are expected; each costs as much as two solves."""
+NOISE_WORTH: Final = 20.0
+"""Number of resistances that the noise given is worth when it is estimated."""
+NOISE_STEP: Final = math.log(1.1)
+"""Logarithm of the change of the noise at which it is set anew."""
+
+Observe = Callable[[float], Observation]
+"""Makes the observation of a frame at a noise factor."""
+
+
+class Hyperparameters:
+    """Scale, places of the loads and noise of one patch's posterior. One owner.
+
+    Args:
+        estimator: Of the patch.
+        clearance: Median clearance, pitches.
+        scale2: s² if it is fixed, pitch².
+        estimate_noise: Whether the noise is estimated.
+
+    Attributes:
+        noise_factor: Estimated noise over the noise given.
+        loads: Posterior of the loads.
+    """
+
+    def __init__(
+        self, estimator: MapEstimator, clearance: float, scale2: float | None, estimate_noise: bool
+    ) -> None:
+        self._estimator, self._prior = estimator, estimator.load_prior
+        self.loads = LoadPosterior(estimator)
+        self._fixed = scale2
+        self._estimate_noise = estimate_noise
+        self._expected, self._most = (SCALE_REST * clearance) ** 2, (SCALE_MOST * clearance) ** 2
+        self._signal = estimator.signal()
+        self._least = self._expected
+        self.noise_factor = 1.0
+
+    def reset(self) -> None:
+        """Forget the stream, and reset the estimator with it."""
+        self._estimator.reset(self._fixed or self._expected)
+        self.noise_factor = 1.0
+        self._least = self._expected
+
+    def set_least(self, observation: Observation) -> None:
+        """Set the smallest scale by the noise of a frame."""
+        power = float((observation.weight**2 * self._signal).sum())
+        count = np.count_nonzero(observation.weight)
+        least = SCALE_LEAST**2 * count / power if power > 0 else math.inf
+        self._least = min(least, self._most)
+
+    def spread(self, observation: Observation, members: Index) -> None:
+        """Expect loads all over the patch alike, then at the scale that the frame suggests."""
+        self._prior.spread(self._fixed or self._expected)
+        if self._fixed is None:
+            self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
+
+    def spread_as_seen(self, observation: Observation, members: Index) -> None:
+        """Expect loads all over the patch alike, at the scale that the frame suggests before that."""
+        guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
+        self._prior.spread(guess)
+
+    def adapt(
+        self, observation: Observation, observe: Observe, members: Index, *, local: bool
+    ) -> Observation:
+        """Set the hyperparameters that the field at hand speaks for, and solve again until they stay.
+
+        Args:
+            observation: The frame.
+            observe: Makes its observation at another noise factor.
+            members: Wires of the estimate.
+            local: Whether to set the places of the loads too.
+
+        Returns:
+            The observation at the noise found.
+        """
+        estimator, prior = self._estimator, self._prior
+        if not local and self._fixed is None and (prior.share != 1.0).any():
+            prior.spread(self._expected)
+            estimator.track(observation, members)
+        refinements = REFINEMENTS if local else 0
+        for _ in range(ADAPTIONS):
+            moved, g, scale2 = estimator.moved.copy(), estimator.g.copy(), prior.scale2
+            share, before = prior.share.copy(), observation
+            changed = self._fixed is None and self._set_scale(local=local, refine=refinements > 0)
+            refinements -= 1
+            found = self.noise_factor
+            if self._estimate_noise:
+                found = self._noise_found(observation, members)
+                if abs(math.log(found / self.noise_factor)) > NOISE_STEP:
+                    self.noise_factor = found
+                    observation = observe(found)
+                    changed = True
+            if not changed:
+                break
+            if not (estimator.track(observation, members) or estimator.anneal(observation, members)):
+                # back to the field that was found and its prior; the next frame starts with the noise found
+                self.noise_factor = found
+                estimator.moved[:], estimator.g[:], observation = moved, g, before
+                if not prior.localise(scale2 * share):
+                    prior.scale2 = scale2
+                estimator.track(observation, members)
+                break
+        return observation
+
+    def _set_scale(self, *, local: bool, refine: bool) -> bool:
+        """Set scale and places by the evidence; whether they changed."""
+        prior, changed = self._prior, False
+        if local:
+            variance = np.minimum(self.loads.expected(self._least), self._most)
+            wanted = self._bounded(float(variance.mean()))
+            changed = refine and prior.localise(variance)
+        else:
+            wanted = self._bounded(self._estimator.evidence_scale(SCALE_WORTH, self._expected))
+        if not changed and abs(math.log(wanted / prior.scale2)) > 2.0 * SCALE_STEP:
+            prior.scale2 = wanted
+            changed = True
+        return changed
+
+    def _noise_found(self, observation: Observation, members: Index) -> float:
+        """Factor on the noise at which the residuals are what they should be (MacKay)."""
+        residuals: Float = self._estimator.residuals(observation)
+        total = float((residuals[members] ** 2).sum())
+        count = float(np.count_nonzero(observation.weight[members]))
+        left = max(count - self._estimator.gamma(), 0.0)
+        return math.sqrt((self.noise_factor**2 * total + NOISE_WORTH) / (left + NOISE_WORTH))
+
+    def _bounded(self, scale2: float) -> float:
+        return min(max(scale2, self._least), self._most)

@@ -1,0 +1,391 @@
+"""The MAP estimate of one frame: Gauss-Newton, chord steps, and annealing for large jumps.
+
+chord     from the last field with the factors of an older frame: two evaluations of F and J as a rule
+newton    new factors at the field at hand, then chord steps
+anneal    from the rest position with the noise taken as 3 %, then a quarter of that, and so on down to what
+          it is. At a high noise the posterior has one maximum, near the prior's. It leads to the right one:
+          presses of 70 % of the layer between two frames arrive, on layouts on which the samples of the press
+          itself lead the exact inversion astray.
+"""
+
+from __future__ import annotations
+
+import math
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.layout import Float
+from skinnode.solve import roots
+from skinnode.solve.linalg.cholesky import cholesky, inverse_diagonal, multiply, solve_lower
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.posterior import measurement_update as kernels
+from skinnode.solve.posterior.gating import Fit
+from skinnode.solve.posterior.load_prior import LoadPrior
+from skinnode.solve.posterior.observation import Observation, eased
+from skinnode.solve.posterior.prior import ElasticPrior
+from skinnode.solve.wires.problem import PatchProblem
+
+ANNEAL_NOISE: Final = 0.03
+"""First relative noise of the annealing: there one Gauss-Newton step from rest is close to the maximum."""
+ANNEAL_RATIO: Final = 4.0
+"""Ratio of the noise from one step of the annealing to the next. On staggered and aligned, h = 0.5 and 1, of
+presses to 70 % from rest, ratio 3 brings 80 of 80 to the right maximum, 5 all but one."""
+SETTLED: Final = 0.02
+"""RMS of a correction over the RMS standard deviation below which it is the last."""
+CHORDS: Final = 4
+"""Maximum chord steps with one set of factors."""
+CHORD_RATE: Final = 0.35
+"""Contraction of chord steps above which new factors are the shorter way: they cost ten chord steps."""
+NEWTONS: Final = 12
+"""Maximum factorisations of a solve that starts near: one or two as a rule, more if full steps would
+cycle."""
+HALVINGS: Final = 6
+"""Maximum halvings of such a step."""
+PRIOR_DOUBT: Final = 3.0
+"""Factor on the part of σ² that only the prior speaks of, in the standard deviation: how much load to expect
+where is known to a factor only. At 1 the hidden part of a first touch is 5 to 7 standard deviations off in
+one wire of 20 000, and so are dents that no half-space makes; at 2 one of 12 000 coordinates of such dents
+is 5.6, of the hard cases none is beyond 5."""
+SMOOTH_SHARE: Final = 0.25
+"""Factor on the same part in the 95 % interval. Independent loads on cells are rougher than bodies: measured,
+0.0 to 0.13 of that variance is in the errors of spheres, 0.02 to 0.5 in those of Gaussian dents. The tail of
+the errors sets the standard deviation, their body the interval."""
+
+
+class MapEstimator:
+    """MAP estimate of one patch: displacement, nuisances, and the factors of the last step. One owner.
+
+    Args:
+        problem: The patch.
+        elastic: Its elasticity.
+        free: (f,) coordinates of a wire that move.
+        nuisances: Their number, p.
+
+    Attributes:
+        load_prior: Prior of the loads and of the displacement.
+        moved: (U, 3N) displacement, pitches; fixed coordinates stay 0.
+        g: (p,) nuisances.
+        std: (U, f) standard deviations by the last factors, pitches.
+        core: (U, f) the same under bodies as smooth as they are, for the 95 % interval.
+        noise_variance: (U f,) variance that noise and nuisances put into the displacement, pitch².
+        members: Wires whose equations are in the factors.
+        factors: Number of the factors at hand.
+        evaluations: Evaluations of F with J since the owner set it to 0.
+        factorisations: Factorisations since the owner set it to 0.
+        until: Time of :func:`time.perf_counter` after which a solve is broken off with a TimeoutError.
+    """
+
+    def __init__(self, problem: PatchProblem, elastic: ElasticPrior, free: Index, nuisances: int) -> None:
+        wires, equations = problem.layout.shape
+        coordinates = problem.layout.unknowns
+        every = (np.arange(wires)[:, None] * coordinates + free).ravel()
+        self._problem, self._free = problem, free
+        self.load_prior = LoadPrior(elastic, every)
+        self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances)
+        self._rows = min(equations, free.size + nuisances)
+        self._reach = roots.NEAR * float(problem.clearance.min())
+        self._enough = math.inf  # RMS of a correction that is small against the standard deviation
+        self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
+        kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
+        self._correction = np.zeros(wires * free.size + nuisances)
+        self._every = np.arange(wires)
+        self.moved = np.zeros((wires, coordinates))
+        self.g = np.zeros(nuisances)
+        self.std = np.full((wires, free.size), np.inf)
+        self.core = np.full((wires, free.size), np.inf)
+        self.noise_variance = np.zeros(wires * free.size)
+        self._gamma: float | None = None
+        self.members: Index = np.arange(0)
+        self._factored: tuple[Float, float, int] | None = None  # weight, s², version of the prior
+        self.evaluations = self.factorisations = 0
+        self.factors = 0
+        self.until = math.inf
+        self.reset(1.0)
+
+    @property
+    def equations(self) -> int:
+        """Equations of all wires after reduction."""
+        return len(self._b.v)
+
+    @property
+    def factored_rows(self) -> int:
+        """Equations in the factors at hand."""
+        return self.members.size * self._rows
+
+    def reset(self, scale2: float) -> None:
+        """Go back to the rest position, with nothing known and the loads spread at scale s², pitch²."""
+        self.moved[:] = 0.0
+        self.g[:] = 0.0
+        self.forget_factors()
+        self.load_prior.spread(scale2)
+
+    def forget_factors(self) -> None:
+        """Forget what is known of the field at hand."""
+        self.std[:] = np.inf
+        self.core[:] = np.inf
+        self._enough = math.inf
+        self._factored = None
+
+    # -- solving ---------------------------------------------------------------------------------------
+
+    def track(self, observation: Observation, members: Index) -> bool:
+        """Solve from the displacement at hand, on the equations of the wires ``members`` (P,).
+
+        Returns:
+            False if the maximum is not near.
+        """
+        if self._fits(observation, members) and self._settle(observation):
+            return True
+        for _ in range(NEWTONS):
+            before = self.moved.copy(), self.g.copy()
+            size = self._newton(observation, members)
+            if not size <= self._reach:
+                return False
+            self._shorten(observation, *before)
+            self._measure(observation)
+            if self._settle(observation):
+                return True
+        return False
+
+    def anneal(self, observation: Observation, members: Index) -> bool:
+        """Solve from rest, with a noise that falls from :data:`ANNEAL_NOISE` to what it is.
+
+        Returns:
+            False if a step failed.
+        """
+        self.moved[:] = 0.0
+        self.g[:] = 0.0
+        present = observation.weight[observation.weight > 0]
+        level = ANNEAL_NOISE
+        while present.size and level > 1.0 / present.max():
+            if not self._newton(eased(observation, level), members) < math.inf:
+                return False
+            level /= ANNEAL_RATIO
+        if not self._newton(observation, members) < math.inf:
+            return False
+        self._measure(observation)
+        return self._settle(observation) or self.track(observation, members)
+
+    def step_s(self, observation: Observation) -> float:
+        """Return the time of one factorisation of all wires with its standard deviations, s.
+
+        Forgets the factors.
+        """
+        self.until = least = math.inf
+        for _ in range(3):  # the first may wait for memory
+            start = perf_counter()
+            self._newton(observation, self._every)
+            self._measure(observation)
+            least = min(least, perf_counter() - start)
+        self.forget_factors()
+        return least
+
+    # -- what the field at hand says -------------------------------------------------------------------
+
+    def residuals(self, observation: Observation, moved: Float | None = None) -> Float:
+        """Return r − H g (U, K) at the displacement at hand, or another; its noise has deviation 1."""
+        self._square(observation, self._every, self.moved if moved is None else moved, self.g)
+        return self._b.r.copy()
+
+    def fit(self, observation: Observation, moved: Float | None) -> Fit:
+        """Return how badly a displacement (U, 3N), pitches, explains a frame; None for the rest position."""
+        if moved is None:
+            self._linearise_at_rest(observation)
+        else:
+            self._linearise(observation, moved)
+        total, top = np.empty((2, len(self.moved)))
+        move = np.empty((len(top), self._free.size))
+        kernels.measure_fit(self._free, observation.h, self.g, self._b.jt, self._b.r, total, top, move)
+        return Fit(total, top, move)
+
+    def objective(
+        self, observation: Observation, moved: Float | None = None, g: Float | None = None
+    ) -> float:
+        """Return −2 log posterior, to a constant, at the field at hand or another; with equal factors."""
+        moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
+        square = self._square(observation, self.members, moved, g)
+        prior = self.roughness(moved) / self.load_prior.scale2
+        return square + prior + float((g**2 / observation.d).sum())
+
+    def roughness(self, moved: Float) -> float:
+        """Return uᵀ C⁻¹ u, pitch², of a displacement (U, 3N)."""
+        return self.load_prior.roughness(np.ascontiguousarray(moved[:, self._free]).ravel())
+
+    def free_displacement(self) -> Float:
+        """Return the free coordinates (U f,), pitches."""
+        return np.ascontiguousarray(self.moved[:, self._free]).ravel()
+
+    def covariance(self) -> Float:
+        """Return the covariance (U f, U f) of the displacement, pitch²."""
+        v = self._b.whitened[: self.factored_rows]
+        explained = np.empty_like(self.load_prior.covariance)
+        multiply(np.ascontiguousarray(v.T), v, explained)
+        return np.asarray(self.load_prior.scale2 * self.load_prior.covariance - explained)
+
+    def whiten(self, response: Float, out: Float) -> None:
+        """Write L⁻¹ J G into ``out`` (m, C) for a response G (U f, C), by the factors at hand."""
+        b, f, rows = self._b, self._free.size, self._rows
+        for i, u in enumerate(self.members.tolist()):
+            block = slice(i * rows, (i + 1) * rows)
+            multiply(b.jacobian[block], response[u * f : (u + 1) * f], out[block])
+        solve_lower(b.innovation_covariance, out, *out.shape)
+
+    # -- evidence --------------------------------------------------------------------------------------
+
+    def signal(self) -> Float:
+        """Return the variance (U, K) of each relative change of R at rest under a prior of s = 1, pitch⁻²."""
+        wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
+        plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
+        self._linearise_at_rest(plain)
+        slopes = self._b.jt[:, self._free]  # (U, f, K)
+        own = self.load_prior.uniform.reshape(wires, f, wires, f)[np.arange(wires), :, np.arange(wires)]
+        return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
+
+    def guess_scale(self, observation: Observation, members: Index) -> float:
+        """Return the s², pitch², at which the resistances would differ from rest as much as they do."""
+        self._linearise_at_rest(observation)
+        trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
+        square = float((self._b.r[members] ** 2).sum())
+        excess = square - float(np.count_nonzero(observation.weight[members]))
+        return excess / trace if trace > 0 else 0.0
+
+    def gamma(self) -> float:
+        """Return the number of directions in the space of the data that the data determine (MacKay's γ)."""
+        if self._gamma is None:
+            b, m = self._b, self.factored_rows
+            inverse_diagonal(b.innovation_covariance, b.work, b.v, m)
+            self._gamma = m - float(b.v[:m].sum())
+        return self._gamma
+
+    def evidence_scale(self, weight: float, scale2: float) -> float:
+        """Return the next s², pitch², of MacKay's fixed point (Neural Computation 4, 415, 1992).
+
+        Args:
+            weight: Number of directions that the prior of s² is worth.
+            scale2: s² that it expects, pitch².
+        """
+        return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
+
+    # -- steps -----------------------------------------------------------------------------------------
+
+    def _square(self, observation: Observation, members: Index, moved: Float, g: Float) -> float:
+        """Σ (r − H g)² of these wires."""
+        x, o = self._problem.rest + moved, observation
+        return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
+
+    def _fits(self, observation: Observation, members: Index) -> bool:
+        """Whether the factors at hand were made for these wires, noise and prior."""
+        if self._factored is None:
+            return False
+        weight, scale2, version = self._factored
+        prior = self.load_prior
+        if version != prior.version or scale2 != prior.scale2 or not np.array_equal(members, self.members):
+            return False
+        new, old = observation.weight[members], weight[members]
+        return bool((np.abs(new - old) <= 0.1 * old).all())  # False for a resistance lost or found
+
+    def _linearise(self, observation: Observation, moved: Float, members: Index | None = None) -> None:
+        if self.until < math.inf and perf_counter() > self.until:
+            raise TimeoutError
+        b, o = self._b, observation
+        members = self._every if members is None else members
+        x = self._problem.rest + moved
+        kernels.linearise(members, x, self._problem.lower, o.a, o.weight, b.r, b.jt)
+        self.evaluations += members.size
+
+    def _linearise_at_rest(self, observation: Observation) -> None:
+        """Linearise all wires at rest, where F and J are known."""
+        b = self._b
+        b.r[:], b.jt[:] = self._at_rest
+        kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
+
+    def _assemble(self, observation: Observation, members: Index, scale2: float, moved: Float) -> float:
+        covariance, o = self.load_prior.covariance, observation
+        return kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, self._b)
+
+    def _newton(self, observation: Observation, members: Index) -> float:
+        """One Gauss-Newton step with new factors; how far it moved any coordinate, inf if it failed."""
+        b, prior = self._b, self.load_prior
+        self._factored = None
+        self._linearise(observation, self.moved, members)
+        self._assemble(observation, members, prior.scale2, self.moved)
+        self.factorisations += 1
+        self.factors += 1
+        if not cholesky(b.innovation_covariance, members.size * self._rows):
+            return math.inf
+        before = self.moved.copy()
+        kernels.gauss_newton_step(members, self._free, observation.d, self.moved, self.g, b)
+        size = float(np.abs(self.moved - before).max())
+        if not size < math.inf:
+            self.moved[:] = before
+            return math.inf
+        self.members = members
+        self._factored = (observation.weight.copy(), prior.scale2, prior.version)
+        return size
+
+    def _shorten(self, observation: Observation, moved: Float, g: Float) -> None:
+        """Go from there towards the field at hand, to the minimum of a parabola through the objective.
+
+        Gauss-Newton leaves out the curvature of F, and if the data say little its full steps go to and fro
+        across the minimum for ever.
+        """
+        way = self.moved - moved, self.g - g
+
+        def at(share: float) -> float:
+            return self.objective(observation, moved + share * way[0], g + share * way[1])
+
+        start, far = at(0.0), 1.0
+        middle, end = at(0.5), at(1.0)
+        for _ in range(HALVINGS):  # far from the minimum it is no parabola
+            if end < 4.0 * start + 1.0:
+                break
+            far *= 0.5
+            middle, end = at(0.5 * far), middle
+        slope, bend = 4.0 * middle - end - 3.0 * start, 2.0 * (end - 2.0 * middle + start)
+        share = far * (min(max(-0.5 * slope / bend, 0.1), 1.0) if bend > 0.0 else 1.0)
+        self.moved[:], self.g[:] = moved + share * way[0], g + share * way[1]
+
+    def _measure(self, observation: Observation) -> None:
+        """Standard deviations by the factors at hand."""
+        b, m, prior = self._b, self.factored_rows, self.load_prior
+        self._gamma = None
+        b.whitened[:m] = b.cross_covariance[:m]
+        solve_lower(b.innovation_covariance, b.whitened, m, b.whitened.shape[1])
+        kernels.noise_variance(m, observation.d, b, self.noise_variance)
+        kernels.standard_deviations(
+            m, prior.covariance, prior.scale2, self.noise_variance, PRIOR_DOUBT, SMOOTH_SHARE, self.std,
+            self.core, b,
+        )  # fmt: skip
+        self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
+
+    def _settle(self, observation: Observation) -> bool:
+        """Chord steps to the maximum; if they do not settle, the better of the fields before and after."""
+        moved, g = self.moved.copy(), self.g.copy()
+        if self._chord(observation):
+            return True
+        if not self.objective(observation) <= self.objective(observation, moved, g):
+            self.moved[:], self.g[:] = moved, g
+        return False
+
+    def _chord(self, observation: Observation) -> bool:
+        """Chord steps until the correction is small against the standard deviation."""
+        b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
+        before = math.inf
+        for _ in range(CHORDS):
+            self._linearise(observation, self.moved, self.members)
+            size, top = kernels.chord_step(
+                self.members, self._free, prior.covariance, prior.scale2, observation.h, observation.d,
+                self.moved, self.g, step, b,
+            )  # fmt: skip
+            if not (top <= self._reach and size < math.inf):
+                return False
+            self.moved[:, self._free] += step[: self.std.size].reshape(wires, -1)
+            self.g += step[self.std.size :]
+            if size <= self._enough:
+                return True
+            if size > CHORD_RATE * before:
+                return False
+            before = size
+        return False

@@ -1,0 +1,106 @@
+"""The observation model of a frame: residuals, weights, and what each nuisance does to them.
+
+A wire's residual is r = w (a F(x) − 1) with w = 1/σ. It is modelled as r(x) − H g = noise of deviation 1,
+with a few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), and an error of the
+forward model in proportion to the change of each resistance.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.wires.problem import PatchProblem
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """Resistances of one frame in the units of the problem."""
+
+    a: Float
+    """(U, K) R · gain; at rest if a resistance is not usable."""
+    noise: Float
+    """(U, K) standard deviation relative to R."""
+    usable: NDArray[np.bool_]
+    """(U, K)"""
+
+    def without(self, wires: list[int]) -> Readings:
+        """Return the readings with those of some wires not usable."""
+        usable = self.usable.copy()
+        usable[wires] = False
+        return Readings(self.a, self.noise, usable)
+
+
+@dataclass
+class Observation:
+    """One frame as the estimator sees it, with U wires, K resistances a wire and p nuisances."""
+
+    a: Float
+    """(U, K) R · gain."""
+    weight: Float
+    """(U, K) 1/σ, 0 if a resistance is missing."""
+    h: Float
+    """(U, K, p) H, residual by a unit of each nuisance."""
+    d: Float
+    """(p,) prior variances of the nuisances."""
+
+    @functools.cached_property
+    def count(self) -> Index:
+        """(U,) usable resistances of each wire."""
+        return np.asarray(np.count_nonzero(self.weight, axis=1))
+
+
+class ObservationModel:
+    """Makes observations of readings.
+
+    Args:
+        problem: The patch.
+        drift: ``none``, ``patch`` (one gain error) or ``wire`` (one for each upper wire).
+        drift_std: Prior standard deviation of a gain error.
+        model_error: Share of the change of each resistance that the forward model may get wrong.
+
+    Attributes:
+        gains: Number of gain errors, the first of the nuisances.
+        variance: (p,) prior variances of the nuisances.
+    """
+
+    def __init__(self, problem: PatchProblem, drift: str, drift_std: float, model_error: float) -> None:
+        wires = len(problem.rest)
+        self._problem = problem
+        self._drift, self._model_error = drift, model_error
+        self._wires = np.arange(wires)
+        self.gains = {"none": 0, "patch": 1, "wire": wires}[drift]
+        self.variance = np.full(self.gains + (model_error > 0), drift_std**2)
+        if model_error > 0:
+            self.variance[-1] = model_error**2
+
+    def observe(self, readings: Readings, noise_factor: float) -> Observation:
+        """Return the observation of a frame whose noise is ``noise_factor`` times the noise given."""
+        a = readings.a
+        change = a / self._problem.a_rest - 1.0
+        variance = (noise_factor * readings.noise) ** 2 + 0.5 * (self._model_error * change) ** 2
+        weight = np.where(readings.usable, 1.0 / np.sqrt(variance), 0.0)
+        h = np.zeros((*a.shape, self.variance.size))
+        if self._drift == "patch":
+            h[..., 0] = weight
+        elif self._drift == "wire":
+            h[self._wires, :, self._wires] = weight
+        if self._model_error > 0:
+            h[..., -1] = weight * change
+        return Observation(a, weight, h, self.variance)
+
+
+def eased(observation: Observation, level: float) -> Observation:
+    """Return the observation with a noise of deviation ``level`` added, for annealing."""
+    weight = observation.weight
+    loose = 1.0 / np.hypot(
+        level, np.divide(1.0, weight, out=np.full_like(weight, math.inf), where=weight > 0)
+    )
+    share = np.divide(loose, weight, out=np.zeros_like(weight), where=weight > 0)
+    return Observation(observation.a, loose, observation.h * share[..., None], observation.d)

@@ -1,0 +1,227 @@
+"""The gate of the exact inverse: which of its wires are doubtful, and what the posterior says of them.
+
+Doubtful are wires that came to no root, that jumped, and displacements too rough for a press. If a layout has
+folds within the reach of a press, every solved wire is doubtful: F = b then has roots nearby that the inverse
+alone cannot tell apart. The posterior, which knows the neighbouring wires, confirms a doubtful wire, replaces
+it, or leaves it without a root. The thresholds are in :mod:`skinnode.solve.roots`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.model.frames import FieldFrame
+from skinnode.model.layout import Float
+from skinnode.model.status import Status
+from skinnode.solve import roots
+from skinnode.solve.exact.tracker import ExactTracker
+from skinnode.solve.options import TrackerOptions
+from skinnode.solve.posterior.posterior import Posterior
+from skinnode.solve.smoothness import Smoothness
+from skinnode.solve.wires.problem import PatchProblem
+from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
+
+PAUSE: Final = 16
+"""Frames in which the posterior is not asked again after it missed a deadline: asking in vain with every
+frame takes 2 ms of the time of patches that wait for the same thread."""
+APART: Final = 3.0
+"""Factor on the gap between a root near a fold and the posterior that confirms it, added to its standard
+deviation: two roots may lie closer than the posterior can tell."""
+NEAR_FOLD: Final = 2.0
+"""Factor on the standard deviation of a wire near a fold that the posterior replaced, for the same reason."""
+
+Mask = NDArray[np.bool_]
+
+
+class RootGate:
+    """Checks every field of an exact tracker with the posterior of its patch. One owner.
+
+    Args:
+        exact: The tracker whose fields are checked.
+        posterior: Posterior of the same patch.
+        options: Options of both.
+    """
+
+    def __init__(self, exact: ExactTracker, posterior: Posterior, options: TrackerOptions) -> None:
+        layout = exact.layout
+        problem = PatchProblem.of(layout, options.baseline_ohm)
+        self._exact, self._posterior = exact, posterior
+        self._seconds = options.deadline_s
+        clearance_m = float(problem.clearance.min()) * layout.pitch_m
+        self._last_m = np.zeros_like(layout.upper_m)
+        self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
+        self._pause = 0  # frames until the posterior is asked again
+        self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # m, what its confirmation left open of a wire
+        self._any_apart = False
+        self._blind = roots.blind_wires(layout, options.normal_only)
+        self._folded = roots.folded_wires(layout, options.normal_only)
+        if roots.nonlinear_in_noise(layout, options.relative_noise, options.normal_only):
+            self._folded = np.ones_like(self._folded)
+        its = exact.arrays
+        whitening = np.array(Smoothness(problem).whitening, order="C")
+        self._root_check = RootCheck(
+            moved_m=its.outcome_m[0],
+            last_m=self._last_m,
+            status=its.status,
+            held=its.held,
+            folded=self._folded.copy(),
+            whitening=whitening,
+            lost=self._lost,
+            unsure=self._unsure,
+            rough=self._rough,
+            jump_m=roots.JUMP * clearance_m,
+            far_m=roots.LARGE * clearance_m,
+            pitch_m=layout.pitch_m,
+            rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
+        )
+        self._doubtful()  # compiles it
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self._confirmed = None
+        self._apart[:], self._any_apart = 0.0, False
+        self._last_m[:] = 0.0
+        self._pause = 0
+
+    def check(self, field: FieldFrame, start: float) -> FieldFrame:
+        """Return the field with its doubtful wires confirmed, replaced or without a root.
+
+        Args:
+            field: Field of the exact tracker.
+            start: Time of :func:`time.perf_counter` at which its update began.
+        """
+        doubtful: Mask | None = None
+        if self._doubtful():
+            doubtful = self._lost | self._unsure
+            until, anew = start + self._seconds, bool(self._unsure.any())
+            if self._pause or (anew and perf_counter() + self._posterior.from_rest_s > until):
+                field = self._give_up(field, doubtful)
+            else:
+                if anew:
+                    self._posterior.reset()  # annealed from rest: tracking a wrong root would confirm it
+                its = self._exact.arrays
+                self._posterior.stop_at(until)
+                noise = np.maximum(its.noise, roots.REFEREE_NOISE)
+                estimate = self._posterior.update(its.ohm.copy(), its.valid.copy(), noise)
+                if Status.DEADLINE in estimate.status:
+                    self._pause = PAUSE
+                field = self._select(field, doubtful, estimate)
+        self._pause = max(0, self._pause - 1)
+        if self._any_apart:
+            every = np.ones(len(self._apart), np.bool_)
+            field = self._keep_apart(field, every if doubtful is None else ~doubtful)
+        self._last_m[:] = field.displacement_m
+        return field
+
+    def _doubtful(self) -> bool:
+        """Whether any wire has no root (``_lost``), or one that may not be the right one (``_unsure``)."""
+        found = check_roots(self._root_check.table)
+        if found & SOME_ROUGH:
+            if self._confirmed is not None:
+                self._rough &= ~roots.still_confirmed(self._exact.arrays.outcome_m[0], self._confirmed)
+            self._unsure |= self._rough
+        return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
+
+    def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
+        """Give a held wire the standard deviation that it had when the posterior confirmed it."""
+        if field.held is None:
+            return field
+        self._apart[unasked & ~field.held] = 0.0
+        apart_now = self._apart[:, 0, 0] > 0.0
+        self._any_apart = bool(apart_now.any())
+        still = unasked & field.held & apart_now
+        if not still.any():
+            return field
+        apart = np.where(still[:, None, None], self._apart, 0.0)
+        core = field.core_std_m
+        return dataclasses.replace(
+            field,
+            displacement_std_m=np.hypot(field.displacement_std_m, apart),
+            core_std_m=None if core is None else np.hypot(core, apart),
+        )
+
+    def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
+        """Leave the doubtful wires without a root, because there is no time to ask the posterior."""
+        std = field.displacement_std_m.copy()
+        std[doubtful] = np.inf
+        self._apart[doubtful] = 0.0
+        self._exact.distrust(doubtful)
+        return dataclasses.replace(
+            field,
+            displacement_std_m=std,
+            core_std_m=std,
+            status=_selected(field.status, doubtful, np.zeros_like(doubtful)),
+            by_prior=np.zeros_like(doubtful),
+        )
+
+    def _select(self, field: FieldFrame, doubtful: Mask, estimate: FieldFrame) -> FieldFrame:
+        """Confirm, replace or give up the doubtful wires by the posterior's estimate."""
+        known = np.array(estimate.status) == Status.CONVERGED
+        converged = np.array(field.status) == Status.CONVERGED
+        spread = np.hypot(field.displacement_std_m, estimate.displacement_std_m)
+        gap = np.abs(field.displacement_m - estimate.displacement_m)
+        asked = ~self._blind & doubtful & known
+        agreed = asked & converged & roots.agrees(gap, roots.AGREE * spread)
+        if agreed.any():
+            if self._confirmed is None:
+                self._confirmed = np.full_like(field.displacement_m, np.inf)
+            self._confirmed[agreed] = field.displacement_m[agreed]
+        replaced = asked & ~agreed
+        refused = doubtful & ~agreed & ~replaced
+        moved, residual = field.displacement_m.copy(), field.residual.copy()
+        moved[replaced], residual[replaced] = estimate.displacement_m[replaced], estimate.residual[replaced]
+        apart = APART * gap.max(axis=(1, 2), keepdims=True)
+
+        def widened(own: Float, posterior: Float) -> Float:
+            std = np.where(replaced[:, None, None], posterior, own)
+            std[refused] = np.inf
+            if self._folded.any():
+                std[replaced & self._folded] *= NEAR_FOLD
+                std = np.where((agreed & self._folded)[:, None, None], np.hypot(std, apart), std)
+            return std
+
+        self._apart[doubtful] = 0.0
+        self._apart[agreed & self._folded] = apart[agreed & self._folded]
+        self._any_apart = True  # perhaps
+
+        assert estimate.core_std_m is not None
+        self._exact.adopt(replaced, moved)
+        self._exact.distrust(refused)
+        force = field.force_n
+        if force is not None and self._exact.stiffness_n_per_m is not None:
+            force = self._exact.stiffness_n_per_m * moved
+        own, other = field.stats, estimate.stats
+        return dataclasses.replace(
+            field,
+            displacement_m=moved,
+            displacement_std_m=widened(field.displacement_std_m, estimate.displacement_std_m),
+            core_std_m=widened(field.displacement_std_m, estimate.core_std_m),
+            status=_selected(field.status, doubtful & ~agreed, replaced),
+            residual=residual,
+            stats=dataclasses.replace(
+                own,
+                evaluations=own.evaluations + other.evaluations,
+                jacobians=own.jacobians + other.jacobians,
+                steps=own.steps + other.steps,
+                time_s=own.time_s + other.time_s,
+            ),
+            force_n=force,
+            by_prior=replaced,
+        )
+
+
+def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
+    """Statuses with CONVERGED for wires ``replaced`` (U,), ILL_CONDITIONED for other ``changed`` roots."""
+    found = list(status)
+    for u in np.flatnonzero(changed).tolist():
+        if replaced[u]:
+            found[u] = Status.CONVERGED
+        elif found[u] is Status.CONVERGED:
+            found[u] = Status.ILL_CONDITIONED
+    return tuple(found)

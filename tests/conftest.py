@@ -13,12 +13,17 @@ from typing import Any
 
 import can
 import pytest
+import typer.main
+import typer.testing
 
 from skinnode.config import BusConfig
 from skinnode.errors import BusError
 from skinnode.transport import CanPort
 
 from . import stalls, workers
+
+# typer builds all commands for each call of one, which takes three times as long as most calls in the tests.
+typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
 
 REQUIRE_VCAN = "SKINNODE_REQUIRE_VCAN"
 

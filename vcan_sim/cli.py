@@ -1,5 +1,7 @@
-"""Entry point of ``vcan-sim``. The command is in :mod:`vcan_sim.command`, exit statuses in
-:mod:`skinnode.cli._exit_status`."""
+"""Entry point of ``vcan-sim``.
+
+The command is in :mod:`vcan_sim.command`, exit statuses in :mod:`skinnode.cli._exit_status`.
+"""
 
 from __future__ import annotations
 

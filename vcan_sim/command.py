@@ -1,4 +1,4 @@
-"""``vcan-sim hand.toml``: the patches of a hand as CANopen nodes, pressed by a simulated indenter."""
+"""``vcan-sim hand.toml``: run the patches of a hand as CANopen nodes, pressed by a simulated indenter."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._errors import Seconds
+from skinnode.cli._options import OtherChannel, OtherInterface, Seconds
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -122,7 +121,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return the injected faults, a line for each patch."""
+    """Return the counts of injected faults, one line for each patch."""
     lines = []
     for patch in fleet.patches:
         counts = dataclasses.asdict(fleet.injected(patch))

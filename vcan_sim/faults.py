@@ -1,6 +1,6 @@
-"""What can go wrong between a node and its bus, as data: faults to inject, and a count of each that was.
+"""Faults that can be injected into a node, as data, and counts of those that were.
 
-One chunk suffers one fault at most, so that counts can be compared with those of whoever listens.
+A chunk suffers at most one fault, so that counts can be compared with those of a receiver.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 class Faults:
     """Faults of one node. None by default.
 
-    Raises ConfigError for a share that is not 0 to 1, shares that are more than 1 together, or a rate that is
-    negative.
+    Raises:
+        ConfigError: A share is not between 0 and 1, shares of chunks or of scans exceed 1 together, or a rate
+            is negative.
     """
 
     seed: int = 1
@@ -68,24 +69,24 @@ class Faults:
     reordered: float = 0.0
     """Changes places with the frame after it."""
     late: float = 0.0
-    """Comes after the first frame of the next scan."""
+    """Arrives after the first frame of the next scan."""
     short: float = 0.0
     """A byte is missing."""
     remote: float = 0.0
-    """A remote frame comes instead."""
+    """A remote frame is sent instead."""
     miscounted: float = 0.0
     """Has the counter of another scan."""
     miscounted_by: int | None = None
-    """How far that counter is off, modulo 256; None: any other value."""
+    """Error of that counter, modulo 256; None: a random error."""
     corrupted: float = 0.0
-    """A code differs from what the node packed, without a trace in length or counters."""
+    """A code differs from the one that the node packed; length and counters are right."""
 
     # --- shares of the scans
     torn: float = 0.0
     """Breaks off after its first half, without a summary, and the next scan has the same counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """The node resets itself after half of the chunks, as a watchdog does."""
+    """The node resets itself after half of the chunks, as a watchdog would."""
     displaced: float = 0.0
     """A chunk has the counter of the next scan, whose own chunk of that index is lost."""
     understated: float = 0.0
@@ -98,9 +99,9 @@ class Faults:
 
     # --- shares of other frames
     sync_lost: float = 0.0
-    """The node does not hear it."""
+    """The node does not hear a SYNC."""
     long: float = 0.0
-    """A heartbeat has a byte too many; chunks and summaries fill their frame already."""
+    """A heartbeat has one byte too many; chunks and summaries already fill their frames."""
     nmt_lost: float = 0.0
     """The node does not hear an NMT command."""
     sdo_request_lost: float = 0.0
@@ -122,17 +123,17 @@ class Faults:
 
     # --- as long as they are set
     silent: bool = False
-    """Nothing of what the node sends arrives."""
+    """No frame of the node arrives."""
     deaf: bool = False
     """The node hears nothing: its receiver is stuck."""
     frozen: bool = False
     """The converter gives the same values again and again."""
     unplugged: bool = False
-    """Neither bus nor supply. It boots when this ends."""
+    """The node has neither bus nor supply. It boots when this ends."""
     wrong_identity: bool = False
-    """It says to be of another product."""
+    """The node reports another product code."""
     wrong_layout: bool = False
-    """It gives another layout hash."""
+    """The node reports another layout hash."""
     open_upper: int | None = None
     """This upper wire is broken. Wires are counted from 0, and are sound while a node tares at power-on."""
     open_lower: int | None = None
@@ -144,13 +145,13 @@ class Faults:
     noisy_upper: int | None = None
     """This upper wire has a bad contact: a noise of 0.3 % of each resistance."""
     noisy_lower: int | None = None
-    """This lower wire has such a contact."""
+    """This lower wire has a bad contact."""
     restart_every_s: float = 0.0
-    """It resets itself this often; 0: never."""
+    """Seconds between resets of the node by itself; 0: never."""
     emcy_per_s: float = 0.0
-    """Emergency messages; one that says that the error is gone follows the last."""
+    """Emergency messages a second; after the last follows one that reports *error reset*."""
     babble_per_s: float = 0.0
-    """Frames of COB-ID 0x3F0, which is nobody's."""
+    """Frames a second with COB-ID 0x3F0, which no device uses."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -170,7 +171,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Injected:
-    """How often each fault was injected into one node, and what arrived on the bus all the same."""
+    """Number of times that each fault was injected into one node."""
 
     lost: int = 0
     duplicated: int = 0
@@ -181,13 +182,13 @@ class Injected:
     miscounted: int = 0
     torn: int = 0
     torn_chunks: int = 0
-    """Chunks that were sent of the first halves."""
+    """Chunks sent of the first halves of torn scans."""
     summary_lost: int = 0
     reset: int = 0
     """Resets in the middle of a scan."""
     corrupted: int = 0
     displaced: int = 0
-    """Scans of which a chunk moved into the next scan."""
+    """Scans that lost a chunk to the next scan."""
     understated: int = 0
     unchecked: int = 0
     sync_lost: int = 0
@@ -202,11 +203,11 @@ class Injected:
     emcy_lost: int = 0
     command_lost: int = 0
     silenced: int = 0
-    """Frames that were not let out while silent, unplugged or cut off by a reset."""
+    """Frames not sent because the node was silent, unplugged or about to be reset."""
     unheard: int = 0
-    """Frames that the node would have heard."""
+    """Frames that the node missed because it was deaf or unplugged."""
     frozen: int = 0
-    """Readings that were those of before."""
+    """Readings that repeated the previous reading."""
     miswired: int = 0
     """Readings with a wire open, shorted or noisy."""
     unplugged: int = 0
@@ -226,8 +227,16 @@ NO_FAULTS: Final = Faults()
 
 
 def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]:
-    """Faults of each patch from texts such as ``lost=0.01,silent``, of all, and ``palm:open_upper=3``, of it;
-    what comes later is added. Raises ConfigError as :func:`parse_faults`, and for no patch of the hand."""
+    """Return the faults of each patch from the texts of ``--fault``.
+
+    Args:
+        texts: Such as ``lost=0.01,silent``, for all patches, and ``palm:open_upper=3``, for one; later texts
+            add to earlier ones.
+        patches: Names of the patches of the hand.
+
+    Raises:
+        ConfigError: As :func:`parse_faults`, or a patch is not in the hand.
+    """
     found = dict.fromkeys(patches, NO_FAULTS)
     for text in texts:
         patch, colon, listed = text.rpartition(":")
@@ -239,8 +248,15 @@ def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]
 
 
 def parse_faults(text: str, added_to: Faults = NO_FAULTS) -> Faults:
-    """Faults from ``lost=0.01,restart_every_s=2,silent``. Raises ConfigError for a name or value that cannot
-    be."""
+    """Return faults from a text such as ``lost=0.01,restart_every_s=2,silent``.
+
+    Args:
+        text: Names of faults with their values, separated by commas.
+        added_to: Faults to which they are added.
+
+    Raises:
+        ConfigError: A name is unknown or a value is not possible.
+    """
     kinds = {field.name: type(field.default) for field in dataclasses.fields(Faults)}
     values: dict[str, int | float | bool] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):

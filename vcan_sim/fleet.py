@@ -26,16 +26,16 @@ from vcan_sim.tally import Kind, Tally, kind_of
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """What a simulated node has done so far."""
+    """Counts of one simulated node since its start."""
 
     patch: str
     node_id: int
     nmt_state: NmtState
     frames_sent: int
     pdos_sent: int
-    """Those of the frames that carried process data: chunks and summaries."""
+    """Frames that carried process data: chunks and summaries."""
     scans_sent: int
-    """Scans sent to their end."""
+    """Scans sent completely."""
     overruns: int
     """Scans skipped because two earlier scans were still to be sent."""
     slow_overruns: int
@@ -43,22 +43,25 @@ class NodeReport:
 
 
 class Fleet:
-    """The patches of a hand as CANopen nodes in a scene each.
+    """The patches of a hand as CANopen nodes, each with a scene of its own.
 
-    A scene begins when its node has sent its first scan: bring-up may take as long as it likes, and a tare at
-    power-on sees an untouched patch. :meth:`start` opens the buses and powers the nodes on, :meth:`stop`
-    takes them to pre-operational and closes the buses; a ``with`` block does both.
+    A scene begins when its node has sent its first scan: bring-up may take any time, and a tare at power-on
+    sees an untouched patch. :meth:`start` opens the buses and powers the nodes on, :meth:`stop` takes them to
+    pre-operational and closes the buses; a ``with`` block does both.
 
     Args:
-        hand: buses, patches and scene.
-        interface, channel: instead of those of the file. Raises ConfigError for a channel that is meant for
-            several buses.
-        faults: what goes wrong with every node from the start; see also :meth:`inject`.
-        wire_up: what the converter of each patch is connected to, in place of the simulated patch itself.
-        unchecked: names of patches of revision 1.0, whose summaries carry no check.
+        hand: Buses, patches and scene.
+        interface: python-can interface in place of the file's.
+        channel: Channel in place of the file's.
+        faults: Faults of every node from the start; see also :meth:`inject`.
+        wire_up: Returns what the converter of a patch is connected to; default: the simulated patch itself.
+        unchecked: Names of patches of revision 1.0, whose summaries carry no check.
+
+    Raises:
+        ConfigError: A channel is given for a hand of several buses.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - keyword arguments, each rarely given
         self,
         hand: HandConfig,
         *,
@@ -86,7 +89,11 @@ class Fleet:
         self._running = ExitStack()
 
     def start(self) -> None:
-        """Open the buses, power the nodes on. Raises BusError, and leaves nothing open, if a bus does not."""
+        """Open the buses and power the nodes on.
+
+        Raises:
+            BusError: A bus cannot be opened; none is left open.
+        """
         with ExitStack() as opened:
             runners, ports = [], {}
             for bus in self.hand.buses:
@@ -100,8 +107,10 @@ class Fleet:
         self._runners, self._ports = runners, ports
 
     def stop(self) -> None:
-        """Nodes to pre-operational, threads joined, buses closed. Raises what ended a thread early. Stopping
-        twice is fine."""
+        """Take the nodes to pre-operational, join the threads and close the buses. Stopping twice is fine.
+
+        Raises the error that ended a thread early, if there was one.
+        """
         self._running.close()
 
     @property
@@ -111,23 +120,29 @@ class Fleet:
 
     @property
     def patches(self) -> dict[str, SimulatedPatch]:
-        """The simulated patches by name."""
+        """Simulated patches by name."""
         return {name: station.source for name, station in self._stations.items()}
 
     def report(self) -> tuple[NodeReport, ...]:
-        """Where each node stands, in the order of the file."""
+        """Return the counts of each node, in the order of the hand file."""
         return tuple(station.report() for station in self._stations.values())
 
     def inject(self, faults: Faults, patch: str | None = None) -> None:
-        """From now on these faults and no others, on one patch or on all; the seed is that of the start.
+        """Replace the faults of one patch, or of all. The seed stays that of the start.
 
-        Raises ConfigError for a wire that a patch does not have."""
+        Args:
+            faults: The new faults.
+            patch: Name of the patch; None: all patches.
+
+        Raises:
+            ConfigError: A patch does not have the wire of a fault.
+        """
         for name, station in self._stations.items():
             if patch in (None, name):
                 station.inject(faults)
 
     def injected(self, patch: str) -> Injected:
-        """A count of what went wrong so far with the node of a patch."""
+        """Return the counts of faults injected so far into the node of a patch."""
         return self._stations[patch].injected()
 
     def tally(self, patch: str) -> Tally:
@@ -139,14 +154,21 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Take the controller of the nodes on a bus off it, or back. The nodes end if it lasts longer than
-        :data:`skinnode.node.runner.PATIENCE_S`."""
+        """Take the controller of the nodes on a bus off the bus, or put it back.
+
+        The nodes end if it lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
+        """
         self._ports[bus].off = off
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
-        """(U, N, 3) true electrodes of the scan whose summary carried ``device_time_us``, metres.
+        """Return the true electrodes (U, N, 3) of a scan, metres.
 
-        Raises LookupError for a patch that is not in the hand, or a scan that was not sent, or too long ago.
+        Args:
+            patch: Name of the patch.
+            device_time_us: Time in the summary of the scan.
+
+        Raises:
+            LookupError: The patch is not in the hand, or the scan was not sent or is too long ago.
         """
         source = self._stations[patch].source
         try:
@@ -176,7 +198,7 @@ class Passed:
 
 
 class FaultyPort(CanPort):
-    """A port whose controller may go off the bus: then it sends nothing, and what passes is lost to it."""
+    """A port whose controller may go off the bus: it then sends nothing, and misses every frame."""
 
     off = False
 
@@ -185,12 +207,14 @@ class FaultyPort(CanPort):
         self.passed = Passed()
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+        """Send a frame. Raises BusError if the bus refuses it or the controller is off the bus."""
         if self.off:
             raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
         super().send(can_id, data, remote=remote)
         self.passed.sent[kind_of(can_id, data, remote)] += 1
 
     def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
+        """Receive frames. Raises BusError if the controller is off the bus."""
         if self.off:
             while frames := super().recv_batch(0.0):
                 _count(frames, self.passed.missed)
@@ -207,7 +231,7 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 
 
 class _Station:
-    """A node, its analogue front end, and a count of what it sends."""
+    """A node, its analogue front end, and counts of its frames."""
 
     def __init__(
         self,
@@ -226,7 +250,7 @@ class _Station:
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
-        """A new node on the patch, sending by ``emit``."""
+        """Return a new node on the patch that sends by ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,

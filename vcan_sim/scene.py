@@ -1,9 +1,9 @@
-"""What happens on the skin: a sphere presses, slides and lifts, again and again, and the rubber follows.
+"""Deforms the skin: a sphere presses, slides and lifts, again and again, and the rubber follows.
 
 The displacement of the electrodes is the closed form of a sliding Hertz contact on a half-space
-(:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and owes nothing to a solver's
-discretisation. A scene is a pure function of scene time: it can be asked for any instant, in any order, and
-the same seed gives the same scene.
+(:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and does not depend on the
+discretisation of a solver. A scene is a pure function of scene time: it can be asked for any instant, in any
+order, and the same seed gives the same scene.
 
 The onset of sliding is simplified: shear grows in proportion to the pressure from none to full friction while
 the sphere gathers speed; a real contact slips from its rim inwards (Cattaneo, Mindlin).
@@ -23,13 +23,13 @@ from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
 
 LEAD_S: Final = 0.8
-"""Rest before the first press, so that a viewer, and a baseline, has something to start from."""
+"""Rest before the first press in s, for the baseline and for a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Shares of a cycle; what is left is rest. In a cycle of 4 s a press takes 1.4 s."""
+"""Shares of a cycle; the remainder is rest. In a cycle of 4 s a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
-"""Share of a slide in which the sphere gathers, and at the end loses, its speed."""
+"""Share of a slide in which the sphere accelerates, and at the end decelerates."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -49,7 +49,7 @@ class Stroke:
     lift_s: float
 
     def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
-        """The contact at ``t_s``, None where the sphere does not touch."""
+        """Return the contact at ``t_s``, or None if the sphere does not touch."""
         lifting = t_s - self.press_s - self.slide_s
         depth = self.depth_m * _ease(t_s / self.press_s) * (1.0 - _ease(lifting / self.lift_s))
         if depth <= 0.0:
@@ -71,11 +71,11 @@ class Scene:
     """Strokes of a sphere over one patch.
 
     Args:
-        layout: the patch at rest. Its electrodes lie on the surface of the rubber; a curved skin is treated
+        layout: The patch at rest. Its electrodes lie on the surface of the rubber; a curved skin is treated
             as the flat one below its x and y.
-        simulation: seed, sphere, depth, friction, speed and pace.
-        number: number of the patch in the hand. Each has strokes and a phase of its own.
-        rubber: what the skin is made of. Displacement does not depend on its Young's modulus, force does.
+        simulation: Seed, sphere, depth, friction, speed and pace.
+        number: Number of the patch in the hand. Each has strokes and a phase of its own.
+        rubber: Material of the skin. Displacement does not depend on its Young's modulus, force does.
     """
 
     layout: PatchLayout
@@ -89,7 +89,7 @@ class Scene:
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:
-        """The stroke that begins at ``lead_s + index * cycle_s``."""
+        """Return the stroke that begins at ``lead_s + index * cycle_s``."""
         options = self.simulation
         random = np.random.default_rng([options.seed, self.number, index])
         press_s, slide_s, lift_s = (share * options.cycle_s for share in (PRESS, SLIDE, LIFT))
@@ -115,7 +115,7 @@ class Scene:
         )
 
     def contacts(self, t_s: float) -> tuple[HertzContact, ...]:
-        """What touches the patch at scene time ``t_s``."""
+        """Return the contacts at scene time ``t_s``."""
         index, since = divmod(t_s - self.lead_s, self.simulation.cycle_s)
         if index < 0 or self.simulation.depth == 0.0:
             return ()
@@ -123,7 +123,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """(U, N, 3) electrodes at scene time ``t_s``, metres; exactly ``layout.upper_m`` out of contact."""
+        """Return the electrodes (U, N, 3) at scene time ``t_s``, metres; ``layout.upper_m`` at rest."""
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m
@@ -136,21 +136,23 @@ class Scene:
 
     @functools.cached_property
     def _field_m(self) -> tuple[Float, Float]:
-        """Corners of the rectangle the centre of the sphere keeps to: a pitch inside the outermost
-        electrodes, or their middle on a patch too small for that."""
+        """Corners of the rectangle that the centre of the sphere stays in.
+
+        It is one pitch inside the outermost electrodes, or their middle on a patch too small for that.
+        """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))
         return low + inset, high - inset
 
 
 def _ease(share: float) -> float:
-    """0 to 1 with speed and acceleration zero at both ends: the path of least jerk (Flash and Hogan 1985)."""
+    """Rise from 0 to 1 with zero speed and acceleration at both ends: least jerk (Flash and Hogan 1985)."""
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
 
 def _glide(share: float) -> float:
-    """0 to 1 at constant speed but for smooth ramps of ``_RAMP`` at both ends."""
+    """Rise from 0 to 1 at constant speed, with smooth ramps of ``_RAMP`` at both ends."""
     s = min(max(share, 0.0), 1.0)
     if s > 0.5:
         return 1.0 - _glide(1.0 - s)

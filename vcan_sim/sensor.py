@@ -1,4 +1,4 @@
-"""A simulated patch at the analogue port of a node: where the real one has its converter."""
+"""Simulated resistances at the analogue port of a node, and the faults of wires and converter."""
 
 from __future__ import annotations
 
@@ -10,14 +10,20 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float, PatchLayout
+from skinnode.node.patch.source import ResistanceSource
 from skinnode.protocol.device_time import TIME_STEP_US
+from vcan_sim.faults import OF_WIRES
+from vcan_sim.injector import Injector
 from vcan_sim.scene import Scene
 
 REMEMBERED_READINGS: Final = 4096
-"""Readings whose time is kept: more than five minutes of scans at 12.5 a second."""
+"""Number of readings whose time is kept: more than five minutes of scans at 12.5 a second."""
+
+WIRE_NOISE: Final = 3e-3
+"""Standard deviation of a resistance through a bad contact, relative."""
 
 Fault = Callable[[Float, int], Float]
-"""What is wrong with a patch: resistances (U, K) in ohm and the time in ns to what the converter sees
+"""Function from resistances (U, K) in ohm and the time in ns to the resistances that the converter sees
 instead; inf is an open pair of wires, 0 a short."""
 
 
@@ -25,13 +31,13 @@ class SimulatedPatch:
     """The resistances of a patch in a scene, as a converter with noise reads them.
 
     A :class:`skinnode.node.ResistanceSource`. The scene lies at rest until :meth:`start` sets its origin of
-    time, so that readings at power-on (a tare) see a patch that nobody touches. The truth is a pure function
-    of time and kept nowhere: :meth:`truth_m` gives it for any time, :meth:`read_ns` that of a scan.
+    time, so that readings at power-on (a tare) see an untouched patch. The truth is a pure function of time
+    and is not stored: :meth:`truth_m` gives it for any time, :meth:`read_ns` gives the time of a scan.
 
     Args:
-        scene: what happens on the skin.
-        converter_noise: standard deviation of a reading, relative to the resistance. Default: the scene's.
-        fault: applied to each reading, after the noise.
+        scene: What happens on the skin.
+        converter_noise: Standard deviation of a reading, relative to the resistance. Default: the scene's.
+        fault: Applied to each reading, after the noise.
     """
 
     def __init__(
@@ -40,7 +46,7 @@ class SimulatedPatch:
         self.scene = scene
         self.fault = fault
         self.reads = 0
-        """Readings so far, those of a tare included."""
+        """Number of readings so far, including those of a tare."""
         self.last_read_ns = 0
         """Time of the newest reading."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
@@ -52,15 +58,18 @@ class SimulatedPatch:
 
     @property
     def started(self) -> bool:
+        """Whether the scene has begun."""
         return self._origin_ns is not None
 
     def start(self, t_ns: int) -> None:
-        """Let the scene begin at ``t_ns``; again, to begin anew."""
+        """Let the scene begin, or begin again, at ``t_ns``."""
         self._origin_ns = t_ns
 
     def read(self, t_ns: int) -> Float:
-        """(U, K) resistances in ohm at ``t_ns`` with the converter's noise. The k-th reading of a seed has
-        the same noise whenever it is taken."""
+        """Return the resistances (U, K) in ohm at ``t_ns`` with the converter's noise.
+
+        The k-th reading of a seed has the same noise whenever it is taken.
+        """
         self.reads += 1
         self.last_read_ns = t_ns
         self._remember(t_ns)
@@ -71,10 +80,14 @@ class SimulatedPatch:
         return read if self.fault is None else self.fault(read, t_ns)
 
     def read_ns(self, device_time_us: int) -> int:
-        """When the reading was taken that a node calls ``device_time_us``: its lower 32 bits, of which a
-        checked summary carries all but the lowest 6.
+        """Return when a reading was taken.
 
-        Raises LookupError if there was none, or if it is too long ago.
+        Args:
+            device_time_us: Time of the reading as the node has it: its lower 32 bits, of which a checked
+                summary carries all but the lowest 6.
+
+        Raises:
+            LookupError: There was no such reading, or it is too long ago.
         """
         try:
             return self._read_ns[(device_time_us & 0xFFFF_FFFF) // TIME_STEP_US]
@@ -84,7 +97,7 @@ class SimulatedPatch:
             ) from None
 
     def truth_m(self, t_ns: int) -> Float:
-        """(U, N, 3) true electrodes at ``t_ns``, metres."""
+        """Return the true electrodes (U, N, 3) at ``t_ns``, metres."""
         if self._origin_ns is None:
             return self.scene.layout.upper_m
         return self.scene.upper_m((t_ns - self._origin_ns) * 1e-9)
@@ -95,18 +108,66 @@ class SimulatedPatch:
             self._read_ns.popitem(last=False)
 
 
+class FaultyConverter:
+    """A converter whose readings may be frozen, or taken through open, shorted or noisy wires.
+
+    Wires are sound while the node boots, so that its tare at power-on is sound.
+
+    Args:
+        source: What the sound converter measures.
+        injector: Faults, chance and counts of the node.
+        booting: Returns whether the node is booting.
+    """
+
+    def __init__(self, source: ResistanceSource, injector: Injector, *, booting: Callable[[], bool]) -> None:
+        self._source, self._injector, self._booting = source, injector, booting
+        self._reading: Float | None = None
+
+    def read(self, t_ns: int) -> Float:
+        """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading if frozen."""
+        if self._injector.faults.frozen and self._reading is not None:
+            self._injector.injected.frozen += 1
+        else:
+            self._reading = self._through_wires(self._source.read(t_ns))
+        return self._reading
+
+    def _through_wires(self, read: Float) -> Float:
+        faults = self._injector.faults
+        if all(getattr(faults, name) is None for name in OF_WIRES) or self._booting():
+            return read
+        self._injector.injected.miswired += 1
+        read = read.copy()
+        for wire, ohm in ((faults.noisy_upper, read), (faults.noisy_lower, read.T)):
+            if wire is not None:
+                ohm[wire] *= 1.0 + WIRE_NOISE * self._injector.random.standard_normal(ohm.shape[1])
+        for wire, ohm, value in (
+            (faults.shorted_upper, read, 0.0),
+            (faults.shorted_lower, read.T, 0.0),
+            (faults.open_upper, read, np.inf),
+            (faults.open_lower, read.T, np.inf),
+        ):
+            if wire is not None:
+                ohm[wire] = value
+        return read
+
+
 def simulated(layout: PatchLayout) -> SimulatedPatch:
-    """A patch that a sphere presses, over which it slides and from which it lifts, from its first reading on:
-    the source ``simulated`` of ``skinnode node``. The first touch comes after 0.8 s, so that a tare at
-    power-on sees an untouched patch."""
+    """Return a patch that a sphere presses: the source ``simulated`` of ``skinnode node``.
+
+    The scene begins with this call. The first touch comes after 0.8 s, so that a tare at power-on sees an
+    untouched patch.
+    """
     source = SimulatedPatch(Scene(layout))
     source.start(time.monotonic_ns())
     return source
 
 
 class _Forward:
-    """Resistances of a patch by plain sums, apart from the solver's kernels so that they cannot share a bug
-    with the truth; six times as fast as the reference for want of its (…, 3) temporaries."""
+    """Computes the resistances of a patch by plain sums.
+
+    It shares no code with the solver's kernels, so that truth and solver cannot share a bug, and is six times
+    as fast as the reference model because it makes no (…, 3) temporaries.
+    """
 
     def __init__(self, layout: PatchLayout) -> None:
         self._shape = (*layout.upper_m.shape[:2], *layout.lower_m.shape[:2])

@@ -1,4 +1,4 @@
-"""Counts of frames by kind, so that what simulated nodes sent can be compared with what a host received."""
+"""Counts of frames by kind, to compare what simulated nodes sent with what a host received."""
 
 from __future__ import annotations
 
@@ -50,8 +50,10 @@ _HEARTBEAT: Final = od.heartbeat_cob_id(0)
 
 
 def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
-    """Return the kind of a frame with an 11-bit identifier. Remote frames are a kind of their own; a frame of
-    wrong length has the kind of its COB-ID."""
+    """Return the kind of a frame with an 11-bit identifier.
+
+    Remote frames are a kind of their own; a frame of wrong length has the kind of its COB-ID.
+    """
     if remote:
         return Kind.REMOTE
     if (single := _SINGLE.get(can_id)) is not None:
@@ -63,8 +65,11 @@ def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
 
 
 class Tally:
-    """Frames of one node by kind. Sent frames: ``handed = emitted + lost + silenced + refused + waiting``;
-    received frames: ``heard = taken + lost_in + unheard``."""
+    """Frames of one node by kind.
+
+    Sent frames: ``handed = emitted + lost + silenced + refused + waiting``; received frames:
+    ``heard = taken + lost_in + unheard``.
+    """
 
     def __init__(self) -> None:
         self.handed: Counter[Kind] = Counter()

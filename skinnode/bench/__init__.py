@@ -1,10 +1,10 @@
-"""Benchmarks: speed beside error, each figure of the documentation.
+"""Benchmarks: speed and error, every figure of the documentation.
 
 ::
 
-    cases, truth -> methods (solvers of ours and of others) -> verdict, score -> rows -> plots
+    cases, truth -> methods (solvers set up for a case) -> verdict, score -> rows -> plots
 
-One module per subcommand of ``skinnode bench`` with a function ``run``, which returns the figures as plain
-values; ``skinnode.cli.bench`` prints and writes them. ``truth`` simulates presses on a finer grid than
-the solver's and by another load model; ``load`` and ``soak`` take their frames from the simulator.
+Each subcommand of ``skinnode bench`` has a module with a function ``run``, which returns the figures as plain
+values; ``skinnode.cli.bench`` prints and writes them. ``truth`` simulates presses by closed forms, without
+any assumption of the solvers; ``load`` and ``soak`` take their frames from the simulator.
 """

@@ -1,4 +1,4 @@
-"""How exact, how honest, how fast: every figure beside the line that has to be reached."""
+"""Accuracy, honesty of the reported uncertainty, and speed: every figure beside its requirement."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""At a relative noise of 1e-5, h = 0.5, a press of a tenth of the height, by the posterior."""
+"""Maximum error of the posterior by layout, at a relative noise of 1e-5, h = 0.5, a press of 0.1 heights."""
 SCENES_A_CELL: Final = 25
-"""One cell of the tables over noise and codes gets one scene for so many random ones, at least 3: its RMS
-is over 300 coordinates a scene already."""
+"""Random scenes for each scene of a cell of the tables over noise and codes, which has at least 3: its RMS is
+over 300 coordinates a scene already."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
-    """The figures of the benchmark. ``scenes``: random ones for each row of the coverage."""
+    """Return the figures of the benchmark.
+
+    Args:
+        scenes: Random scenes for each row of the coverage table.
+        rounds: Times that each candidate is measured.
+    """
     few = max(3, scenes // SCENES_A_CELL)
     coverage, parts = noise.coverage(scenes)
     figures: dict[str, Any] = {
@@ -42,8 +47,10 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Every line that has to be reached: what, the figure, the limit as text, whether it is reached, and
-    whether it is ``absolute``, a time: that is the machine's as well, and fails nothing."""
+    """Return a row for each requirement: its name, the figure, the limit as text, and whether it is met.
+
+    A requirement on a time is ``absolute``: it depends on the machine and fails nothing.
+    """
     found = []
     for row in figures["noise"]:
         if row["method"] == "posterior" and row["height"] == 0.5 and row["sigma"] == 1e-5:
@@ -76,7 +83,7 @@ def _must(what: str, value: float, limit: str, reached: bool) -> dict[str, Any]:
 
 
 def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
-    """The tables."""
+    """Print the tables."""
     _print_front(figures["front"], echo)
     _print_noise(figures["noise"], echo)
     _print_codes(figures["codes"], echo)
@@ -91,7 +98,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """A share in percent, whatever its size: figures of one column are of one unit."""
+    """Return a share in percent, whatever its size, so that a column has one unit."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
@@ -110,7 +117,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The fastest row of each solver that reaches the accuracy, else its most accurate; the fastest first."""
+    """Return each solver's fastest row that reaches the accuracy, else its most accurate; fastest first."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]

@@ -1,9 +1,9 @@
-"""Error against time of a few wires, ours beside every peer on the same compiled F and J.
+"""Error against time of a few wires: our solvers beside their peers on the same compiled F and J.
 
-The wires are those pressed deepest; the samples of the press have no noise. Every solver starts from rest,
-either on the last sample alone or sample by sample, each solved from the solution of the one before, as the
-paper does it; at several tolerances, a point each. Beside the bare operators stands ``solve_path``, whose
-time has in it what the others leave out: setting up the patch, following the branch, the error estimate.
+The wires are the most deeply pressed ones of the patch; the samples of the press have no noise. Every solver
+starts from rest, either on the last sample alone or sample by sample, each from the solution of the previous
+sample, as the paper does it; at several tolerances, one point each. The time of ``solve_path`` also contains
+what the bare operators leave out: setting up the patch, following the branch, estimating the error.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Unif
 from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
-"""Preset, height in pitches, depth in heights: one that all solve from rest, one that needs the samples, and
-the paper's own layout."""
+"""Preset, height in pitches, depth in heights: a press that all solvers solve from rest, a press that needs
+the samples, and the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Largest error, as a share of the displacement, that is drawn: beyond it nothing was found."""
+"""Maximum error, as a share of the displacement, that counts as solved and is drawn."""
 ROUNDING: Final = 1e-11
-"""Errors below are equal: rounding of F through the condition of J decides about them."""
+"""Errors below this are equal: they are rounding errors of F, amplified by the condition of J."""
 LOOSE: Final = 1e-6
-"""Tolerance on the way, the paper's."""
+"""Tolerance at samples before the last, as in the paper."""
 REPEATS: Final = 7
 LONG_S: Final = 0.1
 
@@ -53,18 +53,18 @@ class Scene:
     """(U, N, 3) at the last."""
 
     def thinned(self, samples: int) -> Float:
-        """So many of the samples, evenly spaced, the last among them."""
+        """Return ``samples`` of the samples, evenly spaced, with the last."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """As a share of the displacement."""
+        """Return the error of a displacement (U, N, 3) as a share of the true displacement."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
 
 def scene_of(name: str, height: float, depth: float) -> Scene:
-    """The four middle wires of a preset under a sphere at ``depth`` heights."""
+    """Return the four middle wires of a preset under a sphere, ``depth`` heights deep."""
     full = preset(name, height)
     layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
     press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))
@@ -75,7 +75,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """The fastest of a few, since what else runs on the machine only adds; fewer where one takes long."""
+    """Return the fastest of a few calls, or fewer if they are slow; other programs can only add time."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -85,7 +85,7 @@ def _timed_us(call: Callable[[], object]) -> float:
 
 
 def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tuple[float, float, bool]:
-    """µs a wire, error, whether every wire converged."""
+    """Return µs a wire, the error, and whether every wire converged."""
     frames = scene.thinned(samples)
     call = functools.partial(solve_path, scene.layout, frames, operator=operator, schedule=schedule)
     path = call()
@@ -94,7 +94,7 @@ def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tupl
 
 
 def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
-    """µs a wire, error."""
+    """Return µs a wire and the error."""
     problem = PatchProblem.of(scene.layout)
     truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
     frames = scene.thinned(samples) * problem.gain
@@ -108,13 +108,13 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(all="ignore"):  # a solver that diverges says so by its error
+    with np.errstate(all="ignore"):  # a solver that diverges shows by its error
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 
 
 def pareto(rows: list[dict[str, Any]]) -> list[int]:
-    """Rows that solved and that nobody beats in time and error at once, the fastest first."""
+    """Return the rows that solved and that no other row beats in time and error at once, fastest first."""
     front: list[int] = []
     best = SOLVED
     for index in sorted(range(len(rows)), key=lambda i: (rows[i]["us"], rows[i]["error"])):
@@ -126,7 +126,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """A scatter for each scene: rows with time, error, and whether they are on the front."""
+    """Return a scatter plot for each scene: rows with time, error, and whether they are on the front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)
@@ -157,7 +157,7 @@ def _rows(scene: Scene) -> list[dict[str, Any]]:
 
 
 def _schedules(tolerance: float) -> dict[str, tuple[Schedule, int]]:
-    """By name: the schedule, and the number of samples it gets."""
+    """Return step controls by name, each with its number of samples."""
     loose = max(tolerance, LOOSE)
     uniform = Uniform(intermediate_tolerance=loose, final_tolerance=tolerance)
     found: dict[str, tuple[Schedule, int]] = {

@@ -1,7 +1,7 @@
 """Error against noise, code width and layout, and how honest the reported deviations are.
 
-Every scene is followed in four frames from rest; the last one counts. Errors and deviations are pooled over
-scenes and coordinates of the wires that converged, as RMS shares of the displacement.
+Every scene is tracked for four frames from rest; the last frame counts. Errors and deviations are pooled over
+scenes and coordinates of the converged wires, as RMS shares of the displacement.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
 PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST: Final = 1000
-"""Coordinates for a quantile of 99.9 %."""
+"""Minimum coordinates for a quantile of 99.9 %."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 PROTOTYPE: Final = {
@@ -45,12 +45,12 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""RMS error of the prototype in the design notes: a 10 % press with shear by one Hertz-like indenter."""
+"""RMS errors of the prototype: a 10 % press with shear by one Hertz-like indenter."""
 
 
 @dataclass
 class Pool:
-    """Errors and deviations of many scenes."""
+    """Pools the errors and deviations of many scenes."""
 
     scenes: int = 0
     wires: int = 0
@@ -62,7 +62,7 @@ class Pool:
     _size: float = 0.0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """``truth_m``: (U, N, 3)"""
+        """Add a scene: its last frame, and the true displacement ``truth_m`` (U, N, 3)."""
         used = np.array([status is Status.CONVERGED for status in frame.status])
         error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
         self.scenes += 1
@@ -75,7 +75,7 @@ class Pool:
         self._size += float((truth_m[used] ** 2).sum())
 
     def row(self) -> dict[str, Any]:
-        """NaN where no wire converged."""
+        """Return the figures; NaN if no wire converged."""
         size = self._size or math.nan
         return {
             "scenes": self.scenes,
@@ -89,14 +89,14 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Errors of the posterior against its variance n + b: n by the noise, b by what the prior leaves open."""
+    """Compares the posterior's errors with its variance n + b: n from the noise, b left open by the prior."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """``truth_m``: (U, N, 3). A held frame's deviations have more in them and do not count."""
+        """Add a scene and its truth (U, N, 3). Held frames do not count: their variance has more parts."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -107,8 +107,11 @@ class Parts:
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:
-        """By the prior's share b / (n + b): error / √(n + b), its RMS, quantiles and kurtosis, beside the RMS
-        that n alone would give; and how much of b is in the errors."""
+        """Return a row for each interval of the prior's share b / (n + b).
+
+        It holds error / √(n + b), its RMS, quantiles and kurtosis, the RMS that n alone would give, and the
+        share of b that is found in the errors.
+        """
         if not self._error:
             return []
         error, noise, left = (np.concatenate(each) for each in (self._error, self._noise, self._left))
@@ -130,13 +133,13 @@ class Parts:
 
 @dataclass
 class Bound:
-    """The Cramér-Rao bound of the wires without a prior, computed at the truth from the NumPy model."""
+    """Pools the Cramér-Rao bound of the wires without a prior, computed at the truth with the NumPy model."""
 
     _variance: float = 0.0
     _size: float = 0.0
 
     def add(self, layout: PatchLayout, taken: Stream) -> None:
-        """The last frame of a stream."""
+        """Add the last frame of a stream."""
         truth = taken.truth_m[-1]
         std = bound_std_m(layout, layout.upper_m + truth, taken.noise[-1])
         self._variance += float((std**2).sum())
@@ -144,14 +147,16 @@ class Bound:
 
     @property
     def share(self) -> float:
-        """Of the displacement."""
+        """Bound as a share of the displacement."""
         return math.sqrt(self._variance / self._size)
 
 
 @dataclass
 class Forces:
-    """Contacts found against the truth; forces, where any contact was found, as shares of the true one,
-    centroids in metres."""
+    """Compares contacts, forces and centroids with the truth.
+
+    Forces, in scenes with a contact, are shares of the true normal force; centroids are in metres.
+    """
 
     found_right: int = 0
     found_none: int = 0
@@ -161,7 +166,7 @@ class Forces:
     _place: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, taken: Stream) -> None:
-        """The last frame of a stream."""
+        """Add the last frame of a stream."""
         contacts, truth = frame.contacts, taken.force_n[-1]
         self.scenes += 1
         self.found_right += len(contacts) == len(taken.presses)
@@ -181,7 +186,7 @@ class Forces:
                 self._place.append((float(off), float(contacts[0].centroid_std_m[axis])))
 
     def row(self) -> dict[str, Any]:
-        """RMS errors and deviations, and the shares within 95 % intervals."""
+        """Return RMS errors and deviations, and the shares within 95 % intervals."""
         figures: dict[str, Any] = {
             "contacts_right": self.found_right / self.scenes,
             "contacts_none": self.found_none / self.scenes,
@@ -203,27 +208,27 @@ class Forces:
 
 def _case(kind: str, height: float) -> Case:
     def never(rng: np.random.Generator) -> Stream:
-        raise RuntimeError("of this case the skin is used, and no stream")
+        raise RuntimeError("this case has a skin, but no stream")
 
     return Case(0, f"{kind} h={height:g}", Skin(preset(kind, height)), never)
 
 
 class Follower:
-    """One layout, solved by every method."""
+    """Solves streams of one layout by every method."""
 
     def __init__(self, kind: str, height: float) -> None:
         self.case = _case(kind, height)
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """What each makes of the last frame of a stream."""
+        """Return the last frame of a stream by each method."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Presses of a tenth of the height, the same for every converter and layout of one height."""
+    """Yield presses of a tenth of the height, the same for every converter and layout of one height."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -231,9 +236,9 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 
 
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
-    """A body as blunt as a fingertip: its contact has a radius of 1.5 to 2.5 pitches at full depth.
+    """Return a press by a body as blunt as a fingertip: a contact radius of 1.5 to 2.5 pitches at full depth.
 
-    It displaces as much as the prototype's indenter: the Cramér-Rao bounds of the two agree, see PROTOTYPE.
+    It displaces as much as the prototype's indenter: their Cramér-Rao bounds agree, see PROTOTYPE.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m
@@ -241,7 +246,7 @@ def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Pr
 
 
 def against_noise(scenes: int) -> list[dict[str, Any]]:
-    """10 % presses: a row for each layout, noise and method."""
+    """Solve 10 % presses with noise. Returns a row for each layout, noise and method."""
     rows = []
     for kind, height in LAYOUTS:
         follower = Follower(kind, height)
@@ -262,7 +267,7 @@ def against_noise(scenes: int) -> list[dict[str, Any]]:
 
 
 def against_codes(scenes: int) -> list[dict[str, Any]]:
-    """10 % presses behind codes without other noise."""
+    """Solve 10 % presses behind codes without noise. Returns a row for each layout, width and method."""
     rows = []
     for kind in ("staggered", "aligned"):
         follower = Follower(kind, 0.5)
@@ -287,7 +292,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """One body anywhere on the patch, sharp or blunt, or, in three of ten scenes, two in different halves."""
+    """Return one body, sharp or blunt, or in three of ten scenes two bodies in different halves."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -306,8 +311,12 @@ def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press,
 
 
 def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Random scenes: a row for each layout and noise, method by method, with forces where there are any; and
-    the posterior's errors of all of them by the prior's share in its variance."""
+    """Solve random scenes.
+
+    Returns:
+        A row for each layout, noise and method, with forces if there are any; and the posterior's errors in
+        all scenes, by the share of the prior in its variance.
+    """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:
         follower = Follower(kind, height)

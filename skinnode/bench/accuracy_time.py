@@ -22,8 +22,15 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 
 
 class Cycle:
-    """A press to and fro, of the wires that ``valid`` has; every call solves all of its frames, lest a turn
-    have the cheap ones and another the dear ones."""
+    """A press down and up again, solved frame by frame.
+
+    Every call solves all of its frames, so that no turn has only the cheap frames.
+
+    Args:
+        solver: The solver.
+        frames: Frames (T, U, K) of the press down, ohm.
+        valid: Mask (U, K) of the resistances to use; default: all.
+    """
 
     def __init__(
         self, solver: Tracker | Posterior, frames: Float, valid: NDArray[np.bool_] | None = None
@@ -31,9 +38,10 @@ class Cycle:
         self._solver, self._valid = solver, valid
         self.frames = np.concatenate([frames, frames[-2:0:-1]])
         self.active: list[int] = []
-        """Wires that were solved, frame by frame."""
+        """Number of wires solved in each frame."""
 
     def __call__(self) -> None:
+        """Solve all frames."""
         for frame_ohm in self.frames:
             frame = self._solver.update(frame_ohm, self._valid)
             held = 0 if frame.held is None else int(frame.held.sum())
@@ -41,17 +49,17 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """A press that deepens from half to all of its depth."""
+    """Return a press that deepens from half to all of its depth."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 
 
 def run(rounds: int) -> list[dict[str, Any]]:
-    """A row for each: µs a frame (of the mean frame, median over turns), the limit, how many wires were
-    solved.
+    """Return a row for each solver: µs a frame, the limit, and the number of wires solved.
 
-    All of a half-space moves when it is pressed, so a scene does not keep to three wires; here the others
-    give no resistances. Nothing is held: every frame is solved.
+    The time is that of the mean frame, median over turns. The whole half-space moves when it is pressed, so
+    no scene moves only three wires; here the other wires give no resistances. Nothing is held: every frame is
+    solved.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

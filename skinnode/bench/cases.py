@@ -1,4 +1,4 @@
-"""The hard cases, by the numbers of the list in the design notes; a new one is added when one is found.
+"""The hard cases: streams that make solvers fail. A new one is added when it is found.
 
  1 symmetric layout, J rank-deficient         8 drift of the baseline, gain, contact resistance
  2 thick layers                               9 wrong roots with zero residual
@@ -8,8 +8,8 @@
  6 noise and code widths                     13 the wrong model
  7 open, shorted, missing, saturated
 
-A case is a patch as the solver is told, what an informed user would tell the solver beside it, and a stream
-of frames with its truth for every seed.
+A case is the patch as the solver knows it, the options that an informed user would set, and a stream of
+frames with its truth for every seed.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""About a 16-bit converter."""
+"""Noise of about a 16-bit converter."""
 STRIDE: Final = 4
-"""A tracker gets every so many of the samples of a path."""
+"""Samples of a path for each frame of a tracker."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Share of the change of R that the wrong models of case 13 get wrong. Measured on a 30 % press, staggered,
-h = 0.5: ‖ΔR‖ is wrong by 2.2 to 5 %, the change of a pair by 1 to 5 % in the median and 7 % at worst."""
+"""Relative error of the change of R in the wrong models of case 13. Measured on a 30 % press, staggered,
+h = 0.5: ‖ΔR‖ is wrong by 2.2 to 5 %, the change of one pair by 1 to 5 % in the median and 7 % at worst."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A hard case. ``make`` gives the stream of a seed's generator."""
+    """A hard case. ``make`` returns the stream of a seed's generator."""
 
     number: int
     name: str
@@ -46,30 +46,30 @@ class Case:
     make: Callable[[np.random.Generator], Stream]
     methods: tuple[str, ...] = TRACKERS
     converter: Converter = FINE
-    """The streams are read by it, and the user knows its noise."""
+    """Converter of the streams; the user knows its noise."""
     drift: str = "none"
     stride: int = 1
-    """A tracker gets every so many of the frames; a path all of them."""
+    """Frames of the stream for each frame of a tracker; a path gets all of them."""
     model_error: float = 0.0
-    """Share of the change of R that the user knows the model may get wrong."""
+    """Relative error of the change of R that the user expects of the model."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """A preset of 10 × 10 electrodes, ``height`` in pitches."""
+    """Return a preset of 10 × 10 electrodes, ``height`` in pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
 def narrowed(layout: PatchLayout) -> PatchLayout:
-    """Both outer upper wires and three in between: a path solves wire by wire, ten would tell little more."""
+    """Return both outer upper wires and three between them: a path solves wire by wire, so these suffice."""
     return PatchLayout(layout.upper_m[[0, 2, 5, 8, 9]], layout.lower_m, layout.resistivity_ohm_per_m)
 
 
 def press_and_release(steps: int) -> Float:
-    """Shares of the depth: at rest, down in equal steps, at rest."""
+    """Return shares of the depth: at rest, down in equal steps, at rest."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 
-def pressing(
+def pressing(  # noqa: PLR0913 - one argument for each way to change a stream
     skin: Skin,
     depth: float,
     converter: Converter,
@@ -79,7 +79,17 @@ def pressing(
     gain: Callable[[np.random.Generator, int], Float] | None = None,
     presses: Callable[[np.random.Generator], tuple[Press, ...]] | None = None,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Makes the stream of one random press, with what goes wrong."""
+    """Return a function that makes the stream of one random press.
+
+    Args:
+        skin: The patch.
+        depth: Depth of the press in heights.
+        converter: Converter that reads the resistances.
+        shares: Shares (T,) of the depth, one for each frame.
+        spoil: Changes the stream.
+        gain: Returns factors (T, U, K), or broadcast to it, of the resistances.
+        presses: Returns the presses in place of one random press.
+    """
 
     def make(rng: np.random.Generator) -> Stream:
         found = (random_press(rng, skin.layout, depth),) if presses is None else presses(rng)
@@ -90,7 +100,7 @@ def pressing(
 
 
 def all_cases() -> list[Case]:
-    """Every case, in the order of the list."""
+    """Return every case, in the order of the list."""
     return [
         *_symmetric_and_thick(),
         *_deep(),
@@ -106,7 +116,7 @@ def all_cases() -> list[Case]:
 
 
 def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: int) -> Case:
-    """A press without noise, for every operator along the samples and for the trackers."""
+    """Return a press without noise, for every operator along the samples and for the trackers."""
     skin = Skin(narrowed(layout))
     shares = np.linspace(0.0, 1.0, samples + 1)
     make = pressing(skin, depth, Converter(), shares)
@@ -162,7 +172,7 @@ def _sudden_and_close() -> Iterator[Case]:
 
 
 def _touching(skin: Skin) -> Callable[[np.random.Generator], tuple[Press, ...]]:
-    """A press that brings one electrode to a twentieth of the height above a lower one's level."""
+    """Return a press that brings one electrode to 0.05 heights above the lower layer."""
     layout = skin.layout
     gap = layout.upper_m[..., None, None, :2] - layout.lower_m[None, None, ..., :2]
     beside = np.linalg.norm(gap, axis=-1).min(axis=(2, 3))
@@ -214,14 +224,14 @@ def _spoilt(taken: Stream, frames: Float, valid: np.ndarray) -> Stream:
 
 
 def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """A lower wire breaks in the press and comes back before its end."""
+    """Break a lower wire during the press, and mend it before the end."""
     frames, valid, k = taken.frames_ohm.copy(), taken.valid.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k], valid[2:5, :, k] = np.nan, False
     return _spoilt(taken, frames, valid)
 
 
 def _shorted_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """A shorted wire that nobody marked: 0 ohm."""
+    """Short a wire without marking it: 0 ohm."""
     frames, k = taken.frames_ohm.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k] = 0.0
     return _spoilt(taken, frames, taken.valid)
@@ -234,7 +244,7 @@ def _open_upper(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Five chunks of three codes lost in every frame, others each time."""
+    """Lose five random chunks of three codes in every frame."""
     frames, valid = taken.frames_ohm.copy(), taken.valid.copy()
     for t in range(len(frames)):
         flat, lost = valid[t].reshape(-1), rng.choice(valid[t].size // 3, 5, replace=False)
@@ -244,7 +254,7 @@ def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stre
 
 
 def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Zero, negative, infinite and no number at all, not marked, in the middle of the press."""
+    """Put in zero, negative, infinite and NaN values, not marked, in the middle of the press."""
     frames = taken.frames_ohm.copy()
     for t in (2, 3, 4):
         where = rng.choice(frames[t].size, 4, replace=False)
@@ -253,7 +263,7 @@ def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _garbage(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """A frame that no deformation explains, then the stream as if nothing had been."""
+    """Put in one frame that no deformation explains."""
     frames = taken.frames_ohm.copy()
     frames[4] = skin.rest_ohm * rng.uniform(0.3, 1.2, skin.layout.shape)
     return _spoilt(taken, frames, taken.valid)
@@ -299,7 +309,7 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Half a turn of two neighbours on a wire about their middle: F ends as it began."""
+    """Turn two neighbours on a wire half round about their middle: F ends as it began."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share
@@ -312,7 +322,7 @@ def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
 
 
 def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """One electrode through the lower layer to its mirror image: F ends as it began."""
+    """Move one electrode through the lower layer to its mirror image: F ends as it began."""
     moved = np.zeros(layout.upper_m.shape)
     wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
     moved[wire, electrode, 2] = -2 * share * layout.height_m
@@ -324,10 +334,10 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Frames of a motion that no skin can make, ending at the resistances of rest; then an honest press.
+    """Return frames of a motion that no skin can make, ending at the resistances of rest; then a real press.
 
-    On the way there is nothing to hold a solver to: F does not tell a wire from the same with two electrodes
-    relabelled or mirrored.
+    The detour has no truth: F does not distinguish a wire from the same wire with two electrodes relabelled
+    or mirrored.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -412,7 +422,7 @@ def _many_times(skin: Skin) -> Callable[[np.random.Generator], Stream]:
 
 
 def fingertip(radius_m: float = 20e-3) -> Skin:
-    """The staggered patch of h = 0.5 wrapped around a cylinder whose axis runs across the upper wires."""
+    """Return the staggered patch of h = 0.5 around a cylinder with its axis across the upper wires."""
     flat = preset("staggered", 0.5)
     middle = float(flat.upper_m[..., 0].mean())
     turned = []

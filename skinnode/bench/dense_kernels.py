@@ -1,7 +1,7 @@
-"""The dense kernels against LAPACK, in a process of its own where LAPACK has one thread, as ours have.
+"""The dense kernels against LAPACK, in a process of its own in which LAPACK has one thread, as ours have.
 
-Its worker threads go on spinning for a while after each call. Where they share a core with what is measured
-next, that takes up to three times as long, and they wait for each other where the machine has other work.
+LAPACK's worker threads go on spinning for a while after each call. If they share a core with the next
+candidate, that takes up to three times as long, and they wait for each other while the machine is busy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ONE_THREAD: Final = {
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Rows of the benchmark, µs a call."""
+    """Return the rows of the benchmark, µs a call."""
     command = [sys.executable, "-m", "skinnode.bench.dense_kernels", str(rounds)]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, check=True)
     rows: list[dict[str, Any]] = json.loads(done.stdout)
@@ -33,8 +33,10 @@ def measure(rounds: int) -> list[dict[str, Any]]:
 
 
 def dense_pairs() -> dict[str, dict[str, Callable[[], object]]]:
-    """The dense kernels at the 300 unknowns of ten wires of ten electrodes, and LAPACK; each is given its own
-    order of axes and buffers to overwrite, refilled in every call."""
+    """Return the dense kernels and their LAPACK peers, at the 300 unknowns of ten wires of ten electrodes.
+
+    Each has its own order of axes, and buffers to overwrite that are refilled in every call.
+    """
     from scipy.linalg import blas, lapack
 
     n, rng = 300, np.random.default_rng(2)

@@ -1,5 +1,8 @@
-"""The compiled kernels against NumPy and LAPACK: F + J and one step of each operator, of one wire of the
-reference patch, and the dense kernels at the size of its posterior."""
+"""The compiled kernels against NumPy and LAPACK.
+
+Measured are F + J and one step of each operator, for one wire of the reference patch, and the dense kernels
+at the size of its posterior.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +31,14 @@ from skinnode.solve.operators.steps import (
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches a coordinate: well within Newton's step here, so that every operator has to work."""
+"""Trust radius, pitches a coordinate: far shorter than Newton's step, so that every operator must search."""
 
 
 class NumpyWire:
-    """F and Jᵀ of one wire as fast as NumPy does it: structure of arrays, into buffers made once.
+    """Computes F and Jᵀ of one wire as fast as NumPy can: structure of arrays, into buffers made once.
 
-    Of the orders of axes and ways to sum that were tried this is the fastest; it takes 0.85 of the time of
-    the obvious one.
+    Of the orders of axes and ways to sum that were tried, this is the fastest: 0.85 of the time of the
+    obvious way.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:
@@ -53,6 +56,7 @@ class NumpyWire:
         self.jt = np.empty((electrodes, 3, wires))
 
     def __call__(self, x: Float) -> tuple[Float, Float]:
+        """Return F (K,) and Jᵀ (3N, K) at x."""
         self._x[:] = x.reshape(-1, 3).T[:, :, None]
         np.subtract(self._lower, self._x.reshape(3, 1, -1), out=self._gap)
         np.einsum("amp,amp->mp", self._gap, self._gap, out=self._square)
@@ -67,9 +71,9 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Evaluate, step, evaluate, as :func:`compiled_steps` does.
+    """Evaluate, step, evaluate, as :func:`compiled_steps` does, and return r at the end.
 
-    The parameter of Levenberg-Marquardt, which that has to search for, is given.
+    The parameter of Levenberg-Marquardt, for which the compiled step searches, is given.
     """
     f, jt = wire(x)
     r, j = a * f - 1.0, (jt * a).T
@@ -117,10 +121,12 @@ def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
 
 
 @njit
-def compiled_steps(operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float) -> None:
-    """One step of every wire from ``start`` (U, n), with the compiled parts the driver is made of.
+def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
+    operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float
+) -> None:
+    """Take one step of every wire from ``start`` (U, n), with the compiled parts of the driver.
 
-    The driver itself, told to stop after one step, works out the next before it looks whether it may.
+    The driver itself, limited to one step, would compute the next step before it checks the limit.
     """
     for u in range(start.shape[0]):
         for j in range(w.x.size):
@@ -135,7 +141,7 @@ def compiled_steps(operator: int, start: Float, lower: Float, a: Float, w: Work,
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """The figures of the benchmark, µs a wire (dense kernels: a call) and ratios to ours."""
+    """Return the figures of the benchmark: µs a wire (dense kernels: µs a call) and ratios to ours."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)
@@ -181,7 +187,7 @@ def run(rounds: int) -> dict[str, Any]:
 
 
 def potential_of(x: Float, lower: Float) -> Float:
-    """F of one wire by the compiled kernel."""
+    """Return F of one wire by the compiled kernel."""
     f, jt = np.empty(lower.shape[2]), np.empty((x.size, lower.shape[2]))
     potential_jacobian(x, lower, f, jt)
     return f

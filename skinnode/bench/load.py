@@ -1,10 +1,9 @@
-"""The load of ``skinnode bench pipeline``: frames that real nodes sent on buses in simulated time, replayed
-at their pace by a process of its own.
+"""The load of ``skinnode bench pipeline``: frames of real nodes, replayed at their pace by another process.
 
-The nodes are those of ``skinnode node`` with the simulator's patches in front of them. Their frames go over a
-bus that arbitrates as CAN does: whenever it is free the waiting frame with the lowest identifier goes, and
-takes as long as its bits do, stuff bits included. This file may import the simulator, as the demo may: frames
-that the solver's own assumptions made would prove nothing.
+The nodes are those of ``skinnode node`` with the simulator's patches in front of them. Their frames cross, in
+simulated time, a bus that arbitrates as CAN does: whenever the bus is free, the waiting frame with the lowest
+identifier goes, and takes as long as its bits do, stuff bits included. This file may import the simulator, as
+the demo may: frames made with the solver's own assumptions would prove nothing.
 """
 
 from __future__ import annotations
@@ -37,33 +36,39 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""How often the frames that are due are sent: two frames of a full bus at once, as a USB adapter does."""
+"""Time between turns of the sender: two frames of a full bus at once, as from a USB adapter."""
 LEAD_S: Final = 0.5
-"""From the order to begin to the first frame."""
+"""Time from :meth:`Generator.begin` to the first frame."""
 _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
 _Queued = tuple[int, int, bytes, bool]
-"""When a node had a frame ready, ns; its COB-ID, data, and whether it is of CAN FD."""
+"""Time at which a node had a frame ready, ns; its COB-ID, data, and whether it is a CAN FD frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """What became of a replay."""
+    """Figures of a replay."""
 
     frames: dict[str, int]
-    """By bus, without the heartbeats before the start."""
+    """Frames sent by bus, without the heartbeats before the start."""
     bus_load: dict[str, float]
     """Share of the simulated bus that the frames took."""
     late_p99_ms: float
-    """How late frames were behind their time on the simulated bus: the generator's own."""
+    """Delay of the frames behind their time on the simulated bus, due to the generator itself."""
     late_max_ms: float
     cpu_s: float
 
 
 class Generator:
-    """A process with the load of ``hand``, for ``seconds``, ready when the constructor returns. All patches
-    are ``touched``, pressed and stroked as in the demo, or none; ``core``: that it keeps to."""
+    """A process that replays the load of a hand, ready when the constructor returns.
+
+    Args:
+        hand: The hand.
+        seconds: Length of the load.
+        touched: Whether all patches are pressed and stroked as in the demo, or none.
+        core: Processor core that the process keeps to; None: any.
+    """
 
     def __init__(self, hand: HandConfig, seconds: float, *, touched: bool, core: int | None) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -72,32 +77,32 @@ class Generator:
         with starting_children():
             self._process.start()
         theirs.close()
-        self._hear()
+        self._receive()
 
     def send_heartbeats(self, buses: Sequence[str]) -> None:
-        """Send the heartbeats of the patches on ``buses`` from now on, so that a host finds them."""
+        """Send the heartbeats of the patches on ``buses`` from now on, so that a host finds the patches."""
         self._pipe.send(list(buses))
 
     def begin(self) -> int:
-        """Replay from :data:`LEAD_S` later on; that time, monotonic ns."""
+        """Begin the replay :data:`LEAD_S` from now, and return that time, monotonic ns."""
         t_ns = time.monotonic_ns() + round(LEAD_S * 1e9)
         self._pipe.send(t_ns)
         return t_ns
 
     def wait(self) -> Sent:
-        """The end of the replay."""
-        sent: Sent = self._hear()
+        """Wait for the end of the replay, and return its figures."""
+        sent: Sent = self._receive()
         return sent
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process."""
         self._pipe.close()
         self._process.join(5)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
 
-    def _hear(self) -> Any:
+    def _receive(self) -> Any:
         try:
             answer = self._pipe.recv()
         except EOFError:
@@ -120,7 +125,7 @@ def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, co
                 pipe.send(_play(pipe, hand, [(bus, streams[bus.name]) for bus in chosen]))
     except EOFError:
         return
-    except Exception as error:  # the parent tells
+    except Exception as error:  # the parent raises it
         pipe.send(error)
 
 
@@ -129,16 +134,16 @@ def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, co
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """What passes on a bus."""
+    """The frames of a bus in simulated time."""
 
     t_ns: list[int]
-    """When each frame has been transmitted, from the first SYNC on, ascending."""
+    """End of each frame, ns from the first SYNC, ascending."""
     packets: list[bytes]
     load: float
 
 
 def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool = True) -> Stream:
-    """The frames of ``bus`` in ``seconds`` of the hand's life, SYNC among them."""
+    """Return the frames of ``bus`` in ``seconds`` of the hand's operation, with SYNC."""
     scans = round(seconds / hand.sync.period_s)
     late_ns = round([each.name for each in hand.buses].index(bus.name) * hand.sync.stagger_s * 1e9)
     syncs = _syncs(hand, scans, late_ns)
@@ -159,7 +164,7 @@ def _syncs(hand: HandConfig, scans: int, late_ns: int) -> list[_Queued]:
 def _node_frames(
     hand: HandConfig, patch: PatchConfig, number: int, syncs: Sequence[_Queued], touched: bool
 ) -> list[_Queued]:
-    """What the node of a patch has ready to send, and when, after these SYNCs."""
+    """Return the frames that the node of a patch has ready to send after these SYNCs."""
     bus, layout = hand.bus(patch.bus), patch.layout.build()
     profile = PatchProfile.from_config(patch, bus)
     source = SimulatedPatch(Scene(layout, hand.simulation, number))
@@ -208,7 +213,7 @@ def _node_frames(
 
 
 def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
-    """Time of each frame on the bus."""
+    """Return the time of each frame on the bus, ns."""
     ids = np.array([can_id for _, can_id, _, _ in frames])
     lengths = np.array([len(data) for _, _, data, _ in frames])
     durations = np.zeros(len(frames))
@@ -225,8 +230,11 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 
 
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
-    """All frames one after the other. Those of a node keep their order, as in the queue of its controller;
-    of the first of each node the lowest identifier goes."""
+    """Send all frames one after the other.
+
+    Frames of a node keep their order, as in the queue of its controller; among the first frames of all nodes
+    the lowest identifier goes.
+    """
     order = sorted(range(len(frames)), key=lambda i: frames[i][0])
     waiting: dict[int, list[int]] = {}  # by node, the first last
     heads: list[tuple[int, int]] = []  # identifier and node
@@ -286,7 +294,7 @@ def _play(pipe: Connection, hand: HandConfig, loads: Sequence[tuple[BusConfig, S
 def _replay(
     sockets: Sequence[socket.socket], streams: Sequence[Stream], begin_ns: int, sent: list[int]
 ) -> list[int]:
-    """Send every frame at its time. Returns how late each turn found the first frame it had to send."""
+    """Send every frame at its time. Returns the delay of the first frame of each turn, ns."""
     late_ns, clock = [], time.monotonic_ns
     at = [0] * len(streams)
     left = sum(len(stream.packets) for stream in streams)
@@ -318,7 +326,7 @@ def _connect(bus: BusConfig) -> socket.socket:
 
 
 def _send(sock: socket.socket, packet: bytes) -> int:
-    """1, or 0 where nobody listens yet."""
+    """Send a packet. Returns 1, or 0 if no receiver is open yet."""
     while True:
         try:
             sock.send(packet)

@@ -1,4 +1,4 @@
-"""The solvers as an informed user would set them up for a case: a stream in, what each frame gave out."""
+"""The solvers, set up for a case as an informed user would: from a stream to an estimate for each frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Method = Callable[[Stream], Solved]
 
 
 def set_up(case: Case, name: str) -> Method:
-    """The method ``name`` set up for ``case``, starting afresh with every stream."""
+    """Return the method ``name``, set up for ``case``; it is reset at the start of every stream."""
     if last_only(name):
         return functools.partial(_path, case, name.removeprefix("path "))
     solver = solver_of(case, name)
@@ -32,12 +32,12 @@ def set_up(case: Case, name: str) -> Method:
 
 
 def last_only(name: str) -> bool:
-    """Whether the method gives the last frame alone."""
+    """Return whether the method solves the last frame only."""
     return name.startswith("path ")
 
 
 def _path(case: Case, how: str, stream: Stream) -> Solved:
-    """``how``: an operator along all samples, or ``adaptive``."""
+    """Solve a path. ``how``: an operator along all samples, or ``adaptive``."""
     adaptive = how == "adaptive"
     path = solve_path(
         case.skin.layout,
@@ -46,13 +46,13 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # 5 deviations are what an error may reach; the estimate is just that
+    # an error may reach 5 deviations; the estimate is such an error
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 
 
 def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -> list[FieldFrame]:
-    """Every frame of the stream by ``solver``, which was made for the case under that name."""
+    """Solve every frame of the stream with ``solver``, which :func:`solver_of` made under ``name``."""
     solver.reset()
     noise = _noise_for_exact(case, stream) if name == "exact" else stream.noise
     frames = zip(stream.frames_ohm, stream.valid, noise, strict=True)
@@ -60,7 +60,7 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
-    """A solver of the case: ``exact``, ``posterior`` or ``auto``."""
+    """Return a solver for the case: ``exact``, ``posterior`` or ``auto``."""
     # every frame comes with its own noise as well
     common: dict[str, Any] = {
         "relative_noise": case.converter.relative_std,
@@ -78,7 +78,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """The inverse knows noise of single resistances only: drift and model errors are told as that."""
+    """Return drift and model errors as noise: the exact inverse knows noise of single resistances only."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))

@@ -1,10 +1,9 @@
-"""How punctual a node is, and what a frame costs it: pacing of chunks, SYNC to first chunk, heartbeat on a
-full bus, µs a frame.
+"""Punctuality and cost of a node: pacing of chunks, SYNC to first chunk, heartbeat on a full bus, µs a frame.
 
-Times are those at which the node hands a frame to its interface, by the monotonic clock that SYNC is stamped
-with. Whoever sends SYNC and the load is another endpoint and another thread of the same process: the
-interpreter's lock is part of what is measured. So is other work of the machine, by far the most of it where
-there is any; ``chrt -f 20 skinnode bench node`` shows what an idle one would do.
+Times are those at which the node hands a frame to its interface, by the monotonic clock that stamps SYNC.
+SYNC and load come from another endpoint in another thread of the same process: the interpreter's lock is part
+of the result. So is other work of the machine, which dominates if there is any; ``chrt -f 20 skinnode bench
+node`` shows an idle machine.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ Row = dict[str, Any]
 
 
 class _Still:
-    """A patch that nobody touches."""
+    """An untouched patch."""
 
     def __init__(self, layout: PatchLayout) -> None:
         self._ohm = resistance_ohm(layout, layout.upper_m)
@@ -48,13 +47,13 @@ class _Still:
 
 
 class _Rig:
-    """A node on a bus with a manager beside it, both for one measurement."""
+    """A node and a manager on a bus, for one measurement."""
 
     def __init__(self, config: BusConfig, pacing: Pacing) -> None:
         layout = PatchLayout.preset("staggered")
         self.manager, self._port = CanPort(config), CanPort(config)
         self.sent: list[tuple[int, int]] = []
-        """COB-ID and time of everything the node sent."""
+        """COB-ID and time of every frame that the node sent."""
         node = PatchNode(NODE_ID, layout, _Still(layout), send=self._send, pacing=pacing)
         self.inhibit_ns = node.profile.default_inhibit_100us * 100_000
         self._runner = NodeRunner(self._port, [node])
@@ -80,13 +79,20 @@ class _Rig:
         return self._port.received
 
     def take(self) -> None:
-        """What the node says is read and thrown away, as a queue that fills would end it."""
+        """Discard the frames of the node: a full queue would stop it."""
         while self.manager.recv(0.0) is not None:
             pass
 
 
 def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dict[str, Any]:
-    """All rows. ``seconds``: length of each measurement on the bus."""
+    """Return all rows.
+
+    Args:
+        seconds: Length of each measurement on the bus.
+        rounds: Times that each candidate is measured.
+        interface: python-can interface.
+        channel: Its channel; None: an unused name.
+    """
     config = BusConfig(interface=interface, channel=channel or uuid.uuid4().hex)
     with without_long_collections():
         rows = _scans(config, seconds, EXACT, "exact") + _scans(config, seconds, THRIFTY, "thrifty")
@@ -99,7 +105,7 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
 
 
 def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row:
-    """Of distances from what was meant, ns, of either sign."""
+    """Return the row for deviations from the nominal time, ns, of either sign."""
     late_ms = np.abs(late_ns) / 1e6
     p50, p99, most = np.percentile(late_ms, [50, 99, 100]).tolist() if len(late_ms) else [None] * 3
     spread = {"p50_ms": p50, "p99_ms": p99, "max_ms": most}
@@ -107,7 +113,7 @@ def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row
 
 
 def _scans(config: BusConfig, seconds: float, pacing: Pacing, name: str) -> list[Row]:
-    """Distances of chunks from the inhibit time, and of the first from its SYNC."""
+    """Measure the time between chunks, and from SYNC to the first chunk."""
     gaps: list[int] = []
     first: list[int] = []
     with _Rig(config, pacing) as rig:
@@ -128,7 +134,7 @@ def _scans(config: BusConfig, seconds: float, pacing: Pacing, name: str) -> list
 
 
 def _heartbeat(config: BusConfig, seconds: float, load_hz: int) -> Row:
-    """Distances between heartbeats, from their period."""
+    """Measure the time between heartbeats."""
     stop = threading.Event()
     with _Rig(config, EXACT) as rig:
         period = bytes((0x2B, 0x17, 0x10, 0, *BEAT_MS.to_bytes(2, "little"), 0, 0))
@@ -148,7 +154,7 @@ def _heartbeat(config: BusConfig, seconds: float, load_hz: int) -> Row:
 
 
 def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
-    """Frames of somebody else, at an even rate over any burst."""
+    """Send foreign frames, in bursts at an even rate."""
     start_s, sent = time.monotonic(), 0
     while not stop.is_set():
         due = int((time.monotonic() - start_s) * rate_hz)
@@ -160,8 +166,10 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """A node without a bus: what it does for frames of each kind, and asks when to be called next, as the
-    thread that drives it does."""
+    """Return what a node without a bus does for a frame of each kind.
+
+    Each also asks for the next deadline, as the thread that drives a node does.
+    """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)
     now_ns = 0

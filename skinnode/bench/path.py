@@ -1,16 +1,17 @@
-"""The paper's experiments on the path, in its protocol, beside what it prints (``paper.toml``).
+"""The paper's path experiments, by its protocol, beside its printed values (``paper.toml``).
 
 One upper wire of 10 electrodes, 30 unknowns; the other wires of the patch are left out. An experiment is a
 smooth press at random: a sphere of 6 to 12 mm on rubber, by Hertz's closed form with friction, somewhere in
-the middle of the patch, and the wire nearest to it. Of 1000 samples on the way down n are used, evenly.
+the middle of the patch, and the wire nearest to it. Of 1000 samples on the way down, n evenly spaced ones are
+used.
 
-What is counted. The paper's function calls are of finite-difference Jacobians: one costs 30 more calls than
-F alone. Here F comes with J, for about the price of two F; ×31 is what that would be by differences. Calls a
-step are of all samples but the last, as in the paper. The accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS), its mean
+Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls more
+than F alone. Here F comes with J at about the cost of two F; ×31 is the cost by differences. Calls a step are
+means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS), its mean
 over the experiments that converged. The first-order optimality is that of r = a F − 1, dimensionless in
-pitches; MATLAB's would be of F, F² times as large in the unit of length, which the paper does not tell.
+pitches; MATLAB's would be of F, F² times as large in the unit of length, which the paper does not state.
 
-The settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves
+Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves
 10 of 10 at any number of steps. So the hardest ``aligned`` of that depth is h = 1, and Gauss-Newton fails as
 it did for the authors, at 5 and 10 steps but not from 20 on, at h = 0.7 and 30 % (h 0.3 … 1 and 15 … 30 %
 were searched: 6 and 2 of 10 fail; at h = 1 and 25 %, 5 and 3, but there levenberg_marquardt fails later too).
@@ -55,13 +56,13 @@ LABELS: Final = {
 }
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
-"""Calls of F that F and J by forward differences cost."""
+"""Calls of F for F and J by forward differences."""
 WRONG: Final = 1e-4
-"""Relative error above which a CONVERGED wire is wrong; exact data leave 1e-8 at worst."""
+"""Minimum relative error at which a CONVERGED wire is wrong; exact data leave 1e-8 at worst."""
 
 
 def printed() -> dict[str, Any]:
-    """The figures of the paper."""
+    """Return the printed values of the paper."""
     text = resources.files("skinnode.bench").joinpath("paper.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
@@ -71,34 +72,34 @@ class Experiment:
     """One wire being pressed."""
 
     layout: PatchLayout
-    """Of the one wire."""
+    """Layout of the one wire."""
     samples_ohm: Float
-    """(SAMPLES, 1, K)"""
+    """(SAMPLES, 1, K), ohm."""
     truth_m: Float
-    """(1, N, 3) displacement at the last sample."""
+    """(1, N, 3), displacement at the last sample, metres."""
     patch: PatchLayout
     press: Press
 
     def solve(self, schedule: Schedule, operator: str = "dogleg", samples: int = SAMPLES) -> PathResult:
-        """The path by ``samples`` of the samples, as many to choose from as there are."""
+        """Solve the path by ``samples`` evenly spaced samples."""
         chosen = self.samples_ohm[SAMPLES // samples - 1 :: SAMPLES // samples]
         with np.errstate(all="ignore"):
             return solve_path(self.layout, chosen, operator=operator, schedule=schedule)
 
     def error(self, path: PathResult) -> float:
-        """‖X − X*‖ / ‖X* − X(0)‖."""
+        """Return ‖X − X*‖ / ‖X* − X(0)‖."""
         with np.errstate(all="ignore"):
             wrong = np.linalg.norm(path.displacement_m - self.truth_m)
         return float(wrong / np.linalg.norm(self.truth_m))
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """A preset of the reference patch; ``height`` in pitches."""
+    """Return a preset of the reference patch; ``height`` in pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
 def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experiment]:
-    """``count`` random presses, ``depth`` heights deep."""
+    """Return ``count`` random presses, ``depth`` heights deep."""
     rng = np.random.default_rng(SEED)
     span = layout.upper_m[..., :2].max(axis=(0, 1))
     made = []
@@ -122,7 +123,7 @@ def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experimen
 
 
 def run(count: int) -> dict[str, Any]:
-    """All figures of the benchmark, with ``count`` experiments a setting."""
+    """Return all figures of the benchmark, with ``count`` experiments for each setting."""
     settings = []
     for name, height, depth in SETTINGS:
         layout = preset(name, height)
@@ -165,7 +166,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """What a schedule costs and reaches, on average over the experiments."""
+    """Return cost and accuracy of a step control, on average over the experiments."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()
@@ -173,14 +174,14 @@ def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int
         times.append(time.perf_counter() - start)
     errors = [one.error(path) for one, path in zip(made, paths, strict=True)]
     good = [path.status == (Status.CONVERGED,) for path in paths]
-    before = [path.evaluations[_walked(path)][:-1] for path in paths]
+    before = [path.evaluations[_path_rows(path)][:-1] for path in paths]
     reached = [error for error, converged in zip(errors, good, strict=True) if converged]
     cycles = [path.cycle for path in paths if path.cycle is not None]
     return {
         "steps": samples,
         "calls_per_step": _mean([float(each.mean()) for each in before if each.size]),
         "evaluations": _mean([path.stats.evaluations for path in paths]),
-        "iterations": _mean([float(path.steps[_walked(path)].sum()) for path in paths]),
+        "iterations": _mean([float(path.steps[_path_rows(path)].sum()) for path in paths]),
         "search_iterations": _mean([float(path.steps[: path.searched].sum()) for path in paths]),
         "cycle": statistics.median(cycles) if cycles else None,
         "tol_x": _mean(
@@ -204,30 +205,30 @@ def _mean(values: Sequence[float]) -> float | None:
     return statistics.mean(finite) if finite else None
 
 
-def _walked(path: PathResult) -> slice:
-    """Rows of the path itself: after the search for a cycle, without second tries and checks."""
+def _path_rows(path: PathResult) -> slice:
+    """Return the rows of the path itself: without the search for a cycle, second tries and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
 
 def _final(path: PathResult) -> float:
-    return float(path.optimality[_walked(path)][-1, 0])
+    return float(path.optimality[_path_rows(path)][-1, 0])
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
-    """Figure 8: mean calls of each step but the last."""
+    """Return figure 8: mean calls of each step but the last."""
     paths = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     return [float(each) for each in np.mean([path.evaluations[: samples - 1, 0] for path in paths], axis=0)]
 
 
 def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
-    """Figures 9 and 10: first-order optimality at the end of each step but the last."""
+    """Return figures 9 and 10: first-order optimality at the end of each step but the last."""
     path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
     return [float(each) for each in path.optimality[: samples - 1, 0]]
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Median cycle over the experiments that have one."""
+    """Return the median cycle over the experiments that have one."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -238,21 +239,21 @@ def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | No
 
 
 def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
-    """Figure 11: steps of the operator over the path, in total and at each sample of the first experiment."""
+    """Return figure 11: operator steps over the path, in total and at each sample of one experiment."""
     uniform = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     periodic = [one.solve(Periodic(plain=True), samples=samples) for one in made]
     return {
-        "uniform": _mean([float(path.steps[_walked(path)].sum()) for path in uniform]),
-        "periodic": _mean([float(path.steps[_walked(path)].sum()) for path in periodic]),
+        "uniform": _mean([float(path.steps[_path_rows(path)].sum()) for path in uniform]),
+        "periodic": _mean([float(path.steps[_path_rows(path)].sum()) for path in periodic]),
         "search": _mean([float(path.steps[: path.searched].sum()) for path in periodic]),
         "uniform_each": uniform[0].steps[:samples, 0].tolist(),
-        "periodic_at": (1 + periodic[0].position[_walked(periodic[0]), 0]).tolist(),
-        "periodic_each": periodic[0].steps[_walked(periodic[0]), 0].tolist(),
+        "periodic_at": (1 + periodic[0].position[_path_rows(periodic[0]), 0]).tolist(),
+        "periodic_each": periodic[0].steps[_path_rows(periodic[0]), 0].tolist(),
     }
 
 
 def _last_step(one: Experiment, periodic: bool) -> list[float]:
-    """Figure 12: first-order optimality at the start of the last of 50 samples and after each iteration."""
+    """Return figure 12: optimality at the start of the last of 50 samples and after each iteration."""
     cycle = one.solve(Periodic(plain=True), samples=50).cycle if periodic else None
 
     def schedule(most: int) -> Schedule:
@@ -261,37 +262,39 @@ def _last_step(one: Experiment, periodic: bool) -> list[float]:
         return Uniform(plain=True, final_steps=most)
 
     whole = one.solve(schedule(1000), samples=50)
-    walked = _walked(whole)
-    before = int(whole.position[walked][-2, 0])
+    on_path = _path_rows(whole)
+    before = int(whole.position[on_path][-2, 0])
     chosen = one.samples_ohm[SAMPLES // 50 - 1 :: SAMPLES // 50]
     start = solve_path(one.layout, chosen[: before + 1], schedule=Uniform(plain=True))
-    iterations = range(1, int(whole.steps[walked][-1, 0]) + 1)
+    iterations = range(1, int(whole.steps[on_path][-1, 0]) + 1)
     after = [_final(one.solve(schedule(most), samples=50)) for most in iterations]
     return [optimality(one.layout, start.upper_m, chosen[-1]), *after]
 
 
 def optimality(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """‖Jᵀr‖∞ of r = a F − 1 with lengths in pitches, by the reference model."""
+    """Return ‖Jᵀr‖∞ of r = a F − 1 with lengths in pitches, by the reference model."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(r @ slopes).max())
 
 
 def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """Largest coordinate of the Newton step still to come, pitches."""
+    """Return the largest coordinate of the next Newton step, pitches."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(np.linalg.solve(slopes, r)).max())
 
 
 def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Float, Float]:
-    """r and J of the one wire."""
+    """Return r and J of the one wire."""
     a = frame_ohm[0] / layout.resistivity_ohm_per_m
     r = a * potential_per_m(layout, upper_m)[0] - 1.0
     return r, jacobian(layout, upper_m)[0].reshape(len(a), -1) * a[:, None] * layout.pitch_m
 
 
 def _ten_steps() -> list[dict[str, Any]]:
-    """Time and error of the ten-step path on ``staggered``: of one wire called alone, by each operator and as
-    we do it, and of one of a patch of ten."""
+    """Return time and error of the ten-step path on ``staggered``.
+
+    Rows are one wire alone, by each operator and by our own step control, and one wire of a patch of ten.
+    """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
     points = layout.upper_m[..., :2].reshape(-1, 2)
@@ -322,8 +325,10 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Figure 13: the whole patch of the hardest setting by 5 and by 20 samples, as the paper walks and as we
-    do; heights in µm."""
+    """Return figure 13: the whole patch of the hardest setting, heights in µm.
+
+    It is solved by 5 and by 20 samples as in the paper, and by our step control.
+    """
     name, height, depth = SETTINGS[-1]
     layout = preset(name, height)
     press = experiments(layout, depth, 1)[0].press
@@ -362,7 +367,7 @@ Say = Callable[[str], None]
 
 
 def print_all(figures: dict[str, Any], say: Say) -> None:
-    """The tables and the data of the figures, each beside what the paper prints."""
+    """Print the tables and the data of the figures, each beside the value in the paper."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second try.")
@@ -396,7 +401,7 @@ def _rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _accuracy(row: dict[str, Any], count: int) -> str:
-    """Mean of what converged, and how many did not."""
+    """Return the mean of the converged experiments, and how many did not converge."""
     if row["failed"] == count:
         return f"failed {count}/{count}"
     text = f"{row['accuracy_percent']:.0e} %"
@@ -485,8 +490,8 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
         ("uniform, 100 samples", "100", "uniform", printed_totals["uniform_100_steps"]),
         ("periodic, 100 samples", "100", "periodic", printed_totals["periodic_100_steps"]),
     ):
-        looked = f", and {totals[n]['search']:.0f} once to find the cycle" if key == "periodic" else ""
-        say(f"  {label:24}{totals[n][key]:7.1f}   paper {theirs}{looked}")
+        search = f", and {totals[n]['search']:.0f} once to find the cycle" if key == "periodic" else ""
+        say(f"  {label:24}{totals[n][key]:7.1f}   paper {theirs}{search}")
     for row in setting["periodic"]:
         say(
             f"  ours, Periodic(), {row['steps']} samples: T = {_figure(row['cycle'], 'g')}, "

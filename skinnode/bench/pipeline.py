@@ -1,8 +1,7 @@
-"""How much a host takes, and how fast: frames/s without loss, latency from the last frame of a scan to its
-field, CPU by group of threads, by number of buses and patches.
+"""Throughput and latency of a host, and CPU by group of threads, by number of buses and patches.
 
-The host is the one of ``skinnode host``, as guest of a robot whose master and nodes are a replay in another
-process (:mod:`skinnode.bench.load`). Frames come in by UDP, through SocketCAN's reader (see
+The host is that of ``skinnode host``, as guest of a robot whose master and nodes are a replay in another
+process (:mod:`skinnode.bench.load`). Frames arrive by UDP, through SocketCAN's reader (see
 :mod:`skinnode.transport.datagram`), or on a real CAN interface.
 """
 
@@ -37,8 +36,8 @@ CLASSIC_MS: Final = 50
 """Four patches of 101 frames in 50 ms are 8,080 frames/s beside SYNC and heartbeats."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""From the SYNC of a bus to that of the next, where they are not sent at the same instant: four patches are
-then solved before the next four are due."""
+"""Milliseconds from the SYNC of a bus to the SYNC of the next, if they are staggered: four patches are then
+solved before the next four are due."""
 SCENES: Final = (
     (False, True, 0.0),
     (False, True, STAGGER_MS),
@@ -47,9 +46,9 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""CAN FD, touched, and the stagger."""
+"""CAN FD, touched, and the stagger in ms."""
 DEADLINE_US: Final = 1000
-"""For a field. An exact inverse takes 200 µs; one that is put to the posterior as well would take 13 ms."""
+"""Deadline of a field. An exact inverse takes 200 µs, and 13 ms if the posterior has to check it."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -58,7 +57,7 @@ Row = dict[str, Any]
 _GROUPS: Final = ("receive", "mainline", "solve", "subscriber")
 
 
-def run(
+def run(  # noqa: PLR0913 - the options of the command
     seconds: float,
     *,
     short: bool,
@@ -67,8 +66,22 @@ def run(
     all_cores: bool,
     report: Callable[[Row], None],
 ) -> dict[str, Any]:
-    """All rows, each told to ``report`` as it comes. ``short``: only those on which something is asked.
-    Raises BusError."""
+    """Run all hands.
+
+    Args:
+        seconds: Length of each measurement.
+        short: Run only the rows that have a requirement.
+        interface: ``udp`` or ``socketcan``.
+        channel: Channel of socketcan.
+        all_cores: Do not keep the host to one core and the load to another.
+        report: Called with each row when it is ready.
+
+    Returns:
+        The figures.
+
+    Raises:
+        BusError: A bus fails.
+    """
     fullest = 1 if interface == "socketcan" else 4
     cores = sorted(os.sched_getaffinity(0))
     apart = len(cores) > 1 and not all_cores
@@ -96,7 +109,7 @@ def run(
     return {"machine": machine() | {"road": road, "": where}, "rows": rows, "must": _must(rows)}
 
 
-def _hand(
+def _hand(  # noqa: PLR0913 - the properties in which hands differ
     buses: int,
     fd: bool,
     stagger_ms: float,
@@ -136,13 +149,13 @@ def _hand(
             "stream": {"capacity_fields": 100_000},
         }
     )
-    # A bus this full is refused, and should be: every frame at its longest does not fit. Hence no validation.
+    # Not validated: a bus this full is refused, because frames of maximum length do not fit.
     full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
     return hand.model_copy(update={"buses": full})
 
 
 def _part(hand: HandConfig, buses: int) -> HandConfig:
-    """The hand with the first of its buses only."""
+    """Return the hand with the first ``buses`` of its buses."""
     kept = hand.buses[:buses]
     patches = tuple(patch for patch in hand.patches if patch.bus in {bus.name for bus in kept})
     return hand.model_copy(update={"buses": kept, "patches": patches})
@@ -202,13 +215,13 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Frames, chunks and scans that did not become fields, wherever they were lost."""
+    """Return the number of frames, chunks and scans that did not become fields."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
 
 def hand_name(row: Row) -> str:
-    """What the hand of a row is, in a few words."""
+    """Return a short description of the row's hand."""
     kind = "CAN FD" if row["fd"] else "classic"
     scene = "touched" if row["touched"] else "at rest"
     apart = f", {row['stagger_ms']:g} ms apart" if row["stagger_ms"] else ""
@@ -216,7 +229,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """What is asked of the fullest hands whose patches are touched, and whether it is reached."""
+    """Return the requirements on the fullest hands with touched patches, and whether they are reached."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:
@@ -232,7 +245,7 @@ def _must(rows: list[Row]) -> list[Row]:
 
 
 class _Reader:
-    """A program that reads fields, and when each came into its hands."""
+    """A program that reads fields, and notes when it got each."""
 
     def __init__(self, fields: Subscription) -> None:
         self._stamps: list[tuple[ScanStamp, int]] = []
@@ -240,7 +253,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Of the scans that ended later: ms from their last frame to the field, and until it was read."""
+        """Return ms from last frame to field, and to reading it, for scans that ended after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]
@@ -263,7 +276,7 @@ def _read(host: Host) -> int:
 
 
 def _settle(host: Host) -> None:
-    """Wait until nothing changes any more."""
+    """Wait until the counters stop changing."""
     end_s, last = time.monotonic() + SETTLE_S, None
     while time.monotonic() < end_s:
         stats = host.stats()
@@ -278,7 +291,7 @@ def _settle(host: Host) -> None:
 
 
 def _cpu_s() -> dict[str, float]:
-    """CPU time that each group of threads of this process has had."""
+    """Return the CPU time of each group of threads of this process, s."""
     used: dict[str, float] = defaultdict(float)
     names = {thread.native_id: thread.name.split()[0] for thread in threading.enumerate()}
     for task in os.listdir("/proc/self/task"):
@@ -305,7 +318,7 @@ LEGEND: Final = (
 
 
 def line(row: Row) -> str:
-    """A row in a line."""
+    """Return a row as a line."""
 
     def ms(spread: dict[str, float | None], *names: str) -> str:
         return "".join("     -" if spread[name] is None else f"{spread[name]:6.1f}" for name in names)

@@ -1,4 +1,4 @@
-"""Holds decoded fields against the truth: error, reported uncertainty, and what the codes allow.
+"""Compares decoded fields with the truth: error, reported uncertainty, and the bound set by the codes.
 
 The bound is the Cramér-Rao bound of one scan: with S the deviations of the relative residuals F/b − 1 and J
 their Jacobian at the true position, no unbiased estimate of a wire's electrodes has a covariance below
@@ -20,12 +20,20 @@ OUTLIER_DEVIATIONS = 6.0
 normal distribution puts 2e-4 beyond six deviations: one false alarm in 5,000 runs."""
 
 EXCESS_LIMIT = 1.15
-"""RMS error over RMS reported deviation that a run may reach; the accuracy line this project sets itself."""
+"""Maximum RMS error over RMS reported deviation of a run, required by this project."""
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
-    """Cramér-Rao bound of every coordinate, (U, N, 3) in metres, for electrodes at ``upper_m`` and relative
-    deviations ``relative_std`` (U, K) of the resistances. Inf for a wire whose Jacobian is singular."""
+    """Return the Cramér-Rao bound of every coordinate as a standard deviation (U, N, 3), metres.
+
+    Args:
+        layout: The patch.
+        upper_m: Electrodes (U, N, 3), metres.
+        relative_std: Relative standard deviations (U, K) of the resistances.
+
+    Returns:
+        Inf for a wire whose Jacobian is singular.
+    """
     potential = potential_per_m(layout, upper_m)
     slopes = jacobian(layout, upper_m).reshape(*layout.shape, layout.unknowns)
     bound = np.full((layout.shape[0], layout.unknowns), np.inf)
@@ -39,17 +47,17 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """A patch's run in figures; lengths in metres, NaN without a scored scan."""
+    """Figures of a patch's run; lengths in metres, NaN without a scored scan."""
 
     scans: int
     untrusted: int
-    """Scans in which a wire did not converge; they count for nothing else here."""
+    """Scans in which a wire did not converge; the other figures leave them out."""
     deepest_m: float
     """Largest true displacement of an electrode."""
     error_rms_m: float
     reported_rms_m: float
     bound_rms_m: float
-    """What the codes alone allow on this layout (the converter's own noise not counted)."""
+    """RMS of the bound set by the codes alone, without the converter's noise."""
     error_max_m: float
     relative_error: float
     """‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
@@ -60,7 +68,7 @@ class Score:
 
     @property
     def within_uncertainty(self) -> bool:
-        """False when the error is above what was reported, over the run or anywhere by far."""
+        """Whether the RMS error, and each single error, agree with the reported deviations."""
         return (
             self.scans > 0
             and self.untrusted == 0
@@ -71,12 +79,12 @@ class Score:
 
 @dataclass
 class Scorer:
-    """Accumulates one patch's run. ``code_std`` is the deviation of R / R0 that quantisation makes."""
+    """Accumulates one patch's run. ``code_std`` is the standard deviation of R / R0 due to quantisation."""
 
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """The bound changes slowly; it is computed for one scan in this many, and not before :meth:`score`."""
+    """Scans for each scan whose bound is computed, which :meth:`score` does; the bound changes slowly."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0
@@ -88,7 +96,7 @@ class Scorer:
     _deepest: tuple[float, float] = (0.0, float("nan"))
 
     def add(self, frame: FieldFrame, true_upper_m: Float) -> float:
-        """Score one scan against the true positions (U, N, 3); returns its RMS error in metres."""
+        """Add a scan with its true positions (U, N, 3), metres. Returns its RMS error in metres."""
         truth = true_upper_m - self.layout.upper_m
         error = frame.displacement_m - truth
         rms = float(np.sqrt(np.mean(error**2)))
@@ -111,7 +119,7 @@ class Scorer:
         return rms
 
     def score(self) -> Score:
-        """The figures so far."""
+        """Return the figures so far."""
         count = self._scans or float("nan")
         at_rest = potential_per_m(self.layout, self.layout.upper_m)
         bounds = [

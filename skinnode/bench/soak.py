@@ -43,16 +43,17 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import REMEMBERED_READINGS
 
 WARM_UP: Final = 0.25
-"""Share of the time after which memory is looked at for the first time."""
+"""Share of the time after which memory is measured for the first time."""
 BLOCKS: Final = 2000
-"""Growth allowed: a few hundred come and go with what is under way; a leak of one a scan makes 10,000 in
-three minutes."""
+"""Maximum growth in blocks: a few hundred come and go; a leak of one block a scan makes 10,000 in three
+minutes."""
 RESIDENT_MB: Final = 8.0
-"""Of the allocator of C, which gives memory back as it likes."""
+"""Maximum growth of resident memory, which C's allocator returns at its own pace."""
 BACK_S: Final = 15.0
-"""A stream that is not back by then is lost. It should take one; a loaded machine may need more."""
+"""Seconds after which a stream that is not back counts as lost. It should take one second; a loaded machine
+may need more."""
 SLOW_S: Final = 1.0
-"""Rounds that took longer are told."""
+"""Seconds after which a round is reported as slow."""
 STARVED: Final = 0.1
 """Share of the rounds in which other processes occupy the processor."""
 STARVED_S: Final = 3.0
@@ -61,7 +62,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Number of simultaneous faults from which a line gives their number, not their names."""
+"""Minimum number of simultaneous faults that a line counts instead of naming."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -123,7 +124,7 @@ _KINDS: Final[tuple[dict[str, Any], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class _Size:
-    """What must not grow."""
+    """Sizes that must not grow."""
 
     blocks: int
     resident_mb: float
@@ -140,7 +141,13 @@ def warm_up() -> None:
 
 
 def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Soak for ``minutes``; progress goes to ``report``. Raises as :meth:`Host.from_config`."""
+    """Soak a hand, and return the figures. Raises as :meth:`Host.from_config`.
+
+    Args:
+        minutes: Length of the soak.
+        seed: Seed of the faults.
+        report: Called with each line of progress.
+    """
     chance = random.Random(seed)
     hand = _hand()
     counter = sums.FrameCounter([bus.name for bus in hand.buses])
@@ -282,7 +289,7 @@ def _soak(
 
 
 def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
-    """Every patch has to be brought up at the same time: as many threads as there will ever be."""
+    """Bring every patch up at the same time, for the maximum number of threads."""
     fleet.inject(Faults(unplugged=True))
     time.sleep(CALM_S)
     _calm(fleet)
@@ -291,7 +298,7 @@ def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
 
 
 def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
-    """The faults of a round; what they are."""
+    """Inject the faults of a round. Returns their description."""
     if chance.random() < 0.05:
         bus = chance.choice(fleet.hand.buses).name
         fleet.bus_off(bus, off=True)
@@ -321,8 +328,11 @@ def _calm(fleet: Fleet) -> None:
 
 
 def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
-    """Wait until every patch is operational and has published a field of a SYNC sent after the call. Returns
-    the time in s, and the last patch waited for with the reason."""
+    """Wait until every patch is operational and has published a field of a SYNC sent after the call.
+
+    Returns:
+        The time in s, and the last patch waited for with the reason.
+    """
     begin_ns, waited_for = time.monotonic_ns(), ""
 
     def waits_for(name: str) -> str:
@@ -355,7 +365,7 @@ def _patient(field: FieldFrame) -> None:
 
 
 def _standing_still(host: Host) -> HostStats:
-    """Counters when nothing comes any more and everything has been worked off."""
+    """Return the counters when they have stopped changing."""
     last, stats = None, host.stats()
     for _ in range(100):
         now = (

@@ -18,10 +18,13 @@ _COMPILE_S: Final = 600.0
 
 
 def fill(folder: Path) -> None:
-    """Fill a cache below ``folder`` with the kernels that a soak needs: copied from the user's cache, or
-    compiled in a child process if the user has none. The user's cache is not changed.
+    """Fill a cache below ``folder`` with the kernels that a soak needs.
 
-    Raises subprocess.SubprocessError if the child fails.
+    They are copied from the user's cache, or compiled in a child process if the user has none. The user's
+    cache is not changed.
+
+    Raises:
+        subprocess.SubprocessError: The child fails.
     """
     from skinnode.compiled.jit import cache_dir, is_cold
 
@@ -40,8 +43,10 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage files of the cache below ``folder``, alternately cut in half and overwritten with random bytes;
-    the same seed damages the same files. Returns a line for each file."""
+    """Damage files of the cache below ``folder``, alternately cut in half and overwritten with random bytes.
+
+    The same seed damages the same files. Returns a line for each file.
+    """
     chance = random.Random(seed)
     files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)
     lines = []

@@ -1,5 +1,4 @@
-"""Sums of a soak: compares, kind by kind, the frames that simulated nodes sent and dropped with the host's
-counts."""
+"""Compares, kind by kind, the frames that the nodes of a soak sent and dropped with the host's counts."""
 
 from __future__ import annotations
 
@@ -17,8 +16,10 @@ from vcan_sim.tally import Kind, kind_of
 
 
 class FrameCounter:
-    """Counts the frames that a host receives and sends, by bus and kind; a
-    :class:`~skinnode.host.tap.HostTap`."""
+    """Counts the frames that a host receives and sends, by bus and kind.
+
+    It is a :class:`~skinnode.host.tap.HostTap`.
+    """
 
     def __init__(self, buses: Sequence[str]) -> None:
         self.received_on: dict[str, Counter[Kind]] = {bus: Counter() for bus in buses}
@@ -78,8 +79,10 @@ def of_nodes(fleet: Fleet) -> list[KindSums]:
 
 
 def of_host(fleet: Fleet) -> list[KindSums]:
-    """Return the sums of frames from the host to the nodes, by kind; a frame counts once for each node that
-    could hear it."""
+    """Return the sums of frames from the host to the nodes, by kind.
+
+    A frame counts once for each node that could hear it.
+    """
     sums = []
     for kind in Kind:
         wanted = dropped = held = arrived = 0
@@ -96,8 +99,15 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Return a line for each sum of frames from nodes to host that does not add up. Call while the nodes are
-    silent. ``before``: frames that each bus carried before the host opened it."""
+    """Return a line for each sum of frames from nodes to host that does not agree.
+
+    Call while the nodes are silent.
+
+    Args:
+        fleet: The nodes.
+        counter: Counts of the host.
+        before: Frames that each bus carried before the host opened it.
+    """
     found = []
     for bus in fleet.hand.buses:
         tallies = [fleet.tally(patch.name) for patch in fleet.hand.patches_on(bus.name)]
@@ -113,8 +123,10 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Return a line for each sum of frames from host to nodes that does not add up, in total and for each
-    node. Call after the host has closed and the nodes have stopped."""
+    """Return a line for each sum of frames from host to nodes that does not agree, in total and by node.
+
+    Call after the host has closed and the nodes have stopped.
+    """
     found = []
     for bus in fleet.hand.buses:
         passed = fleet.passed(bus.name)

@@ -1,7 +1,8 @@
-"""One wire of the reference patch to 1e-9 from a near start: ours and its peers on the same compiled F and J.
+"""One wire of the reference patch to 1e-9 from a near start: our solvers and their peers on the same F and J.
 
 The start is the sample before the last of a ten-step path to a 10 % press. Every peer runs at the loosest
-tolerance that brings the displacement to 1e-9; one that no tolerance brings there is listed without a time.
+tolerance that brings the displacement to 1e-9; a peer that no tolerance brings there is listed without a
+time.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 ACCURACY: Final = 1e-9
-"""Largest error of a coordinate, relative to the largest displacement of its wire."""
+"""Maximum error of a coordinate, relative to the largest displacement of its wire."""
 TOLERANCES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-14, 1e-15)
 
 Solve = Callable[["Case", float], Float]
 
 
 class Case:
-    """One wire: r = a F − 1 and its Jacobian for anyone, its start and its truth."""
+    """One wire: r = a F − 1 and its Jacobian for any solver, its start and its truth."""
 
     def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
         self.wire, self.a, self.start, self.truth = wire, a, start, truth
@@ -43,26 +44,30 @@ class Case:
         self._jt = np.empty((unknowns, equations))
 
     def residual(self, x: Float) -> Float:
+        """Return r (K,) at x."""
         potential(x, self._lower, self._f)
         return np.asarray(self.a * self._f - 1.0)
 
     def jacobian_transposed(self, x: Float) -> Float:
+        """Return Jᵀ (3N, K) at x."""
         potential_jacobian(x, self._lower, self._scratch, self._jt)
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """r at the point of the last Jacobian, which came with it."""
+        """Return r at the point of the last Jacobian, computed with it."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
+        """Return J (K, 3N) at x."""
         return self.jacobian_transposed(x).T
 
     def error(self, x: Float) -> float:
+        """Return the largest error of a coordinate, relative to the largest displacement."""
         return float(np.abs(x - self.truth).max()) / self.size
 
 
 def press(layout: PatchLayout, depth: float) -> Float:
-    """A smooth dent with shear, deepest ``depth`` heights, (U, N, 3) metres."""
+    """Return the displacement (U, N, 3) of a smooth dent with shear, ``depth`` heights deep, metres."""
     middle = layout.upper_m[..., :2].mean(axis=(0, 1)) + 0.3 * layout.pitch_m
     away = ((layout.upper_m[..., :2] - middle) ** 2).sum(axis=-1) / (2.0 * layout.pitch_m) ** 2
     dent = depth * layout.height_m / (1.0 + away)
@@ -70,7 +75,7 @@ def press(layout: PatchLayout, depth: float) -> Float:
 
 
 def peers(problem: PatchProblem) -> dict[str, Solve]:
-    """Every solver by name: (case, tolerance) to x. Ours come first."""
+    """Return every solver by name, ours first: functions of case and tolerance that return x."""
     from scipy import optimize
 
     solver = PatchSolver(problem, 0)
@@ -133,7 +138,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
 
 
 def ceres() -> Solve:
-    """Ceres with its dense QR and traditional dogleg, without a line of output."""
+    """Return Ceres with its dense QR and traditional dogleg, without output."""
     pyceres = importlib.import_module("pyceres")
     options = pyceres.SolverOptions()
     options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG
@@ -149,7 +154,7 @@ def ceres() -> Solve:
             self.set_num_residuals(case.a.size)
             self.set_parameter_block_sizes([case.start.size])
 
-        def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:  # noqa: N802
             x = np.ascontiguousarray(parameters[0])
             if jacobians is None:
                 residuals[:] = self._case.residual(x)
@@ -178,7 +183,7 @@ def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """The figures of the benchmark: µs a wire, ratio to our dogleg, error."""
+    """Return the figures of the benchmark: µs a wire, ratio to our dogleg, error."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     cases = []

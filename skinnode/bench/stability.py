@@ -21,7 +21,7 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Where ``auto`` gave the same bits as the method it chose on so many streams, it is not run again."""
+"""Streams on which ``auto`` must equal another method bit for bit before it is no longer run itself."""
 
 
 @contextlib.contextmanager
@@ -47,10 +47,17 @@ def run(
     jobs: int = 1,
     report: Callable[[dict[str, Any]], object] = lambda row: None,
 ) -> dict[str, Any]:
-    """The figures; ``report`` gets each row when it is ready. ``only``: the methods to run.
+    """Solve the hard cases.
 
-    Where no ``cases`` are given all of them are shared out to so many processes, ``jobs``; the streams of a
-    case, and so its rows, do not depend on that.
+    Args:
+        seeds: Streams of each case.
+        cases: The cases; default: all.
+        only: The methods; default: all of each case.
+        jobs: Processes that solve all cases in parallel; the streams, and so the rows, do not depend on it.
+        report: Called with each row when it is ready.
+
+    Returns:
+        The figures.
     """
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
@@ -75,17 +82,17 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """The rows of one of all cases, in a process of its own: a case has closures, which do not travel."""
+    """Return the rows of a case by number: a case has closures, which cannot be sent to a process."""
     return _rows(all_cases()[number], only, seeds)
 
 
 def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
-    """One row a method; all of them get the same streams."""
+    """Return one row for each method; all methods get the same streams."""
     chosen = [name for name in case.methods if only is None or name in only]
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
-    name_code = zlib.crc32(case.name.encode())  # a case added or moved leaves the streams of the others
+    name_code = zlib.crc32(case.name.encode())  # adding or moving a case leaves the streams of the others
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
         tracked = stream.every(case.stride)
@@ -120,7 +127,7 @@ LEGEND = (
 
 
 def line(row: dict[str, Any]) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     method = row["method"] if row["same_as"] is None else f"{row['method']} = {row['same_as']}"
     return (
         f"{row['number']:2} {row['case']:46}{method:22}{share(row['median_error']):>11}"
@@ -130,7 +137,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def share(value: float) -> str:
-    """As a percentage where that can be read, else by its power of ten; a dash where there is none."""
+    """Return a share as a percentage or, if that is unreadable, as a power of ten; a dash for NaN."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "inf"
     if 1e-4 <= value < 1:

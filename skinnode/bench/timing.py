@@ -15,9 +15,9 @@ from typing import Any, Final
 from skinnode.files.output_file import write_text
 
 ROUNDS: Final = 31
-"""Odd, so that the median is a time that was measured."""
+"""Default number of rounds; odd, so that the median is a measured time."""
 TURN_S: Final = 4e-3
-"""Length of a turn: long against the clock, short against what else the machine does."""
+"""Length of a turn: long compared with the clock's resolution, short compared with other load."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Timing:
 
 
 def take_turns(candidates: Mapping[str, Callable[[], object]], *, rounds: int = ROUNDS) -> dict[str, Timing]:
-    """Time every candidate in every round; the first is what the others are compared with."""
+    """Time every candidate in every round; ratios are to the first candidate."""
     calls = {name: _calls_in_a_turn(function) for name, function in candidates.items()}
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in range(rounds):
@@ -57,7 +57,7 @@ def _calls_in_a_turn(function: Callable[[], object]) -> int:
 
 
 def machine() -> dict[str, str]:
-    """What the figures were measured on."""
+    """Return the versions and the processor that the figures were measured with."""
     import numba
     import numpy
     import scipy
@@ -85,5 +85,5 @@ def _processor() -> str:
 
 
 def write_json(path: Path, figures: dict[str, Any]) -> None:
-    """Write ``figures``, readable and with a stable order."""
+    """Write ``figures`` as readable JSON, in a stable order."""
     write_text("--json", path, json.dumps(figures, indent=2) + "\n")

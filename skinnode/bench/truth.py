@@ -1,9 +1,9 @@
-"""The truth that benchmarks hold the solvers against, made without any of the solvers' assumptions.
+"""The truth with which benchmarks compare the solvers, made without any assumption of the solvers.
 
 Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
-they have no grid and come from no prior. Resistances come from :class:`Skin`, which can be what the solver
-does not expect: electrodes of finite size, rubber whose resistivity depends on strain, another thickness, a
-contact resistance in series. Converters spoil them as real ones do.
+they have no grid and come from no prior. Resistances come from :class:`Skin`, which can differ from what the
+solver expects: electrodes of finite size, rubber whose resistivity depends on strain, another thickness, a
+contact resistance in series. Converters add noise and codes as real ones do.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative deviation told to a tracker whose data has no noise at all: the tolerance it solves to."""
+"""Relative noise given to a tracker for data without noise: the tolerance to which it solves."""
 RING: Final = 4
-"""Points on the rim of a finite electrode. With two rings of them half a step apart, 16 distances a pair."""
+"""Points on the rim of a finite electrode; a pair of electrodes has 16 distances."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """A sphere at its deepest; lengths in metres. ``share`` of the methods is the share of the depth."""
+    """A sphere at its deepest; lengths in metres. ``share`` is always a share of the depth."""
 
     center_m: tuple[float, float]
     radius_m: float
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """The traction along the surface alone: the contact with friction less the same without."""
+    """Only the traction along the surface: the contact with friction less the same contact without."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
-        """Closed forms with their sign."""
+        """Return the closed forms, each with its sign."""
         depth = share * self.depth_m
         full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
         if not self.shear_only:
@@ -47,14 +47,14 @@ class Press:
         return ((1, full), (-1, HertzContact(RUBBER, self.radius_m, depth, self.center_m)))
 
     def displacement_m(self, points_m: Float, share: float) -> Float:
-        """(P, 3) at surface points (P, 2)."""
+        """Return the displacement (P, 3) at surface points (P, 2), metres."""
         moved = np.zeros((len(points_m), 3))
         for sign, contact in self.contacts(share):
             moved += sign * contact.displacement_m(points_m)
         return moved
 
     def force_n(self, share: float) -> Float:
-        """(3,) load on the rubber."""
+        """Return the load (3,) on the rubber, newtons."""
         force = np.zeros(3)
         for sign, contact in self.contacts(share):
             force += sign * np.array(contact.force_n)
@@ -63,16 +63,16 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A real patch, of which the solver knows only ``layout``.
+    """A real patch; the solver knows only its ``layout``.
 
     Args:
-        layout: what the solver is told.
-        height: true height of the upper layer as a share of the layout's.
-        electrode: radius of every electrode, pitches; 0 is the point that the solver assumes.
+        layout: The layout that the solver gets.
+        height: True height of the upper layer as a share of the layout's.
+        electrode: Radius of every electrode, pitches; 0 is the point that the solver assumes.
         strain: β of ρ d (1 + β (d/d₀ − 1)), d₀ the distance at rest.
-        series: contact resistance in series with each pair of wires, as a share of its R₀.
-        points_m: (U, N, 2) place of the electrodes along the surface, where it is not flat.
-        axes: (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
+        series: Contact resistance in series with each pair of wires, as a share of its R₀.
+        points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
+        axes: Axes (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
     """
 
     layout: PatchLayout
@@ -85,14 +85,14 @@ class Skin:
 
     @functools.cached_property
     def body(self) -> PatchLayout:
-        """The layout as it really is."""
+        """The true layout."""
         if self.height == 1.0:
             return self.layout
         upper = self.layout.upper_m * np.array([1.0, 1.0, self.height])
         return PatchLayout(upper, self.layout.lower_m, self.layout.resistivity_ohm_per_m)
 
     def displacement_m(self, presses: tuple[Press, ...], share: float) -> Float:
-        """(U, N, 3) of the electrodes, presses superposed."""
+        """Return the displacement (U, N, 3) of the electrodes under all presses, metres."""
         points = self.layout.upper_m[..., :2] if self.points_m is None else self.points_m
         moved = np.zeros((points.shape[0] * points.shape[1], 3))
         for press in presses:
@@ -102,11 +102,11 @@ class Skin:
 
     @functools.cached_property
     def rest_ohm(self) -> Float:
-        """(U, K) at rest, without noise: the baseline that the solver gets."""
+        """Resistances (U, K) at rest, without noise: the baseline that the solver gets."""
         return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
 
     def resistance_ohm(self, displacement_m: Float) -> Float:
-        """(U, K)"""
+        """Return the resistances (U, K) at a displacement (U, N, 3)."""
         upper = self.body.upper_m + displacement_m
         if self.strain:
             found = self._strained(upper)
@@ -121,7 +121,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """What :func:`skinnode.model.forward.resistance_ohm` gives, in a fifth of its time."""
+        """Return the same as :func:`skinnode.model.forward.resistance_ohm`, in a fifth of its time."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -136,7 +136,7 @@ class Skin:
         return self._distance(self.body.upper_m)
 
     def _distance(self, upper: Float) -> Float:
-        """(U, K, M, N)"""
+        """Return the distances (U, K, M, N)."""
         gap = upper[:, None, None, :, :] - self.body.lower_m[None, :, :, None, :]
         return np.asarray(np.sqrt(np.einsum("ukmna,ukmna->ukmn", gap, gap)))
 
@@ -146,7 +146,7 @@ class Skin:
         return np.asarray(self.layout.resistivity_ohm_per_m / (1.0 / path).sum(axis=(2, 3)))
 
     def _finite(self, upper: Float) -> Float:
-        """Potential of the rims of the lower electrodes, averaged over the rims of the upper ones."""
+        """Average the potential of the lower rims over the upper rims."""
         radius = self.electrode * self.layout.pitch_m
         rims = []
         for points, turned in ((upper, 0.0), (self.body.lower_m, 0.5)):
@@ -162,10 +162,10 @@ class Skin:
 
 @dataclass(frozen=True)
 class Converter:
-    """Noise of every reading (``sigma``, relative) and, where ``bits`` is not 0, codes of R/R₀.
+    """A converter: noise of every reading (``sigma``, relative) and, unless ``bits`` is 0, codes of R/R₀.
 
-    Codes are as on the wire: from ``lo`` to ``hi``, with three reserved; 16 and 24 bits are written and read
-    by the wire's own codec.
+    Codes are those of the protocol: from ``lo`` to ``hi``, with three reserved; 16 and 24 bits are written
+    and read by the protocol's own codec.
     """
 
     sigma: float = 0.0
@@ -180,7 +180,7 @@ class Converter:
 
     @property
     def relative_std(self) -> float:
-        """Deviation of a reading at rest, relative: what its user knows about it."""
+        """Relative standard deviation of a reading at rest, which its user knows."""
         if self.exact:
             return EXACT_NOISE
         rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0
@@ -189,7 +189,7 @@ class Converter:
     def read(
         self, resistance: Float, rest: Float, rng: np.random.Generator
     ) -> tuple[Float, NDArray[np.bool_], Float]:
-        """Resistances, which of them are valid, and the relative deviation of each, all of one shape."""
+        """Return the readings, their validity and their relative standard deviations, all of one shape."""
         if self.exact:
             return resistance, np.ones(resistance.shape, bool), np.full(resistance.shape, EXACT_NOISE)
         noisy = resistance * (1.0 + self.sigma * rng.standard_normal(resistance.shape))
@@ -212,22 +212,22 @@ class Converter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """What a solver gets, and the truth beside it."""
+    """The input of a solver, and the truth."""
 
     frames_ohm: Float
-    """(T, U, K); not finite where not valid."""
+    """(T, U, K), ohm; not finite where not valid."""
     valid: NDArray[np.bool_]
     """(T, U, K)"""
     noise: Float
-    """(T, U, K) relative deviation of the converter."""
+    """(T, U, K), relative standard deviation of the converter."""
     truth_m: Float
-    """(T, U, N, 3) displacement; NaN in frames that no skin can give."""
+    """(T, U, N, 3), displacement in metres; NaN in frames that no skin can produce."""
     force_n: Float
-    """(T, 3) sum of all loads; NaN as above."""
+    """(T, 3), sum of all loads in newtons; NaN as above."""
     presses: tuple[Press, ...] = ()
 
     def every(self, stride: int) -> Stream:
-        """Every so many frames, from the first on."""
+        """Return every ``stride``-th frame, beginning with the first."""
         return Stream(
             self.frames_ohm[::stride],
             self.valid[::stride],
@@ -238,7 +238,7 @@ class Stream:
         )
 
 
-def stream(
+def stream(  # noqa: PLR0913 - the parts of a stream
     skin: Skin,
     presses: tuple[Press, ...],
     shares: Float,
@@ -246,7 +246,16 @@ def stream(
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """The press taken at ``shares`` (T,) of its depth; ``gain`` (T, U, K) or broadcast to it multiplies R."""
+    """Return the stream of presses at shares of their depth.
+
+    Args:
+        skin: The patch.
+        presses: The presses, superposed.
+        shares: Shares (T,) of the depth, one for each frame.
+        converter: Converter that reads the resistances.
+        rng: Source of noise.
+        gain: Factors (T, U, K), or broadcast to it, of the resistances.
+    """
     truth = np.stack([skin.displacement_m(presses, share) for share in shares])
     resistance = np.stack([skin.resistance_ohm(moved) for moved in truth])
     if gain is not None:
@@ -256,7 +265,7 @@ def stream(
     return Stream(frames, valid, noise, truth, force, presses)
 
 
-def random_press(
+def random_press(  # noqa: PLR0913 - keyword arguments, each a range
     rng: np.random.Generator,
     layout: PatchLayout,
     depth: float,
@@ -266,10 +275,17 @@ def random_press(
     margin: float = 2.0,
     where: Literal["inside", "edge", "half off"] = "inside",
 ) -> Press:
-    """A sphere of ``radius`` pitches (from, to) pressed in by ``depth`` heights, friction up to ``shear``.
+    """Return a random press by a sphere.
 
-    ``margin``: pitches between its centre and the border of the patch; on the ``edge`` the centre lies on
-    the border in x, ``half off`` half a contact radius outside.
+    Args:
+        rng: Source of chance.
+        layout: The patch.
+        depth: Depth in heights.
+        radius: Range of the radius, pitches.
+        shear: Maximum friction.
+        margin: Distance from the centre to the border of the patch, pitches.
+        where: ``inside``; or the centre on the border in x (``edge``), or half a contact radius outside
+            (``half off``).
     """
     pitch = layout.pitch_m
     points = layout.upper_m[..., :2].reshape(-1, 2)

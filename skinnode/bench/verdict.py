@@ -1,23 +1,23 @@
-"""Accurate, flagged or wrong: holds solved wires against the truth.
+"""Verdict on solved wires by the truth: accurate, flagged or wrong.
 
 A wire of a frame is
 
-flagged    its status is not CONVERGED: nothing was claimed
-accurate   CONVERGED, every coordinate within what was reported
-wrong      CONVERGED with a coordinate in error by more than it may be, or not finite under any status
+flagged    if its status is not CONVERGED: nothing was claimed
+accurate   if it is CONVERGED and every coordinate is within the reported uncertainty
+wrong      if it is CONVERGED with too large an error in a coordinate, or not finite under any status
 
-With noise an error may reach 5 reported deviations, and chance alone puts 6e-7 of all coordinates beyond.
-So that a long run is not condemned by chance, nor a fault excused by it, two things must hold in each row,
-both at a probability of 1e-4 for an honest Gaussian:
+With noise an error may reach 5 reported deviations; chance alone puts 6e-7 of all coordinates beyond. Chance
+must neither condemn a long run nor excuse a fault, so two conditions must hold in each row, both with a
+probability of 1e-4 for an honest Gaussian:
 
-- no coordinate beyond z(n), the deviations that one of n independent coordinates exceeds with 1e-4; no less
-  than 5. z is 5.7 for 9,000 coordinates, 6.4 for 1e6 (Bonferroni's bound: correlation only makes it safer)
-- among the seeds, which are independent whatever the coordinates are, no more with one beyond 5 than a
-  binomial allows whose probability is the expected number of such coordinates a seed (again a bound)
+- no coordinate is beyond z(n), the number of deviations that one of n independent coordinates exceeds with
+  probability 1e-4, but at least 5. z is 5.7 for 9,000 coordinates, 6.4 for 1e6 (Bonferroni's bound:
+  correlation only makes it safer)
+- no more seeds have a coordinate beyond 5 than a binomial allows whose probability is the expected number of
+  such coordinates a seed (again a bound); seeds are independent even though coordinates are not
 
-What is wrong by the second and not by the first counts in full: then every wire beyond 5 is wrong. With
-exact data nothing is left to chance: the limit is 5 reported deviations or 1e-6 of the wire's largest
-displacement, whichever is more.
+If the second condition fails, every wire beyond 5 is wrong. With exact data nothing is left to chance: the
+limit is 5 reported deviations or 1e-6 of the wire's largest displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 
 LIMIT: Final = 5.0
-"""Reported deviations an error may reach."""
+"""Maximum error in reported deviations."""
 CHANCE: Final = 1e-4
-"""Probability that an honest row is called wrong: some 350 rows, one false alarm in 30 runs."""
+"""Probability that an honest row is called wrong: with 350 rows, one false alarm in 30 runs."""
 EXACT_SHARE: Final = 1e-6
-"""Of the wire's largest displacement: tolerance with exact data."""
+"""Tolerance with exact data, as a share of the wire's largest displacement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """What a method made of the frames it was asked for."""
+    """Estimates of a method for the frames of a stream."""
 
     displacement_m: Float
     """(F, U, N, 3)"""
     std_m: Float
-    """(F, U, N, 3) reported deviation; a fifth of an error estimate where that is given instead."""
+    """(F, U, N, 3), reported standard deviation, or a fifth of an error estimate."""
     converged: NDArray[np.bool_]
     """(F, U)"""
 
     def equals(self, other: Solved) -> bool:
-        """Whether both are the same, bit for bit."""
+        """Return whether both are the same, bit for bit."""
         return (
             np.array_equal(self.displacement_m, other.displacement_m, equal_nan=True)
             and np.array_equal(self.std_m, other.std_m, equal_nan=True)
@@ -61,12 +61,12 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Probability that a normal variable lies farther than this from its mean."""
+    """Return the probability that a normal variable is more than ``deviations`` from its mean."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 
 def limit_of(coordinates: int) -> float:
-    """z(n) of the module's docstring."""
+    """Return z(n) of the module's docstring for n ``coordinates``."""
     from scipy.special import ndtri
 
     if coordinates == 0:
@@ -75,7 +75,7 @@ def limit_of(coordinates: int) -> float:
 
 
 def allowed_seeds(coordinates: int, seeds: int) -> int:
-    """Most seeds with a coordinate beyond 5 that chance explains."""
+    """Return the maximum number of seeds with a coordinate beyond 5 that chance explains."""
     from scipy.stats import binom
 
     if seeds == 0:
@@ -85,7 +85,7 @@ def allowed_seeds(coordinates: int, seeds: int) -> int:
 
 @dataclass
 class Tally:
-    """One row: a case solved by one method over the seeds."""
+    """Accumulates one row: a case solved by one method over the seeds."""
 
     exact: bool
     seeds: int = 0
@@ -100,7 +100,7 @@ class Tally:
     """(deviations, seed, frame, wire) of every wire beyond 5; inf for one that is not finite."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
-        """``truth_m``: (F, U, N, 3), of the frames that were solved; frames of NaN are not held to it."""
+        """Add a seed. ``truth_m`` (F, U, N, 3) is the truth of the frames; frames of NaN are left out."""
         self.seeds += 1
         kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
         truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]
@@ -121,8 +121,10 @@ class Tally:
         self._shares(np.where((converged & finite)[..., None, None], error, np.nan), std, truth_m)
 
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
-        """Error and deviation of the converged wires as shares of the displacement, in the deepest frame;
-        the worst error of any frame, as a share of the deepest one's displacement."""
+        """Add error and deviation of the converged wires in the deepest frame, as shares of the displacement.
+
+        The worst error is that of any frame, as a share of the displacement in the deepest frame.
+        """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])
         if used.any():
@@ -137,7 +139,7 @@ class Tally:
             self._worst_error = float(np.fmax(self._worst_error, worst))
 
     def row(self) -> dict[str, Any]:
-        """The figures, with the verdict."""
+        """Return the figures, with the verdict."""
         limit = LIMIT if self.exact else limit_of(self._coordinates)
         hit = {seed for _, seed, _, _ in self._deviations}
         by_count = self.exact or len(hit) > allowed_seeds(self._coordinates, self.seeds)
@@ -165,7 +167,7 @@ class Tally:
 
 
 def named(row: Mapping[str, Any]) -> str:
-    """One line on a row that is wrong: what, how much, and how to see it again."""
+    """Return one line about a wrong row: what is wrong, by how much, and how to reproduce it."""
     worst = row["worst"]
     far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} deviations"
     return (

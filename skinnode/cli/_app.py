@@ -1,5 +1,4 @@
-"""Subcommands of ``skinnode``, one file each. A file imports its dependencies only when its command runs, so
-that ``--help`` responds at once."""
+"""The typer application ``skinnode``: all subcommands under their names."""
 
 from __future__ import annotations
 

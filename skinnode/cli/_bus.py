@@ -1,71 +1,12 @@
-"""The bus a command works on: by its interface, or one of a hand file; and the node on it."""
+"""The bus that a command works on, from its options: an interface, or a bus of a hand file; and its node."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
-
-import typer
-
-from skinnode.errors import SkinError
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from skinnode.config import BusConfig, HandConfig, PatchConfig
-
-
-def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """What a shell offers for a node-ID: those of the hand, --hand or hand.toml where there is one, with the
-    names of their patches; else all."""
-    patches = _patches(ctx)
-    offered = [(str(patch.node_id), patch.name) for patch in patches]
-    return _beginning(incomplete, offered or [(str(node_id), "") for node_id in range(1, 128)])
-
-
-def nodes(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """The same, and the names of patches where --hand is given."""
-    named = _patches(ctx) if ctx.params.get("hand") is not None else []
-    return node_ids(ctx, incomplete) + _beginning(incomplete, [(p.name, f"node {p.node_id}") for p in named])
-
-
-def _patches(ctx: typer.Context) -> list[PatchConfig]:
-    from skinnode.config import load_hand
-
-    bus = ctx.params.get("bus")
-    try:
-        hand = load_hand(ctx.params.get("hand") or "hand.toml")
-    except (SkinError, OSError):  # a shell cannot be told what is wrong
-        return []
-    return [patch for patch in hand.patches if bus in (None, patch.bus)]
-
-
-def _beginning(incomplete: str, offered: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    return [(value, text) for value, text in offered if value.startswith(incomplete)]
-
-
-Interface = Annotated[
-    str | None, typer.Option(help="python-can interface; default socketcan.", metavar="NAME")
-]
-Channel = Annotated[str | None, typer.Option(help="Its channel; default can0.", metavar="NAME")]
-OtherInterface = Annotated[
-    str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
-]
-OtherChannel = Annotated[
-    str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
-]
-Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
-Fd = Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")]
-Hand = Annotated[
-    Path | None, typer.Option(help="Take the bus from this hand; patches by name.", metavar="HAND.toml")
-]
-Bus = Annotated[
-    str | None,
-    typer.Option(help="Bus of the hand; default: the bus of the patch, or all buses.", metavar="NAME"),
-]
-Node = Annotated[
-    str,
-    typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE", autocompletion=nodes),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
 class Place(NamedTuple):
@@ -80,7 +21,7 @@ class Place(NamedTuple):
         return () if self.hand is None else self.hand.patches_on(self.bus.name)
 
     def patch_name(self, node_id: int) -> str:
-        """What the hand calls the patch at that node-ID; empty for none."""
+        """Return the name of the patch at that node-ID, or an empty text."""
         return next((patch.name for patch in self.patches if patch.node_id == node_id), "")
 
 
@@ -92,8 +33,19 @@ def find_buses(
     hand: Path | None,
     bus: str | None,
 ) -> list[Place]:
-    """Return the bus that the options name, or every bus of the hand without ``--bus``. Raises ConfigError if
-    the options are not valid."""
+    """Return the bus that the options name, or every bus of the hand if ``--bus`` is not given.
+
+    Args:
+        interface: Value of ``--interface``.
+        channel: Value of ``--channel``.
+        bitrate: Value of ``--bitrate``, bits per second.
+        fd: Whether ``--fd`` is given.
+        hand: Value of ``--hand``.
+        bus: Value of ``--bus``.
+
+    Raises:
+        ConfigError: The options are not valid.
+    """
     from pydantic import ValidationError
 
     from skinnode.config import BusConfig
@@ -129,8 +81,11 @@ def find_bus(
     hand: Path | None,
     bus: str | None,
 ) -> Place:
-    """Return the one bus that the options name. Raises ConfigError if the options are not valid or leave
-    several buses."""
+    """Return the one bus that the options name; arguments as for :func:`find_buses`.
+
+    Raises:
+        ConfigError: The options are not valid or leave several buses.
+    """
     from skinnode.errors import NOTHING, ConfigError
 
     places = find_buses(interface, channel, bitrate, fd, hand, bus)
@@ -140,8 +95,7 @@ def find_bus(
 
 
 def _of_one_bus(plan: HandConfig, bus: str | None) -> HandConfig:
-    """Return the hand reduced to ``bus``, or the whole hand if ``bus`` is None. Raises ConfigError if the
-    hand has no such bus."""
+    """Return the hand reduced to ``bus``, or the whole hand if ``bus`` is None."""
     from skinnode.errors import ConfigError
 
     if bus is None:
@@ -153,8 +107,7 @@ def _of_one_bus(plan: HandConfig, bus: str | None) -> HandConfig:
 
 
 def _load(hand: Path, bitrate: int | None, fd: bool) -> HandConfig:
-    """Load a hand file. Raises ConfigError if the file is not valid, or if an option is given that cannot be
-    combined with a hand file."""
+    """Load a hand file, which cannot be combined with ``--bitrate`` or ``--fd``."""
     from skinnode.config import load_hand
     from skinnode.errors import ConfigError, Shown
 
@@ -173,17 +126,28 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and the node-ID of NODE; a patch of the hand is looked up on all its buses.
+    """Return the bus and the node-ID of NODE, a node-ID or the name of a patch on any bus of the hand.
 
-    Raises ConfigError if no patch has the name, or if the node-ID could be on several buses.
+    The other arguments are those of :func:`find_buses`.
+
+    Raises:
+        ConfigError: No patch has the name, or the node-ID could be on several buses.
     """
     places = find_buses(interface, channel, bitrate, fd, hand, bus)
     return node_among(node, places, "NODE")
 
 
 def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
-    """Return the one of ``places`` that has the node that ``node``, the value of ``key``, names, and its
-    node-ID. Raises ConfigError as :func:`find_node` does."""
+    """Return the bus and the node-ID of a node.
+
+    Args:
+        node: A node-ID or the name of a patch.
+        places: Buses where the node may be.
+        key: Argument that has the value ``node``, for errors.
+
+    Raises:
+        ConfigError: As :func:`find_node`.
+    """
     from skinnode.errors import ConfigError
 
     named = [(place, patch) for place in places for patch in place.patches]

@@ -1,4 +1,4 @@
-"""How the technician's commands talk: tables and text on stdout, progress on stderr if a person looks on."""
+"""Output of commands: tables and text on stdout, progress on stderr if it is a terminal."""
 
 from __future__ import annotations
 
@@ -20,20 +20,27 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Columns of a pipe, more than any line of skinnode has."""
+"""Width of a pipe in columns, more than any line of skinnode has."""
 
 
 def print_json(value: Any) -> None:
-    """One JSON document."""
+    """Print ``value`` as one JSON document."""
     from skinnode.text.json_values import plain
 
     typer.echo(json.dumps(plain(value), indent=2))
 
 
 def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
-    """Return the console of all commands. It prints square brackets and colons literally, because names
-    contain them; styles are arguments of ``print``. The console is as wide as the terminal. Output to a pipe
-    or file is not wrapped, so that programs read whole lines, unless ``COLUMNS`` sets a width."""
+    """Return the console of all commands.
+
+    It prints square brackets and colons literally, because names contain them; styles are arguments of
+    ``print``. The console is as wide as the terminal. Output to a pipe or file is not wrapped, so that
+    programs read whole lines, unless ``COLUMNS`` sets a width.
+
+    Args:
+        stderr: Print to stderr instead of stdout.
+        soft_wrap: Let the terminal wrap lines.
+    """
     return _console_type()(
         stderr=stderr,
         soft_wrap=soft_wrap,
@@ -52,14 +59,13 @@ def _width(stream: TextIO) -> int | None:
 
 @functools.cache
 def _console_type() -> type[Console]:
-    """Define the console class. Imports rich only when something is drawn, so that ``--help`` responds at
-    once."""
+    """Define the console class. Imports rich late, so that ``--help`` responds at once."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
     from rich.text import Text
 
     class PrintableConsole(Console):
-        """Console that escapes control characters; see :mod:`skinnode.text.printable`."""
+        """A console that escapes control characters; see :mod:`skinnode.text.printable`."""
 
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(printable_lines(text), **options)
@@ -74,7 +80,7 @@ def _console_type() -> type[Console]:
 
 
 def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
-    """An empty table without much ink; ``right``: columns of numbers."""
+    """Return an empty table with few rules; ``right`` names the columns of numbers, aligned right."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -85,7 +91,7 @@ def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
 
 
 def indented(text: str, columns: int = 10) -> Padding:
-    """Indent each line of ``text`` by ``columns``."""
+    """Return ``text`` with each line indented by ``columns``."""
     from rich.padding import Padding
 
     return Padding(text, (0, 0, 0, columns), expand=False)
@@ -93,7 +99,10 @@ def indented(text: str, columns: int = 10) -> Padding:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Tell what is being done, on one line of stderr that is gone in the end; nothing where nobody looks."""
+    """Yield a function that shows the current step on one line of stderr, erased at the end.
+
+    Nothing is shown if ``quiet``, or if stderr is not a terminal.
+    """
     if quiet or not sys.stderr.isatty():
         yield lambda text: None
         return

@@ -1,4 +1,4 @@
-"""Contacts of a field, as JSON."""
+"""Contacts of a field as JSON."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ if TYPE_CHECKING:
 
 
 def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
-    """Return the contacts, strongest first, in m, m² and N, each value with its standard deviation.
+    """Return the contacts of a field, strongest first, each value with its standard deviation.
 
-    Returns None if there is no field yet, or if the posterior did not produce it.
+    Returns:
+        Lengths in m, areas in m², forces in N; None if there is no field yet, or if the posterior did not
+        produce it.
     """
     if field is None or field.method != "posterior":
         return None

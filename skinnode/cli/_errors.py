@@ -1,11 +1,10 @@
-"""Reports a mistake on the command line as one line and status 2."""
+"""Runs a typer application and reports each error as one line on stderr, with exit status 2."""
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import typer
 
@@ -16,25 +15,15 @@ from skinnode.text.printable import PrintableStream
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # of click, or of typer's own copy of it
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 <= value < math.inf:
-        raise typer.BadParameter(f"{text!r} is not a number of seconds from 0 on")
-    return value
-
-
-Seconds = Annotated[
-    float | None,
-    typer.Option(parser=_seconds, help="End after this long; default: at Ctrl-C.", metavar="S"),
-]
-
-
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
-    """Run ``app`` and return its exit status. A SkinError or an invalid argument gives one line on stderr and
-    status 2."""
+    """Run ``app`` and return its exit status.
+
+    A SkinError, a file error or an invalid argument gives one line on stderr and status 2.
+
+    Args:
+        app: The application.
+        argv: Its arguments; default: those of the process.
+    """
     sys.stdout, sys.stderr = _printable(sys.stdout), _printable(sys.stderr)
     try:
         status = app(args=argv, standalone_mode=False)
@@ -54,8 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Return ``stream`` limited to printable text, with an escape for each character that its encoding
-    lacks."""
+    """Return ``stream`` limited to printable text, with escapes for characters that its encoding lacks."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
@@ -73,7 +61,7 @@ def _refused(line: str) -> int:
 
 
 def _wants_help(error: Any) -> bool:
-    """Whether a group was called without a command; then its help is what is wanted."""
+    """Return whether a group was called without a command; its help is then printed."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
     text = error.ctx.get_help()  # rich prints it by itself and returns nothing
@@ -83,14 +71,15 @@ def _wants_help(error: Any) -> bool:
 
 
 def usage_line(error: Any) -> str:
-    """``skinnode scan: --bitrate: got 'x', allowed: an integer``."""
+    """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
+
+    Typer's own text is kept, except about missing and bad values: it names neither what the argument means,
+    nor the value, nor the whole range.
+    """
     message = " ".join(error.format_message().split()).rstrip(".")
     param, kind = getattr(error, "param", None), type(error).__name__
-    if kind == "NoSuchOption":
-        perhaps = f" ({', '.join(error.possibilities)}?)" if error.possibilities else ""
-        message = f"got {error.option_name!r}, allowed: the options that --help lists{perhaps}"
-    elif param is not None and kind == "MissingParameter":
-        message = f"{_name(param)}: got nothing, allowed: {_values(param) or _meant(param)}"
+    if param is not None and kind == "MissingParameter":
+        message = f"{_name(param)}: got nothing, allowed: {_meaning(param)}"
     elif param is not None and kind == "BadParameter":
         got, _, allowed = message.rpartition(": ")[2].partition(" is not ")
         if error.__cause__ is not None and hasattr(error.__cause__, "errors"):  # pydantic converts for typer
@@ -102,21 +91,20 @@ def usage_line(error: Any) -> str:
 
 
 def _name(param: Any) -> str:
-    """As the user writes it: the option, or what the help calls the argument."""
+    """Return the name as the user writes it: the option, or the argument's name in the help."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper())
 
 
-def _meant(param: Any) -> str:
-    """The first sentence of its help."""
+def _meaning(param: Any) -> str:
+    """Return the first sentence of the help."""
     help_text = str(getattr(param, "help", None) or "a value").split(". ")[0].rstrip(".")
     return help_text[:1].lower() + help_text[1:]
 
 
 def _values(param: Any) -> str:
-    """Which numbers, or which words; empty for what is neither. From the parameter, or from its type as click
-    has it."""
+    """Return the allowed numbers or words; empty for other types. Typer keeps them in two places."""
     converter = getattr(param, "type", param)
     described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
     if get_origin(described) is Literal:
@@ -124,8 +112,6 @@ def _values(param: Any) -> str:
     name = described.__name__ if isinstance(described, type) else getattr(converter, "name", "")
     number = {"int": "an integer", "float": "a number"}.get(name.partition(" ")[0].replace("integer", "int"))
     low, high = getattr(converter, "min", None), getattr(converter, "max", None)
-    if number is None or low is high is None:
+    if number is None or low is None:
         return number or ""
-    if high is None:
-        return f"{number} of at least {low}"
-    return f"{number} up to {high}" if low is None else f"{number} from {low} to {high}"
+    return f"{number} of at least {low}" if high is None else f"{number} from {low} to {high}"

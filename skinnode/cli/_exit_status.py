@@ -11,9 +11,9 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-Nothing is printed about a signal, because its sender knows. Open resources are closed first. SIGHUP stays
-ignored if it was ignored at the start, as under nohup. The module imports nothing slow, so that its handlers
-are installed before anything else is loaded.
+Nothing is printed about a signal, because its sender knows of it. Open resources are closed first. SIGHUP
+stays ignored if it was ignored at the start, as under nohup. The module imports nothing slow, so that its
+handlers are installed before anything else is loaded.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ from types import FrameType
 from typing import Final, NoReturn
 
 FINE: Final = 0
-FAULT: Final = 1
 COULD_NOT_RUN: Final = 2
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def status_of(number: int) -> int:
-    """Return the exit status after signal ``number``, as shells count it."""
+    """Return the exit status after signal ``number``, by the convention of shells."""
     return 128 + number
 
 
@@ -42,8 +41,12 @@ class Stopped(SystemExit):
 
 
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
-    """Run the typer application ``app`` of ``module`` and exit with its status. From here on, signals end it
-    as the table says."""
+    """Run a typer application and exit with its status. From here on, signals end the process.
+
+    Args:
+        module: Module that holds the application as ``app``.
+        argv: Its arguments; default: those of the process.
+    """
     _handle(_exit_at_once)
     run: Callable[..., int] = import_module("skinnode.cli._errors").run
     app = import_module(module).app
@@ -59,7 +62,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Install ``handler`` for the signals. Call on the main thread; Python allows no other."""
+    """Install ``handler`` for the signals, if this is the main thread; Python allows no other."""
     import threading
 
     if threading.current_thread() is threading.main_thread():
@@ -73,8 +76,11 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Unwind the stack. During an import, some of Python's callbacks would lose the exception or print it.
-    While there is no other thread, nothing is open, so the process can exit at once."""
+    """Unwind the stack, or exit at once during an import while there is no other thread.
+
+    During an import, some of Python's callbacks would lose the exception or print it. While there is no other
+    thread, nothing is open.
+    """
     import threading
 
     if threading.active_count() == 1 and _imports(frame):
@@ -91,7 +97,7 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _flush(status: int) -> int:
-    """Flush the output. Returns ``status``, or that of SIGPIPE if the reader has closed the pipe."""
+    """Flush the output. Return ``status``, or that of SIGPIPE if the reader has closed the pipe."""
     try:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:
@@ -102,7 +108,7 @@ def _flush(status: int) -> int:
 
 
 def closed_pipe() -> int:
-    """Discard what stdout and stderr still buffer, and return the status for a reader that has gone."""
+    """Discard the buffers of stdout and stderr, and return the status for a reader that has gone."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for descriptor in (1, 2):
         os.dup2(nowhere, descriptor)

@@ -1,4 +1,4 @@
-"""``--layout``: the geometry of a patch, however the user has it."""
+"""``--layout``: the geometry of a patch, by preset, file or Python name."""
 
 from __future__ import annotations
 
@@ -21,9 +21,13 @@ def import_from_here() -> None:
 
 
 def find_layout(text: str) -> PatchLayout:
-    """The layout that ``text`` names: see HELP. MODULE:NAME is a PatchLayout, or a function that returns one.
+    """Return the layout that ``text`` names.
 
-    Raises ConfigError where there is none.
+    Args:
+        text: A preset, a file, or MODULE:NAME of a PatchLayout or of a function that returns one; see HELP.
+
+    Raises:
+        ConfigError: There is no such layout.
     """
     from skinnode.config import load_layout
     from skinnode.model.layout import PRESETS, PatchLayout

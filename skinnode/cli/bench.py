@@ -1,4 +1,7 @@
-"""``skinnode bench``: ratios taken in one run, never a judgement on an absolute time."""
+"""``skinnode bench``: the benchmarks.
+
+Ratios are formed within one run, because absolute times depend on the machine.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,12 @@ JsonFile = Annotated[
 PlotFile = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Draw the figures to FILE (needs matplotlib).")
 ]
-Rounds = Annotated[int, typer.Option(min=1, help="How often each candidate has its turn.")]
+Rounds = Annotated[int, typer.Option(min=1, help="Number of times that each candidate is measured.")]
 
 
 @app.command()
 def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """F + J and one step of each operator against NumPy; the dense kernels against LAPACK."""
+    """Time F + J and one step of each operator against NumPy, and the dense kernels against LAPACK."""
     from skinnode.bench import kernel as bench
 
     _prepare(json, plot)
@@ -44,7 +47,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """One wire to 1e-9 from a near start: ours, SciPy's and Ceres' solvers on the same compiled F and J."""
+    """Solve one wire to 1e-9 from a near start with our solvers, SciPy's and Ceres' on the same F and J."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)
@@ -68,11 +71,13 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
 def stability(
     json: JsonFile = None,
     plot: PlotFile = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Streams of each hard case.")] = 50,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that the cases are shared out to.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of streams for each hard case.")] = 50,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve cases in parallel.")] = 1,
 ) -> None:
-    """Every hard case over many seeds: error, deviation, status, verdict. Exit 1 if any ends CONVERGED and
-    wrong."""
+    """Solve every hard case over many seeds: error, deviation, status, verdict.
+
+    Exit status 1 if any case ends CONVERGED and wrong.
+    """
     from skinnode.bench import stability as bench
     from skinnode.bench.verdict import named
 
@@ -99,11 +104,15 @@ def stability(
 def accuracy(
     json: JsonFile = None,
     plot: PlotFile = None,
-    scenes: Annotated[int, typer.Option(min=1, help="Random scenes for each line of the coverage.")] = 200,
+    scenes: Annotated[
+        int, typer.Option(min=1, help="Random scenes for each line of the coverage table.")
+    ] = 200,
     rounds: Rounds = 31,
 ) -> None:
-    """Error against time, noise and code width; coverage of the intervals; time a frame. Exit 1 if a line
-    that must be reached is not; times, which are the machine's as well, fail nothing."""
+    """Measure error against time, noise and code width, coverage of the intervals, and time a frame.
+
+    Exit status 1 if a requirement is not met; times depend on the machine and do not count.
+    """
     from skinnode.bench import accuracy as bench
 
     _prepare(json, plot)
@@ -125,7 +134,7 @@ def path(
     plot: PlotFile = None,
     experiments: Annotated[int, typer.Option(min=1, help="Random presses for each setting.")] = 10,
 ) -> None:
-    """The paper's tables 2, 3 and 4 and figures 8 to 13, beside its printed values."""
+    """Repeat the tables 2, 3 and 4 and the figures 8 to 13 of the paper, beside its printed values."""
     from skinnode.bench import path as bench
     from skinnode.text.json_values import plain
 
@@ -147,11 +156,18 @@ def node(
         float, typer.Option(min=0.2, max=3600.0, help="Length of each measurement on the bus.")
     ] = 10.0,
     rounds: Rounds = 31,
-    interface: Annotated[str, typer.Option(help="Of python-can; virtual is in the process.")] = "virtual",
-    channel: Annotated[str | None, typer.Option(help="Default: one that nobody else has.")] = None,
+    interface: Annotated[
+        str, typer.Option(help="python-can interface; virtual stays in the process.")
+    ] = "virtual",
+    channel: Annotated[
+        str | None, typer.Option(help="Channel of the interface; default: an unused name.")
+    ] = None,
 ) -> None:
-    """A node's punctuality and cost: pacing of chunks, SYNC to first chunk, heartbeat on a full bus, µs a
-    frame."""
+    """Measure punctuality and cost of a node.
+
+    These are the pacing of chunks, the time from SYNC to the first chunk, the heartbeat on a full bus, and µs
+    a frame.
+    """
     from skinnode.bench import node as bench
 
     _prepare(json)
@@ -177,17 +193,17 @@ def pipeline(
     json: JsonFile = None,
     plot: PlotFile = None,
     seconds: Annotated[float, typer.Option(min=1, help="Length of each measurement.")] = 10.0,
-    short: Annotated[
-        bool, typer.Option("--short", help="Only the rows of which something is asked.")
-    ] = False,
+    short: Annotated[bool, typer.Option("--short", help="Only the rows that have a requirement.")] = False,
     interface: Annotated[str, typer.Option(help="udp, or socketcan: one bus, by --channel.")] = "udp",
-    channel: Annotated[str, typer.Option(help="Of socketcan.")] = "vcan0",
+    channel: Annotated[str, typer.Option(help="Channel of socketcan.")] = "vcan0",
     all_cores: Annotated[
-        bool, typer.Option("--all-cores", help="Do not keep the host to one core and the load to another.")
+        bool, typer.Option("--all-cores", help="Let host and load use all cores, instead of one core each.")
     ] = False,
 ) -> None:
-    """Four full buses and sixteen patches through a host: losses, latency, CPU. Exit 1 if anything was lost
-    or does not add up; times are said to be reached or not."""
+    """Run four full buses with sixteen patches through a host: losses, latency, CPU.
+
+    Exit status 1 if a frame was lost or a sum does not agree; times are reported, but do not count.
+    """
     from skinnode.bench import pipeline as bench
 
     if interface not in ("udp", "socketcan"):
@@ -218,15 +234,18 @@ def pipeline(
 @app.command()
 def soak(
     json: JsonFile = None,
-    minutes: Annotated[float, typer.Option(min=0.1, help="How long.")] = 10.0,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Length of the soak in minutes.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the faults: the same seed draws the same rounds.")] = 1,
     own_cache: Annotated[
         bool, typer.Option(hidden=True, help="Soak in this process, with the kernel cache as it is.")
     ] = False,
 ) -> None:
-    """Soak a simulated hand under random faults: frames of every kind dropped, a starved processor, a damaged
-    kernel cache at the start. The host must survive, every patch must recover, every sum must be exact, and
-    memory, threads and file descriptors must not grow. Exit 1 if not."""
+    """Run a simulated hand under random faults for minutes or hours.
+
+    Frames of every kind are dropped, the processor is starved, and the kernel cache is damaged at the start.
+    The host must survive, every patch must recover, every sum must be exact, and memory, threads and file
+    descriptors must not grow. Exit status 1 if not.
+    """
     from skinnode.bench import soak as bench
 
     if not own_cache:
@@ -243,7 +262,7 @@ def soak(
 
 
 def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
-    """Soak in a child process whose kernel cache is a damaged copy. Returns its exit status."""
+    """Soak in a child process whose kernel cache is a damaged copy, and return its exit status."""
     import subprocess
     import sys
     import tempfile
@@ -270,7 +289,7 @@ def _print_must(must: list[dict[str, Any]]) -> None:
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
-    """Refuse what could not be written, before the work; say why the first run takes longer."""
+    """Check that the files can be written; if kernels must be compiled, say that the run takes longer."""
     from skinnode.compiled.jit import is_cold
     from skinnode.files.output_file import require_writable
     from skinnode.files.plot_file import require_matplotlib

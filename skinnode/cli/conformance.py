@@ -1,4 +1,4 @@
-"""``skinnode conformance``: hold a CANopen node against the standard, case by case."""
+"""``skinnode conformance``: test a CANopen node against CiA 301, case by case."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import node_ids
+from skinnode.cli._options import node_ids
 
 if TYPE_CHECKING:
     from skinnode.conformance import Eds, Report
@@ -16,35 +16,36 @@ if TYPE_CHECKING:
 def conformance(
     node_id: Annotated[
         int | None,
-        typer.Option(min=1, max=127, help="The node.", metavar="N", autocompletion=node_ids),
+        typer.Option(
+            min=1, max=127, help="Node-ID of the node to test.", metavar="N", autocompletion=node_ids
+        ),
     ] = None,
     interface: Annotated[str, typer.Option(help="python-can interface.", metavar="NAME")] = "socketcan",
     channel: Annotated[str, typer.Option(help="Channel of the interface.", metavar="NAME")] = "can0",
     bitrate: Annotated[int, typer.Option(help="Bits per second.", metavar="BPS")] = 1_000_000,
-    fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")] = False,
+    fd: Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")] = False,
     eds: Annotated[
         Path | None,
-        typer.Option(help="Its data sheet; not needed for a patch of this project.", metavar="FILE"),
+        typer.Option(help="EDS of the node; not needed for a patch of this project.", metavar="FILE"),
     ] = None,
     only: Annotated[
-        str, typer.Option(help="Areas and cases, with commas: SDO,PDO-03.", metavar="NAMES")
+        str, typer.Option(help="Areas and cases, separated by commas: SDO,PDO-03.", metavar="NAMES")
     ] = "",
     junit: Annotated[Path | None, typer.Option(help="Write JUnit XML to this file.", metavar="FILE")] = None,
     html: Annotated[Path | None, typer.Option(help="Write an HTML report.", metavar="FILE")] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write all results and frames.", metavar="FILE")
+        Path | None, typer.Option("--json", help="Write all results and frames as JSON.", metavar="FILE")
     ] = None,
     list_cases: Annotated[
-        bool, typer.Option("--list", help="Print ids, titles and clauses, and end.")
+        bool, typer.Option("--list", help="Print IDs, titles and clauses of the cases, and exit.")
     ] = False,
 ) -> None:
-    """Test a node against CiA 301, 127 cases in raw frames, a line each.
+    """Test a node against CiA 301: 127 cases in raw frames, one line each.
 
-    It RESETS the node many times, starts and stops it, remaps its PDOs, stores
-    and restores its parameters, and puts back at the end what it changed: the
-    configuration is read first, and stored again where it differs from the
-    defaults. It commands all nodes and speaks for others: use a bus without
-    another master, best without another node, and a machine that may stand.
+    It RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
+    parameters. It reads the configuration first, and at the end restores what it changed. It sends commands
+    to all nodes and frames in their name: use a bus without another master, best without another node, on a
+    machine that may stop.
 
     Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
     """

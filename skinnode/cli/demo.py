@@ -16,10 +16,11 @@ __getattr__ = moved("skinnode.cli.demo", "skinnode.demo.hand")
 
 def demo(
     seconds: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="How long to press and slide.", metavar="S")
+        float, typer.Option(min=1.0, max=3600.0, help="Seconds to press and slide.", metavar="S")
     ] = 8.0,
     patches: Annotated[
-        int, typer.Option(min=1, max=MAX_PATCHES, help="How many patches of 10 × 10 electrodes.", metavar="N")
+        int,
+        typer.Option(min=1, max=MAX_PATCHES, help="Number of patches of 10 × 10 electrodes.", metavar="N"),
     ] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of scene and converter noise.", metavar="N")] = 1,
     json_file: Annotated[
@@ -31,9 +32,10 @@ def demo(
 ) -> None:
     """Press simulated patches and decode them from real CANopen traffic.
 
-    Each patch is a CANopen node on an embedded virtual bus; a spherical indenter presses and slides, the
-    host gathers the PDOs and solves. Exit status 1 if a scan was torn, a frame lost, or errors lie above the
-    uncertainty reported with them: RMS over the run above 1.15 of it, or a coordinate beyond 6 deviations.
+    Each patch is a CANopen node on an embedded virtual bus; a spherical indenter presses and slides, the host
+    gathers the PDOs and solves. Exit status 1 if a scan was torn, a frame was lost, or errors exceed the
+    reported uncertainty: an RMS error over the run above 1.15 times the reported one, or an error of a
+    coordinate above 6 standard deviations.
     """
     import json
 

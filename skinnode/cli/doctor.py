@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: what is wrong, how sure that is, and what to do."""
+"""``skinnode doctor [HAND.toml]``: find what is wrong, how certain that is, and what to do."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Interface, Json
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Interface, Json
 
 if TYPE_CHECKING:
     from skinnode.diagnose.facts import BusFacts
@@ -30,16 +30,15 @@ def doctor(
         ),
     ] = False,
     html: Annotated[
-        Path | None, typer.Option(help="Write a report with plots, one file.", metavar="FILE")
+        Path | None, typer.Option(help="Write a report with plots to one HTML file.", metavar="FILE")
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    It listens and reads, and does not disturb a hand that runs. The skin is judged
-    from scans: of a hand that does not run there are none without --active. Leave
-    the skin alone meanwhile. Exit status 0 if nothing was found, 1 if something
-    was, 2 if it could not run.
+    It listens and reads, and does not disturb a running hand. It checks the skin from scans, which a hand
+    that is not running sends only with --active. Do not touch the skin meanwhile. Exit status 0 if no fault
+    was found, 1 if one was, 2 if it could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -34,13 +34,11 @@ def eds(
         int | None, typer.Option(min=1, max=255, help="Electrodes of a lower wire M; default 10.")
     ] = None,
     layout: Annotated[
-        str | None, typer.Option(help=f"Sizes from a layout instead: {LAYOUT_HELP}", metavar="LAYOUT")
+        str | None, typer.Option(help=f"Take the sizes from a layout: {LAYOUT_HELP}", metavar="LAYOUT")
     ] = None,
     code_bits: Annotated[int, typer.Option(help="Width of a code: 16 or 24.", metavar="16|24")] = 16,
-    fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD.")] = False,
-    dcf: Annotated[
-        bool, typer.Option("--dcf", help="The configuration of one device; needs --node-id.")
-    ] = False,
+    fd: Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")] = False,
+    dcf: Annotated[bool, typer.Option("--dcf", help="Print the DCF of one node; needs --node-id.")] = False,
     node_id: Annotated[
         int | None, typer.Option(min=1, max=127, help="Node-ID of the DCF.", metavar="N")
     ] = None,
@@ -48,13 +46,14 @@ def eds(
         int | None, typer.Option(help="Bits per second in the DCF; default 1000000.", metavar="BPS")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write to this file instead.", metavar="FILE")
+        Path | None,
+        typer.Option("--output", "-o", help="Write to this file instead of stdout.", metavar="FILE"),
     ] = None,
 ) -> None:
     """Print the EDS or the DCF of a patch (CiA 306).
 
-    An EDS depends on nothing but the sizes, the code width and the bus. The files
-    of the reference patches are in eds/.
+    An EDS depends only on the sizes, the code width and the bus. The files of the reference patches are in
+    eds/.
     """
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable, write_text

@@ -1,4 +1,4 @@
-"""``skinnode hand``: a hand file before there is a hand: checked, described for editors, begun."""
+"""``skinnode hand``: check a hand file, print its JSON Schema, create a new one."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from skinnode.config import HandConfig
 
 app = typer.Typer(
-    help="Check a hand file and the load of its buses; its JSON Schema; begin one.", no_args_is_help=True
+    help="Check a hand file and its bus load, print its JSON Schema, or create one.", no_args_is_help=True
 )
 
 
 @app.command()
 def check(
     hand: Annotated[Path, typer.Argument(help="The hand to check.", metavar="HAND.toml")],
-    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Validate a hand file and the files it names, and work out what it needs of its buses.
+    """Validate a hand file and the files it names, and compute the load of its buses.
 
-    For each bus: the load of the plan with every frame at its longest and with random data, the worst-case
-    time from SYNC to the end of each patch's summary, and that against the SYNC period; and how long each
-    frame of `others` waits at worst. Nothing is opened.
-    Exit status 1 if a bus needs more than its max_load, 2 if the file cannot be used.
+    For each bus it prints the load of the plan with every frame at its longest and with random data, the
+    worst-case time from SYNC to the end of each patch's summary, as time and as share of the SYNC period, and
+    how long each frame of `others` waits at worst. No bus is opened. Exit status 1 if a bus needs more than
+    its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
@@ -147,7 +147,7 @@ def _scan_table(plan: BusPlan) -> Table:
 
 
 def _frame_table(plan: BusPlan) -> Table:
-    """One line a kind of frame: those of all patches together."""
+    """Return one line for each kind of frame, summed over all patches."""
     kinds: dict[str, list[float]] = {}
     for frame in plan.frames:
         sums = kinds.setdefault(frame.name.partition(" of ")[0], [0.0, 0.0, 0.0])
@@ -160,7 +160,7 @@ def _frame_table(plan: BusPlan) -> Table:
 
 
 def _other_table(plan: BusPlan) -> Table:
-    """How long each frame of others may be kept from the bus by all that has a lower identifier."""
+    """Return how long each frame of other devices may wait for frames of lower identifiers."""
     table = _table("others", "bytes", "every ms", "queued to passed ms")
     for frame in plan.others:
         worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"
@@ -172,14 +172,14 @@ def _remarks(plan: BusPlan) -> list[str]:
     late = [s.patch for s in plan.scans if s.worst_s is None or s.worst_s > plan.period_s]
     if not late:
         return []
-    return [f"note: at worst a scan of {', '.join(late)} is not over when the next SYNC comes"]
+    return [f"note: at worst a scan of {', '.join(late)} has not ended when the next SYNC comes"]
 
 
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of a hand file, for editors that complete and check TOML.
 
-    A file whose first line is `#:schema PATH` names it; the schema of this version is
+    A hand file refers to it in its first line, `#:schema PATH`; the schema of this version is
     skinnode/config/hand.schema.json.
     """
     from skinnode.config.schema import schema_text
@@ -189,7 +189,7 @@ def schema() -> None:
 
 @app.command()
 def new(
-    patches: Annotated[int, typer.Option(min=1, max=127, help="How many patches.", metavar="N")] = 4,
+    patches: Annotated[int, typer.Option(min=1, max=127, help="Number of patches.", metavar="N")] = 4,
     buses: Annotated[
         int, typer.Option(min=1, max=16, help="Number of buses that share the patches.", metavar="N")
     ] = 1,
@@ -238,7 +238,7 @@ name = "hand"
 period_ms = {period_ms}                    # one SYNC is one scan of every patch: {rate} a second
 
 [stream]
-partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"
+partial = "pass"                  # incomplete scans: "pass" them on with a mask, or "withhold"
 """
 _NEW_BUS = """
 [[buses]]

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._errors import Seconds
+from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
 
 if TYPE_CHECKING:
     from skinnode.cli._host_report import Report
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from skinnode.host import Host
 
 _LONGEST_WAIT_S = 0.1
-"""How long Ctrl-C may go unnoticed."""
+"""Maximum delay of Ctrl-C."""
 
 
 def host(
@@ -26,16 +25,16 @@ def host(
     interface: OtherInterface = None,
     channel: OtherChannel = None,
     seconds: Seconds = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
+    as_json: JsonLines = False,
 ) -> None:
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
-    With --json each patch has `contacts` (null unless solver.method is "posterior"):
-    centroid, area, normal and shear force with standard deviations, in m, m² and N.
-    Ctrl-C ends it; the nodes are left pre-operational. Exit status 1 if a patch was not operational at the
-    end, a scan was torn or a frame lost (unless its node reported that its computer was too slow), an
-    interface failed or reported errors, or a guest heard no SYNC; 2 if the hand could not be run, or if a
-    node sent frames whose content does not match their identifier.
+    With --json each patch has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
+    and shear force with standard deviations, in m, m² and N. Ctrl-C ends it and leaves the nodes
+    pre-operational. Exit status 1 if a patch was not operational at the end, a scan was torn or a frame lost
+    (unless its node reported that its computer was too slow), an interface failed or reported errors, or a
+    guest heard no SYNC; 2 if the hand could not be run, or if a node sent frames whose content does not match
+    their identifier.
     """
     from skinnode.cli._host_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold

@@ -1,4 +1,4 @@
-"""``skinnode info NODE``: one node on one screen."""
+"""``skinnode info NODE``: all about one node on one screen."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
 
 if TYPE_CHECKING:
     from skinnode.diagnose.node_info import NodeInfo, PatchInfo
@@ -26,10 +26,10 @@ def info(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Tell everything about one node: identity, layout, baseline, errors, PDOs, wires, configuration.
+    """Print identity, layout, baseline, errors, PDOs, wires and configuration of one node.
 
-    Only reads. Exit status 0 if the node says that all is well, 1 if it has an
-    error, wires at fault or no baseline; 2 if it does not answer.
+    It only reads. Exit status 0 if the node reports no fault, 1 if it has an error, faulty wires or no
+    baseline; 2 if it does not answer.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress

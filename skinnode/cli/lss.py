@@ -1,4 +1,4 @@
-"""``skinnode lss``: node-ID and bit rate of nodes that have no switches."""
+"""``skinnode lss``: give node-ID and bit rate to nodes that have no switches."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, node_ids
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, node_ids
 
 if TYPE_CHECKING:
     from skinnode.canopen.lss import LssAddress
@@ -26,7 +26,7 @@ def list_nodes(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Find all nodes without a node-ID, by fastscan, on one bus or on all of --hand. Changes nothing."""
+    """Find all nodes without a node-ID by LSS fastscan, on one bus or all of --hand. Changes nothing."""
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import console, print_json, progress, table
     from skinnode.diagnose.bus_connection import BusConnection
@@ -68,13 +68,13 @@ def set_node(
     ] = None,
     node_id: Annotated[
         int | None,
-        typer.Option(min=1, max=127, help="Its new node-ID.", metavar="N", autocompletion=node_ids),
+        typer.Option(min=1, max=127, help="New node-ID.", metavar="N", autocompletion=node_ids),
     ] = None,
     bit_rate: Annotated[
-        int | None, typer.Option(help="Its bit rate from its next power-on on.", metavar="BPS")
+        int | None, typer.Option(help="New bit rate, used from the next power-on.", metavar="BPS")
     ] = None,
     store: Annotated[
-        bool, typer.Option(help="Store both, so that the node keeps them across a power cycle.")
+        bool, typer.Option(help="Store both, so that the node keeps them without power.")
     ] = True,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
     vendor: Annotated[
@@ -96,8 +96,8 @@ def set_node(
 ) -> None:
     """Set node-ID or bit rate of one node, and store them.
 
-    A node that has a node-ID is reset to take the new one. Exit status 0 if all
-    was done, 1 if the node did not store or boot, 2 if it could not be done.
+    A node that has a node-ID is reset so that it takes the new one. Exit status 0 if all was done, 1 if the
+    node did not store or did not boot, 2 if nothing could be done.
     """
     from skinnode.canopen import indices as od
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress
@@ -112,7 +112,7 @@ def set_node(
     if bit_rate is not None and bit_rate not in BIT_RATES_BPS.values():
         allowed = ", ".join(str(rate) for rate in BIT_RATES_BPS.values())
         raise ConfigError("--bit-rate", bit_rate, allowed)
-    place = _meant(find_buses(interface, channel, bitrate, fd, hand, bus), serial, node_id)
+    place = _bus_of(find_buses(interface, channel, bitrate, fd, hand, bus), serial, node_id)
     with BusConnection(place.bus) as connection:
         if serial is None:
             with progress(as_json) as tell:
@@ -144,9 +144,8 @@ def set_node(
         raise typer.Exit(1)
 
 
-def _meant(places: list[Place], serial: int | None, node_id: int | None) -> Place:
-    """Return the bus of the patch with this serial number, or else with this node-ID. Raises ConfigError if
-    several buses match."""
+def _bus_of(places: list[Place], serial: int | None, node_id: int | None) -> Place:
+    """Return the bus of the patch with this serial number, or else with this node-ID."""
     from skinnode.errors import NOTHING, ConfigError
 
     for number, key in ((serial, "serial"), (node_id, "node_id")):
@@ -167,7 +166,7 @@ def _confirmed(
     if node_id is not None:
         changes.append(f"node-ID {before or 'none'} → {node_id}")
     if bit_rate is not None:
-        changes.append(f"bit rate → {bit_rate} from its next power-on on")
+        changes.append(f"bit rate → {bit_rate} from the next power-on")
     changes.append("stored" if store else "not stored")
     return bool(typer.confirm(f"serial {serial}: {', '.join(changes)}. Do it?", err=True))
 
@@ -177,7 +176,7 @@ def _print(done: Commissioned) -> None:
     if done.node_id is not None:
         what.append(f"node-ID {done.node_id_before or 'none'} → {done.node_id}")
     if done.bitrate_bps is not None:
-        what.append(f"bit rate {done.bitrate_bps} from its next power-on on")
+        what.append(f"bit rate {done.bitrate_bps} from the next power-on")
     what.append("stored" if done.stored else "not stored")
     typer.echo(f"serial {done.address.serial_number}: {', '.join(what)}")
     for fault in done.faults:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skinnode.cli._options import OtherChannel, OtherInterface
+
 if TYPE_CHECKING:
     import threading
 
@@ -18,22 +20,18 @@ if TYPE_CHECKING:
     from skinnode.monitor.source import Source
 
 _SIMULATED = 4
-"""Patches of the hand that is simulated where no file says which."""
+"""Number of patches to simulate if no hand file is given."""
 
 
 def monitor(
     hand: Annotated[
-        Path | None, typer.Argument(help="The hand to run and to look at.", metavar="[HAND.toml]")
+        Path | None, typer.Argument(help="The hand to run and show.", metavar="[HAND.toml]")
     ] = None,
-    interface: Annotated[
-        str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
-    ] = None,
-    channel: Annotated[
-        str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
-    ] = None,
+    interface: OtherInterface = None,
+    channel: OtherChannel = None,
     replay: Annotated[
         Path | None,
-        typer.Option(help="Look at a recording of `skinnode record`.", metavar="RECORDING"),
+        typer.Option(help="Show a recording of `skinnode record`.", metavar="RECORDING"),
     ] = None,
     speed: Annotated[
         float | None, typer.Option(help="Speed of --replay: 2 is twice as fast; default 1.", metavar="X")
@@ -41,27 +39,26 @@ def monitor(
     simulate: Annotated[
         bool,
         typer.Option(
-            "--simulate", help="Press simulated patches on a bus of their own: those of the hand, or four."
+            "--simulate",
+            help="Press simulated patches on a private bus: the hand's patches, or four if no hand is given.",
         ),
     ] = False,
     output: Annotated[
         str,  # an empty one is no folder
-        typer.Option("--output", "-o", help="Where the key r records to.", metavar="FOLDER"),
+        typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
     ] = ".",
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after this long; default: at q.", metavar="S")
+        float | None, typer.Option(min=0.0, help="End after this many seconds; default: at q.", metavar="S")
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="No screen: a JSON object a second, for programs.")
+        bool, typer.Option("--json", help="Print one JSON object a second instead of a screen.")
     ] = False,
 ) -> None:
     """Show a hand on the terminal: height and shear, touches, health, rates, load, events.
 
-    It runs the hand as `skinnode host` does, but waits for missing patches. Keys:
-    1-9 choose a patch, z shows it alone, t tares it, r records, space holds the
-    picture, ? helps, q quits. Needs the extra `tui`. Exit status 0 if nothing was
-    wrong while it ran, 1 if something was (printed at the end), 2 if it could not
-    run.
+    It runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 choose a patch, z shows
+    it alone, t tares it, r records, space holds the picture, ? helps, q quits. It needs the extra `tui`. Exit
+    status 0 if there was no fault, 1 if there was one (printed at the end), 2 if it could not run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 
@@ -70,7 +67,7 @@ def monitor(
     if (hand is not None or simulate) == (replay is not None):
         got = NOTHING if replay is None else Shown("both it and --replay")
         raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
-    _require_use(interface, channel, speed, played=replay is not None, simulated=simulate)
+    _require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise ConfigError("--output", output, "a folder; the first recording creates it")
     from skinnode.host import BringUpCancelled
@@ -92,10 +89,10 @@ def monitor(
         raise typer.Exit(1)
 
 
-def _require_use(
+def _require_used(
     interface: str | None, channel: str | None, speed: float | None, *, played: bool, simulated: bool
 ) -> None:
-    """Raises ConfigError for an option that what is looked at has no use for."""
+    """Raise ConfigError for an option that a recording or a simulated hand does not use."""
     from skinnode.errors import ConfigError
 
     if speed is not None and not played:
@@ -107,7 +104,7 @@ def _require_use(
 
 
 def _require_screen() -> None:
-    """Raises ConfigError where there is no terminal, or nothing to draw on it with."""
+    """Raise ConfigError if there is no terminal, or textual is not installed."""
     from importlib.util import find_spec
 
     from skinnode.errors import ConfigError, Shown
@@ -120,7 +117,7 @@ def _require_screen() -> None:
 
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """The hand to run, missing patches waited for."""
+    """Return the hand to run; its host waits for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 
@@ -128,7 +125,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
         plan = load_hand(hand).on(interface, channel)
     else:
         plan = demo_hand(_SIMULATED, seed=1)
-        # forces are the posterior's to tell
+        # only the posterior has forces
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
     if simulate:
@@ -142,7 +139,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """A host of that hand; ``stack`` ends it. Raises as :meth:`Host.from_config`."""
+    """Return a source that runs a host; ``stack`` closes it. Raises as :meth:`Host.from_config`."""
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
@@ -170,7 +167,7 @@ def _running(
 
 
 def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """A recording that is played; ``stack`` ends it. Raises ConfigError."""
+    """Return a source that plays a recording; ``stack`` closes it."""
     from skinnode.monitor.source import ReplaySource
     from skinnode.record import replay
 
@@ -178,7 +175,7 @@ def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:
-    """The screen; what was wrong meanwhile. Raises the SkinError that ended the source."""
+    """Run the screen, and return the faults. Raises the SkinError that ended the source."""
     from skinnode.monitor.app import MonitorApp, terminal_colours
 
     app = MonitorApp(
@@ -187,15 +184,15 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
     app.run(mouse=False)  # the terminal's own: text can be selected and copied
     if app.failure is not None:
         raise app.failure
-    if app.return_code:  # a defect of the screen; what it was is on the terminal
+    if app.return_code:  # a defect of the screen, which textual has printed
         raise typer.Exit(2)
-    if app.terminal_is_deaf:  # nobody could read what was wrong
+    if app.terminal_is_deaf:  # output would not be seen
         raise typer.Exit(1 if app.faults.lines else 0)
     return app.faults.lines
 
 
 def _print(source: Source, stop: threading.Event, seconds: float | None) -> list[str]:
-    """A line of JSON a second; what was wrong meanwhile. Raises the SkinError that ended the source."""
+    """Print a line of JSON a second, and return the faults. Raises the SkinError that ended the source."""
     from skinnode.monitor.report import FaultBook, watch
     from skinnode.text.json_values import plain
 

@@ -1,4 +1,4 @@
-"""``skinnode nmt NODE|all COMMAND``: change the NMT state of nodes, and see whether they follow."""
+"""``skinnode nmt NODE|all COMMAND``: change the NMT state of nodes, and check that they follow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
 
 if TYPE_CHECKING:
     from skinnode.cli._bus import Place
@@ -17,8 +17,8 @@ _COMMANDS = "start stop pre-operational reset-node reset-communication"
 
 
 def _nodes_or_all(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    everybody = [("all", "every node of the bus")] if "all".startswith(incomplete) else []
-    return nodes(ctx, incomplete) + everybody
+    every_node = [("all", "every node of the bus")] if "all".startswith(incomplete) else []
+    return nodes(ctx, incomplete) + every_node
 
 
 def nmt(
@@ -39,7 +39,7 @@ def nmt(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Start, stop or reset nodes; tell their state before and after, from heartbeat or guarding.
+    """Start, stop or reset nodes, and print their state before and after, from heartbeat or guarding.
 
     `all` means every node of the bus, or of every bus of --hand.
 

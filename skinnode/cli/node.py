@@ -1,4 +1,4 @@
-"""``skinnode node``: a Linux board with a converter is a patch of skin on a CAN bus."""
+"""``skinnode node``: run a Linux board with a converter as a patch of skin on a CAN bus."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._errors import Seconds
 from skinnode.cli._layout_option import HELP as LAYOUT_HELP
+from skinnode.cli._options import JsonLines, Seconds
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 def node(
     source: Annotated[
         str,
-        typer.Option(help="What measures: MODULE:NAME, or a name that a package registered.", metavar="NAME"),
+        typer.Option(
+            help="Source of resistances: MODULE:NAME, or a name that a package registered.", metavar="NAME"
+        ),
     ],
     node_id: Annotated[
         int | None,
@@ -38,7 +40,9 @@ def node(
     bitrate: Annotated[
         int, typer.Option(min=10_000, max=1_000_000, help="Bits per second.", metavar="BPS")
     ] = 1_000_000,
-    fd: Annotated[bool, typer.Option("--fd", help="PDOs over CAN FD, with bit-rate switch.")] = False,
+    fd: Annotated[
+        bool, typer.Option("--fd", help="Send PDOs in CAN FD frames with bit-rate switch.")
+    ] = False,
     data_bitrate: Annotated[
         int, typer.Option(min=10_000, max=8_000_000, help="Data bit rate of CAN FD frames.", metavar="BPS")
     ] = 5_000_000,
@@ -48,21 +52,22 @@ def node(
     ] = 0,
     store: Annotated[
         Path | None,
-        typer.Option(help="Keeps configuration, baseline and node-ID while it is off.", metavar="FILE"),
+        typer.Option(
+            help="File that keeps configuration, baseline and node-ID without power.", metavar="FILE"
+        ),
     ] = None,
     strict_timing: Annotated[
-        bool, typer.Option("--strict-timing", help="Timers to 0.2 ms instead of 2 ms; takes CPU.")
+        bool, typer.Option("--strict-timing", help="Time to 0.2 ms instead of 2 ms; needs more CPU.")
     ] = False,
     seconds: Seconds = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
+    as_json: JsonLines = False,
 ) -> None:
     """Run one patch as a CANopen node; its resistances come from your source.
 
-    A source is a class, or a function, that takes the layout and gives an object
-    whose read(t_ns) returns (U, K) ohms. `--source simulated` needs no hardware.
-    Ctrl-C ends it. A line a second says how it does. Exit status 1 if the source
-    failed, scans were skipped, frames not sent, another node had its node-ID or
-    what --store names was of no use; 2 if it could not run.
+    A source is a class or function that takes the layout and returns an object whose read(t_ns) returns (U,
+    K) ohms. `--source simulated` needs no hardware. It reports every second until Ctrl-C. Exit status 1 if
+    the source failed, scans were skipped, frames were not sent, another node had its node-ID or the file of
+    --store could not be used; 2 if it could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here
@@ -108,7 +113,7 @@ def node(
         with without_long_collections(), NodeRunner(port, [board]) as runner:
             where = f"{interface} {channel}{', CAN FD' if fd else ''}"
             sizes = f"{profile.rows} × {profile.columns} wires, {code_bits}-bit codes"
-            who = _who(board.node_id, node_id)
+            who = _node_text(board.node_id, node_id)
             _note(f"{who} ({sizes}, source {source}) on {where}; Ctrl-C ends", as_json)
             _watch(runner, port, stop, seconds, as_json)
         faults = _faults(_progress(runner, port, 0.0))
@@ -120,7 +125,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Yield the memory in ``store``, claimed for this process. Raises ConfigError if it cannot be claimed."""
+    """Yield the memory in ``store``, claimed for this process."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory import FileMemory
@@ -146,8 +151,8 @@ def _memory(store: Path | None) -> Iterator[FileMemory | None]:
         yield memory
 
 
-def _who(node_id: int, given: int | None) -> str:
-    """The node-ID in use: one that LSS has stored counts, not the one of --node-id."""
+def _node_text(node_id: int, given: int | None) -> str:
+    """Return the node-ID in use: a node-ID stored by LSS has priority over --node-id."""
     from skinnode.canopen.lss import NOT_CONFIGURED
 
     who = "node without a node-ID" if node_id == NOT_CONFIGURED else f"node {node_id}"
@@ -156,11 +161,11 @@ def _who(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Where the node stands; all counts from its start."""
+    """Progress of the node; all counts are from its start."""
 
     elapsed_s: float
     node_id: int | None
-    """None while LSS has not given one."""
+    """None while the node has no node-ID."""
     state: str
     scans: int
     frames: int
@@ -194,7 +199,7 @@ def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
 
 
 def _faults(end: _Progress) -> list[str]:
-    """What was not as it should be, one line each."""
+    """Return the faults so far, one line each."""
     counts = (
         (end.source_failures, "failure", "failures", f" of the source, the last: {end.source_error}"),
         (end.overruns, "scan", "scans", " skipped because earlier ones were still being sent"),
@@ -213,7 +218,7 @@ def _faults(end: _Progress) -> list[str]:
 def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """A line a second until stopped, time is up, or the thread of the node has ended."""
+    """Print a line a second until stopped, time is up, or the thread of the node has ended."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0

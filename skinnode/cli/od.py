@@ -1,4 +1,4 @@
-"""``skinnode od NODE [INDEX[:SUB]]``: the object dictionary of a node, read, written, dumped and compared."""
+"""``skinnode od NODE [INDEX[:SUB]]``: read, write, dump and compare the object dictionary of a node."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, Node
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from skinnode.cli._bus import Place
     from skinnode.conformance.eds_reader import EdsEntry
     from skinnode.diagnose.data_sheet import DataSheet
     from skinnode.diagnose.object_dictionary import Difference, Reading
@@ -30,19 +33,23 @@ def od(
     hand: Hand = None,
     bus: Bus = None,
     write: Annotated[
-        str | None, typer.Option(help="Write this, typed as the EDS says, and read it back.", metavar="VALUE")
+        str | None,
+        typer.Option(help="Write this value, with the type of the EDS, and read it back.", metavar="VALUE"),
     ] = None,
     as_hex: Annotated[
-        bool, typer.Option("--hex", help="Show and take values as raw bytes in hexadecimal.")
+        bool, typer.Option("--hex", help="Print and accept values as raw bytes in hexadecimal.")
     ] = False,
     eds: Annotated[
-        Path | None, typer.Option(help="Names and types; not needed for a patch of ours.", metavar="FILE")
+        Path | None,
+        typer.Option(
+            help="EDS with names and types; not needed for a patch of this project.", metavar="FILE"
+        ),
     ] = None,
     dcf: Annotated[
-        Path | None, typer.Option(help="Write all that can be configured as a DCF.", metavar="FILE")
+        Path | None, typer.Option(help="Write all configurable values to a DCF.", metavar="FILE")
     ] = None,
     diff: Annotated[
-        Path | None, typer.Option(help="Show what differs from this EDS or DCF.", metavar="FILE")
+        Path | None, typer.Option(help="Print the differences from this EDS or DCF.", metavar="FILE")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -54,55 +61,27 @@ def od(
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
     from skinnode.diagnose.bus_connection import BusConnection
-    from skinnode.diagnose.data_sheet import data_sheet_of, load_data_sheet
-    from skinnode.diagnose.dcf import expected
-    from skinnode.diagnose.object_dictionary import (
-        compare,
-        dump,
-        dump_standard,
-        entries_at,
-        parse_address,
-    )
-    from skinnode.errors import ConfigError
+    from skinnode.diagnose.data_sheet import data_sheet_of
+    from skinnode.diagnose.object_dictionary import parse_address
     from skinnode.files.output_file import require_writable
 
     place, node_id = find_node(node, interface, channel, bitrate, fd, hand, bus)
     where = None if address is None else parse_address(address)
-    if write is not None and where is None:
-        raise ConfigError("--write", write, "only with INDEX[:SUB]")
-    if diff is not None and (where is not None or write is not None or dcf is not None):
-        raise ConfigError("--diff", str(diff), "only by itself, because it compares the whole dictionary")
-    if dcf is not None and where is not None:
-        raise ConfigError("--dcf", str(dcf), "only without INDEX, because it takes the whole dictionary")
+    _require_combination(where, write, dcf, diff)
+    if diff is not None:
+        _diff(place, node_id, diff, as_json)
+        return
     if dcf is not None:
         require_writable("--dcf", dcf)
-    wanted = None
-    if diff is not None:
-        compared = load_data_sheet(diff)
-        _note(compared)
-        wanted = expected(compared)
-    with progress(as_json) as tell, BusConnection(place.bus) as line:
-        remote = line.od(node_id)
-        line.require_answer(node_id)
-        if wanted is not None:
-            found = compare(remote, wanted, node_id, tell)
+    with progress(as_json) as tell, BusConnection(place.bus) as connection:
+        remote = connection.od(node_id)
+        connection.require_answer(node_id)
+        sheet = data_sheet_of(remote, eds) if dcf is not None else _sheet_if_any(remote, eds)
+        _note(sheet)
+        if where is None:
+            readings = _dump(remote, sheet, tell)
         else:
-            sheet = data_sheet_of(remote, eds) if dcf is not None else _sheet_if_any(remote, eds)
-            _note(sheet)
-            if where is None:
-                bare = not sheet.eds.entries
-                readings = list(dump_standard(remote, tell) if bare else dump(remote, sheet.eds, tell))
-            else:
-                index = where[0]
-                entries = entries_at(sheet.eds, *where, lambda: int(remote.read(index, 0, "u8")))
-                if write is not None:
-                    _write(remote, entries, write, as_hex, node_id)
-                readings = _read(remote, entries)
-    if wanted is not None:
-        _tell_differences(found, as_json)
-        if found:
-            raise typer.Exit(1)
-        return
+            readings = _access(remote, sheet, where, write, as_hex, node_id)
     if dcf is not None:
         _write_dcf(dcf, readings, sheet, node_id, place.bus.bitrate_bps, place.patch_name(node_id))
     elif as_json:
@@ -113,14 +92,74 @@ def od(
             typer.echo(f"note: node {node_id} is not a skinnode patch; --eds FILE names all its objects")
 
 
+def _require_combination(
+    where: tuple[int, int | None] | None, write: str | None, dcf: Path | None, diff: Path | None
+) -> None:
+    """Raise ConfigError for options that exclude each other."""
+    from skinnode.errors import ConfigError
+
+    if write is not None and where is None:
+        raise ConfigError("--write", write, "only with INDEX[:SUB]")
+    if diff is not None and (where is not None or write is not None or dcf is not None):
+        raise ConfigError("--diff", str(diff), "only by itself, because it compares the whole dictionary")
+    if dcf is not None and where is not None:
+        raise ConfigError("--dcf", str(dcf), "only without INDEX, because it takes the whole dictionary")
+
+
+def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
+    """Compare the whole dictionary with ``file``; exit status 1 if they differ."""
+    from skinnode.cli._console import progress
+    from skinnode.diagnose.bus_connection import BusConnection
+    from skinnode.diagnose.data_sheet import load_data_sheet
+    from skinnode.diagnose.dcf import expected
+    from skinnode.diagnose.object_dictionary import compare
+
+    sheet = load_data_sheet(file)
+    _note(sheet)
+    wanted = expected(sheet)
+    with progress(as_json) as tell, BusConnection(place.bus) as connection:
+        connection.require_answer(node_id)
+        found = compare(connection.od(node_id), wanted, node_id, tell)
+    _print_differences(found, as_json)
+    if found:
+        raise typer.Exit(1)
+
+
+def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
+    """Read the whole dictionary: the objects of the sheet, or of CiA 301 if the sheet has none."""
+    from skinnode.diagnose.object_dictionary import dump, dump_standard
+
+    return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
+
+
+def _access(
+    remote: RemoteOd,
+    sheet: DataSheet,
+    where: tuple[int, int | None],
+    write: str | None,
+    as_hex: bool,
+    node_id: int,
+) -> list[Reading]:
+    """Write an object if ``write`` is given, and read it."""
+    from skinnode.diagnose.object_dictionary import entries_at
+
+    entries = entries_at(sheet.eds, *where, lambda: int(remote.read(where[0], 0, "u8")))
+    if write is not None:
+        _write(remote, entries, write, as_hex, node_id)
+    return _read(remote, entries)
+
+
 def _note(sheet: DataSheet) -> None:
     if sheet.note:
         typer.echo(f"note: {sheet.note}", err=True)
 
 
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
-    """Return the sheet of the node. It has no entries for a third-party device without an EDS, or a node that
-    refuses to say which it is: CiA 301 then names the objects."""
+    """Return the data sheet of the node.
+
+    It has no entries for a third-party device without an EDS, or for a node that refuses to identify itself;
+    CiA 301 then names the objects.
+    """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of
     from skinnode.errors import NodeError, ProfileError
@@ -137,7 +176,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """One object alone must be there; of several the refusal of one is told beside the others."""
+    """Read the objects. A single object must be readable; of several, a refused one is listed as refused."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":
@@ -204,7 +243,7 @@ def _print(readings: list[Reading], as_hex: bool, *, single: bool) -> None:
     out.print(listed)
 
 
-def _tell_differences(found: list[Difference], as_json: bool) -> None:
+def _print_differences(found: list[Difference], as_json: bool) -> None:
     from dataclasses import asdict
 
     from skinnode.cli._console import console, print_json, table

@@ -1,4 +1,4 @@
-"""``skinnode record hand.toml -o FOLDER``: run a hand and write down every frame."""
+"""``skinnode record hand.toml -o FOLDER``: run a hand and record every frame."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from skinnode.cli._bus import OtherChannel, OtherInterface
-from skinnode.cli._errors import Seconds
+from skinnode.cli._options import JsonLines, OtherChannel, OtherInterface, Seconds
 from skinnode.text.words import counted
 
 if TYPE_CHECKING:
@@ -35,22 +34,25 @@ def record(
     ],
     kind: Annotated[
         Literal["log", "blf"],
-        typer.Option("--format", help="In a folder: candump's text, or Vector's BLF.", metavar="log|blf"),
+        typer.Option(
+            "--format", help="Format in a folder: candump's text, or Vector's BLF.", metavar="log|blf"
+        ),
     ] = "log",
     listen: Annotated[
-        bool, typer.Option("--listen", help="Send nothing, solve nothing: only write down what is heard.")
+        bool,
+        typer.Option("--listen", help="Send nothing and solve nothing; only record the frames received."),
     ] = False,
     interface: OtherInterface = None,
     channel: OtherChannel = None,
     seconds: Seconds = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line instead of text.")] = False,
+    as_json: JsonLines = False,
 ) -> None:
     """Run a hand's patches as `skinnode host` does and record every frame, received and sent.
 
-    Play it with `skinnode replay`; candump's tools and python-can read it too. Killed at any moment, it reads
-    up to the last second. What --listen writes has no baselines, so no fields can be made of it: it is for
-    candump's tools. Exit status 1 if frames could not be written, or for what is a fault of `skinnode host`;
-    2 if it could not run.
+    Play it with `skinnode replay`; candump's tools and python-can read it too. If it is killed at any moment,
+    the recording can be read up to the last second. A recording with --listen has no baselines and thus no
+    fields; it is for candump's tools. Exit status 1 if frames could not be written, or for a fault of
+    `skinnode host`; 2 if it could not run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
@@ -71,7 +73,7 @@ def record(
 def _run(
     plan: HandConfig, recorder: Recorder, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
-    """What was wrong meanwhile, a line each."""
+    """Run the hand, and return its faults, one line each."""
     from skinnode.cli._host_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.scan_solver import check_solvable
@@ -119,7 +121,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """A line a second until stopped or time is up; ``check`` raises what ends it early."""
+    """Print a line a second until stopped or time is up; ``check`` raises to end it early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

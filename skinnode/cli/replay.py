@@ -1,4 +1,4 @@
-"""``skinnode replay RECORDING``: the fields of a recording, by the code that would have made them live."""
+"""``skinnode replay RECORDING``: decode and solve a recording with the code of a live host."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ if TYPE_CHECKING:
 
 def replay(
     recording: Annotated[
-        Path, typer.Argument(help="The .log or .blf; its .jsonl lies beside it.", metavar="RECORDING")
+        Path,
+        typer.Argument(help="The .log or .blf file; its .jsonl is in the same folder.", metavar="RECORDING"),
     ],
-    speed: Annotated[float, typer.Option(help="1: as it was recorded; 2: twice as fast.", metavar="X")] = 1.0,
-    fast: Annotated[bool, typer.Option("--fast", help="As fast as the scans are solved.")] = False,
+    speed: Annotated[float, typer.Option(help="1: as recorded; 2: twice as fast.", metavar="X")] = 1.0,
+    fast: Annotated[bool, typer.Option("--fast", help="Play as fast as scans can be solved.")] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="A JSON object a field, and one with the counters at the end.")
+        bool,
+        typer.Option(
+            "--json", help="Print a JSON object for each field, and one with the counters at the end."
+        ),
     ] = False,
 ) -> None:
     """Decode and solve a recording of `skinnode record`, with the same results as live, bit by bit.
@@ -28,8 +32,8 @@ def replay(
     With --json each field has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
     and shear force with standard deviations, in m, m² and N.
 
-    Exit status 1 if the recording is damaged, was not ended or lacks frames, or if what it holds lacks some:
-    a scan torn or missed, a chunk or a summary lost; or has error frames. 2 if it cannot be read at all.
+    Exit status 1 if the recording is damaged, was not ended or lacks frames, if it contains error frames, or
+    if a scan was torn or missed, or a chunk or summary lost. 2 if it cannot be read at all.
     """
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
@@ -58,7 +62,7 @@ def replay(
 
 
 def field_table(field: FieldFrame) -> dict[str, Any]:
-    """A field as JSON; numbers survive bit by bit."""
+    """Return a field as JSON; numbers keep every bit."""
     from skinnode.cli._contacts import contact_tables
 
     stamp = field.stamp

@@ -1,4 +1,4 @@
-"""``skinnode scan``: who is on a bus."""
+"""``skinnode scan``: find the nodes on a bus."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json
 
 if TYPE_CHECKING:
     from skinnode.cli._bus import Place
@@ -22,12 +22,11 @@ def scan(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Find every node on a bus: by SDO, by its heartbeat, and by LSS those without a node-ID.
+    """Find every node on a bus, by SDO, by heartbeat, and by LSS if it has no node-ID.
 
-    With --hand it scans every bus of the hand. Nothing is changed in any node.
-    Takes two seconds a bus. Exit status 0 if nodes were
-    found and all is well, 1 if none was, two share a node-ID, or one of --hand
-    is missing or another device; 2 if it could not run.
+    With --hand it scans every bus of the hand. It changes nothing in any node and takes two seconds a bus.
+    Exit status 0 if nodes were found and none has a fault; 1 if none was found, two share a node-ID, or a
+    node of --hand is missing or is another device; 2 if it could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
@@ -54,7 +53,7 @@ def scan(
 
 
 def _faults(found: Discovery, place: Place) -> list[str]:
-    """What is not as it should be, one line each."""
+    """Return the faults, one line each."""
     from skinnode.diagnose.bus_connection import no_answer
     from skinnode.text.words import known
 

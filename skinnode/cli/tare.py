@@ -1,4 +1,4 @@
-"""``skinnode tare [PATCH…]``: makes the present resistances of patches their baseline."""
+"""``skinnode tare [PATCH…]``: make the present resistances of patches their baseline."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skinnode.cli._bus import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
+from skinnode.cli._options import Bitrate, Bus, Channel, Fd, Hand, Interface, Json, nodes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,12 +33,12 @@ def tare(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Make the present resistances the baseline R0 of patches, and read it back. Leave the skin alone.
+    """Make the present resistances the baseline R0 of patches. Do not touch the skin meanwhile.
 
-    Taring works by SDO, with or without a host on the bus: a running host reads the
-    new baselines and continues. A patch loses them at power-off unless they are stored
-    (0x1010). A patch whose baseline hand.toml keeps in a file is refused. Exit
-    status 0 if every patch was tared, 1 if one was not, 2 if it could not run.
+    Taring works by SDO, with or without a host on the bus: a running host reads the new baselines and
+    continues. A patch loses its baseline at power-off unless it is stored (0x1010). A patch whose baseline is
+    in a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if one was not, 2 if it
+    could not run.
     """
     from skinnode.cli._bus import find_buses, node_among
     from skinnode.cli._console import print_json, progress
@@ -73,8 +73,7 @@ def tare(
 
 
 def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
-    """Tare the nodes of one bus. Opens it only if at least one of them may be tared. Raises BusError if the
-    bus fails."""
+    """Tare the nodes of one bus. Opens the bus only if at least one of them may be tared."""
     from skinnode.diagnose.bus_connection import BusConnection
     from skinnode.diagnose.tare import Tared, refusal, tare
 

@@ -61,7 +61,7 @@ def skinnode_version() -> str:
         ("demo --seconds nan", "skinnode demo: --seconds: got 'nan', allowed: a number from 1.0 to 3600.0"),
         (
             "scan --bitrat 1",
-            "skinnode scan: got '--bitrat', allowed: the options that --help lists (--bitrate",
+            "skinnode scan: no such option: --bitrat (Possible options: --bitrate",
         ),
         ("scan --bitrate x", "skinnode scan: --bitrate: got 'x', allowed: an integer"),
         ("scan --bitrate 5", "--bitrate: got 5, allowed: a bit rate from 10000 to 1000000"),
@@ -69,7 +69,10 @@ def skinnode_version() -> str:
         ("doctor x.toml --fd", "--fd: got yes, allowed: only without a hand file"),
         ("scan --hand x.toml --fd", "--fd: got yes, allowed: only without a hand file"),
         ("info", "skinnode info: NODE: got nothing, allowed: node-ID, or the name of a patch of --hand"),
-        ("node", "skinnode node: --source: got nothing, allowed: what measures: MODULE:NAME, or a name that"),
+        (
+            "node",
+            "skinnode node: --source: got nothing, allowed: source of resistances: MODULE:NAME, or a name",
+        ),
         ("host hand.toml --seconds -1", "skinnode host: --seconds: got '-1', allowed: a number of seconds"),
         ("node --source simulated --seconds inf", "skinnode node: --seconds: got 'inf', allowed: a number"),
         ("record hand.toml x --seconds nan", "skinnode record: --seconds: got 'nan', allowed: a number"),

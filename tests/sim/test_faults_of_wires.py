@@ -11,8 +11,9 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.node import NmtState
 from skinnode.protocol.profile import PatchProfile
 from vcan_sim.faults import NO_FAULTS, Faults, faults_of
-from vcan_sim.faulty_node import WIRE_NOISE, FaultyNode
+from vcan_sim.faulty_node import FaultyNode
 from vcan_sim.fleet import Fleet
+from vcan_sim.sensor import WIRE_NOISE
 
 SHAPE = {"upper_wires": 4, "upper_electrodes": 4, "lower_wires": 12, "lower_electrodes": 4}
 HAND = parse_hand(
@@ -49,11 +50,11 @@ def node_with(faults: Faults) -> FaultyNode:
 
 def test_what_the_converter_sees() -> None:
     node = node_with(Faults(open_upper=2, shorted_lower=5, noisy_upper=0))
-    np.testing.assert_array_equal(node.read(0), REST_OHM)  # before it is up: the tare
+    np.testing.assert_array_equal(node.converter.read(0), REST_OHM)  # before it is up: the tare
     node.power_on(0)
     node.on_timer(10**9)
     assert node.nmt_state is NmtState.PRE_OPERATIONAL
-    seen = np.array([node.read(i) for i in range(400)])
+    seen = np.array([node.converter.read(i) for i in range(400)])
     assert np.isinf(seen[:, 2]).all()  # a pair with both stays open
     assert (seen[:, [0, 1, 3], 5] == 0.0).all()
     sound = np.delete(seen, 5, axis=2)
@@ -62,7 +63,7 @@ def test_what_the_converter_sees() -> None:
     assert ratio.std() == pytest.approx(WIRE_NOISE, rel=0.06)  # 4400 values: ±1.1 %
     assert node.injected.miswired == 400
     node.faults = NO_FAULTS
-    np.testing.assert_array_equal(node.read(0), REST_OHM)
+    np.testing.assert_array_equal(node.converter.read(0), REST_OHM)
 
 
 def test_of_one_patch_or_of_all() -> None:

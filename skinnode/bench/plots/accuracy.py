@@ -22,7 +22,7 @@ ALIGNED: Final = {("aligned", 0.3): "#fdae6b", ("aligned", 0.5): "#e6550d", ("al
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Writes the picture of the figures that ``_bench_accuracy.run`` gives."""
+    """Draw the figures of :func:`skinnode.bench.accuracy.run` to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

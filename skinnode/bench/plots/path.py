@@ -1,4 +1,4 @@
-"""Figures 8 to 13 of the paper in our own form, from the figures of ``skinnode bench path``."""
+"""Plot of ``skinnode bench path``: figures 8 to 13 of the paper in our own form."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COLOURS: Final = ("tab:blue", "tab:orange", "tab:green", "tab:red")
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Three rows: what the steps cost, how the optimality runs along the path, the surface."""
+    """Draw three rows: cost of the steps, optimality along the path, recovered surface."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -52,7 +52,7 @@ def _draw_calls(axes: Any, setting: dict[str, Any]) -> None:
 
 
 def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Iterations summed up along the path of the first press."""
+    """Draw the iterations summed up along the path of the first press."""
     for colour, marker, size, steps in ((COLOURS[0], "s", 8, "50"), (COLOURS[1], "o", 4, "100")):
         data = setting["figure11"][steps]
         each = np.array(data["uniform_each"])
@@ -73,7 +73,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
 
 
 def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Time of a path against its steps, beside the paper's."""
+    """Draw the time of a path over its steps, beside the paper's."""
     table = paper["table4_dogleg"]
     axes.loglog(table["steps"], table["runtime_s"], "s-", color="0.5", label="paper (dogleg)")
     for colour, key, label in (
@@ -150,7 +150,7 @@ def _draw_surface(figure: Any, surface: dict[str, Any]) -> None:
 
 
 def _length(um: float) -> str:
-    """A length with a unit that suits it."""
+    """Return a length with a unit that suits it."""
     if not um < 1e6:
         return "beyond 1 m"
     if um >= 1e3:

@@ -13,7 +13,7 @@ _GROUPS: Final = {"receive": "tab:blue", "mainline": "tab:orange", "solve": "tab
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Write the figure to ``file``."""
+    """Draw the figures of :func:`skinnode.bench.pipeline.run` to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

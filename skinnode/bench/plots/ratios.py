@@ -32,7 +32,7 @@ def _save(figure: Any, file: Path, figures: dict[str, Any]) -> None:
 
 
 def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: list[bool]) -> None:
-    """Times on a log axis, each with its figure and its ratio behind it."""
+    """Draw times on a log axis, each followed by its figure and its ratio."""
     times = [row["us"] for row in rows if row["us"] is not None]
     low = 0.5 * min(times)
     axes.set_xscale("log")
@@ -51,7 +51,7 @@ def _bars(axes: Any, rows: list[dict[str, Any]], heights: list[float], ours: lis
 
 
 def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
-    """One group of bars for each thing measured; ratios are to the compiled one of the group."""
+    """Draw a group of bars for each operation; ratios are to the compiled kernel of the group."""
     heights, rows, heads = [], figures["rows"], []
     height = 0.0
     for what, group in groupby(rows, key=lambda row: row["what"]):
@@ -71,7 +71,7 @@ def draw_kernel(file: Path, figures: dict[str, Any]) -> None:
 
 
 def draw_solve(file: Path, figures: dict[str, Any]) -> None:
-    """Time a wire and the error reached, solver by solver, fastest first."""
+    """Draw time a wire and error reached, solver by solver, fastest first."""
     rows = sorted(figures["rows"], key=lambda row: (row["us"] is None, row["us"] or 0.0))
     heights = [float(i) for i in range(len(rows))]
     ours = [row["who"].startswith("skinnode") for row in rows]

@@ -23,11 +23,11 @@ COLUMNS: Final = (
 VERDICTS: Final = (("accurate", "#3a9e6e"), ("flagged", "#e3b23c"), ("wrong", "#c8322b"))
 COLOURS: Final = {"path": "0.5", "exact": "tab:blue", "posterior": "tab:orange", "auto": "tab:purple"}
 LEAST: Final = 1e-13
-"""Left and lower end of the axes: errors and deviations below are drawn there."""
+"""Lower end of both axes; smaller errors and deviations are drawn there."""
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
-    """Writes the picture of the figures that ``_bench_stability.run`` gives."""
+    """Draw the figures of :func:`skinnode.bench.stability.run` to ``file``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """A bar a case and method: the shares of the verdicts. A wrong share is widened until it can be seen."""
+    """Draw a bar for each case and method: the shares of the verdicts, with wrong shares made visible."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:
@@ -81,7 +81,7 @@ def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
 
 
 def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Median error of a row against its median reported deviation, both as shares of the displacement."""
+    """Draw the median error of each row over its median reported deviation, as shares of the displacement."""
     for kind, colour in COLOURS.items():
         points = [
             (max(row["reported"], LEAST), max(row["median_error"], LEAST), row["wrong"] > 0)
@@ -111,7 +111,7 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
 
 
 def _list(axes: Any, wrong: list[dict[str, Any]], most: int) -> None:
-    """The worst of what is wrong, in words."""
+    """List the worst rows in words."""
     axes.axis("off")
     worst = sorted(wrong, key=lambda row: -row["wrong"] / row["wires"])
     lines = [named(row) for row in worst[:most]]

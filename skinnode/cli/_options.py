@@ -1,0 +1,86 @@
+"""Options and arguments that several commands share, and what a shell offers for them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skinnode.errors import SkinError
+
+if TYPE_CHECKING:
+    from skinnode.config import PatchConfig
+
+
+def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+    """Return what a shell offers for a node-ID, each with the name of its patch.
+
+    It offers the node-IDs of --hand, or of hand.toml if that exists, or else all node-IDs.
+    """
+    patches = _patches(ctx)
+    offered = [(str(patch.node_id), patch.name) for patch in patches]
+    return _beginning(incomplete, offered or [(str(node_id), "") for node_id in range(1, 128)])
+
+
+def nodes(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+    """Return what a shell offers for a node: node-IDs, and the names of patches if --hand is given."""
+    named = _patches(ctx) if ctx.params.get("hand") is not None else []
+    return node_ids(ctx, incomplete) + _beginning(incomplete, [(p.name, f"node {p.node_id}") for p in named])
+
+
+def _patches(ctx: typer.Context) -> list[PatchConfig]:
+    from skinnode.config import load_hand
+
+    bus = ctx.params.get("bus")
+    try:
+        hand = load_hand(ctx.params.get("hand") or "hand.toml")
+    except (SkinError, OSError):  # completion has no place for a message
+        return []
+    return [patch for patch in hand.patches if bus in (None, patch.bus)]
+
+
+def _beginning(incomplete: str, offered: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    return [(value, text) for value, text in offered if value.startswith(incomplete)]
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise typer.BadParameter(f"{text!r} is not a number of seconds from 0 on")
+    return value
+
+
+Interface = Annotated[
+    str | None, typer.Option(help="python-can interface; default socketcan.", metavar="NAME")
+]
+Channel = Annotated[str | None, typer.Option(help="Channel of the interface; default can0.", metavar="NAME")]
+OtherInterface = Annotated[
+    str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+]
+OtherChannel = Annotated[
+    str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+]
+Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
+Fd = Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")]
+Hand = Annotated[
+    Path | None, typer.Option(help="Take buses and names of patches from this hand.", metavar="HAND.toml")
+]
+Bus = Annotated[
+    str | None,
+    typer.Option(help="Bus of the hand; default: the bus of the patch, or all buses.", metavar="NAME"),
+]
+Node = Annotated[
+    str,
+    typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE", autocompletion=nodes),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object a line instead of text.")]
+Seconds = Annotated[
+    float | None,
+    typer.Option(parser=_seconds, help="End after this many seconds; default: at Ctrl-C.", metavar="S"),
+]

@@ -1,0 +1,51 @@
+"""Faults of one node: which are set, the chance that draws them, and counts of what was injected."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vcan_sim.faults import NO_FAULTS, Faults, Injected
+from vcan_sim.tally import Tally
+
+
+class Injector:
+    """Draws faults from a seed and the order of calls, and counts them.
+
+    :attr:`faults` may be replaced at any time from any thread.
+
+    Args:
+        faults: Faults from the start; their seed remains.
+        node_id: Node-ID, so that each node of a seed has faults of its own.
+    """
+
+    def __init__(self, faults: Faults, node_id: int) -> None:
+        self.faults = faults
+        self.injected, self.tally = Injected(), Tally()
+        self.random = np.random.default_rng([faults.seed, node_id])
+
+    def draw(self, share: float) -> bool:
+        """Return True with probability ``share``."""
+        return share > 0.0 and bool(self.random.random() < share)
+
+    def draw_one(self, names: tuple[str, ...]) -> str:
+        """Return one of the faults with the probability of its share, or an empty text."""
+        faults = self.faults
+        if faults is NO_FAULTS:
+            return ""
+        left = self.random.random()
+        for name in names:
+            left -= getattr(faults, name)
+            if left < 0.0:
+                return name
+        return ""
+
+    def loses(self, fault: str | None) -> bool:
+        """Return whether this fault drops a frame, and count the drop."""
+        if fault is None or not self.draw(getattr(self.faults, fault)):
+            return False
+        self.count(fault)
+        return True
+
+    def count(self, fault: str) -> None:
+        """Count a fault as injected."""
+        setattr(self.injected, fault, getattr(self.injected, fault) + 1)

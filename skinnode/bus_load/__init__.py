@@ -1,3 +1,5 @@
-"""How much of a bus a hand needs: ``stuffing`` counts bits, ``timing`` turns frames into seconds,
-``response`` bounds the worst-case latency, ``plan`` adds it all up for a hand.
+"""The bandwidth that a hand needs on its buses.
+
+``stuffing`` counts bits, ``timing`` turns frames into seconds, ``response`` bounds the worst-case latency,
+and ``plan`` adds everything up for a hand.
 """

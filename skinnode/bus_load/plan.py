@@ -1,10 +1,10 @@
-"""What a hand needs of its buses: every frame that is planned, the load they make, and how late they may be.
+"""The plan of a hand's buses: all frames, their load, and their worst-case delay.
 
-Counted for each bus: the SYNC, whoever sends it; of each patch all chunks of a scan and its summary every
-SYNC period, its heartbeat, and one EMCY a heartbeat period; the host's heartbeat, where it sends one; the
-frames of others that the hand file names; and SDO transfers, one after the other, for :data:`SDO_SHARE` of
-the bus. A node that returns has its configuration by SDO as well: that takes the part of the bus that nobody
-needs, since SDO gives way to all PDOs.
+Each bus carries the SYNC; for each patch all chunks of a scan and its summary every SYNC period, its
+heartbeat, and one EMCY every heartbeat period; the host's heartbeat, if it sends one; the frames of others
+that the hand file names; and consecutive SDO transfers that take :data:`SDO_SHARE` of the bus. The
+configuration of a returning node by SDO is not counted: it uses free bandwidth, because SDO has a lower
+priority than all PDOs.
 """
 
 from __future__ import annotations
@@ -24,19 +24,21 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Part of the SYNC period in which a node paces its scan; the rest is slack for SDO, EMCY and late frames."""
+"""Share of the SYNC period in which a node sends its scan; the rest is slack for SDO, EMCY and late frames.
+"""
 
 SDO_SHARE: Final = 0.01
-"""Part of a bus reserved for SDO: at 1 Mbit/s a request and its answer every 27 ms."""
+"""Share of a bus reserved for SDO: at 1 Mbit/s a request and its answer every 27 ms."""
 
 NODE_LATENCY_S: Final = 2e-3
-"""How long after a SYNC a node may send the first chunk: what is promised of a patch on an idle machine."""
+"""Maximum time from a SYNC to the first chunk, s, as specified for a patch on an idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""How far the chunks of a node may be off their pace, likewise."""
+"""Maximum deviation of a chunk from its pace, s, as specified for a patch on an idle machine."""
 
 _SAMPLES: Final = 512
-"""Frames with random data that typical lengths are the mean of: a standard error of 0.1 bits."""
+"""Number of frames with random data over which a typical length is averaged; the standard error is 0.1 bits.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,90 +48,102 @@ class PlannedFrame:
     name: str
     can_id: int
     length: int
-    """Bytes of data."""
+    """Data bytes."""
     period_s: float
+    """Period, s."""
     count: int
-    """How many there are in each period."""
+    """Frames in each period."""
     spacing_s: float
-    """Shortest time between two of them."""
+    """Shortest time between two of these frames, s."""
     jitter_s: float
+    """Maximum deviation from the spacing, s."""
     worst_s: float
-    """Time on the bus with all the stuff bits there can be."""
+    """Time on the bus with the maximum number of stuff bits, s."""
     typical_s: float
-    """Time on the bus with random data."""
+    """Mean time on the bus with random data, s."""
     scans: bool = False
-    """Whether there is one for each SYNC."""
+    """Whether the period is that of SYNC."""
     response_s: float | None = None
-    """From when it is queued until it has passed, at worst; None where there is no bound."""
+    """Worst-case time from queueing to the end of the frame, s; None if it is unbounded."""
 
     @property
     def frames_per_s(self) -> float:
+        """Frames per second."""
         return self.count / self.period_s
 
     @property
     def load(self) -> float:
-        """Share of the bus, every frame at its longest."""
+        """Share of the bus with frames of maximum length."""
         return self.frames_per_s * self.worst_s
 
     @property
     def typical_load(self) -> float:
+        """Share of the bus with random data."""
         return self.frames_per_s * self.typical_s
 
 
 @dataclass(frozen=True, slots=True)
 class ScanTime:
-    """How long a scan of a patch takes."""
+    """Duration of a scan of a patch."""
 
     patch: str
     node_id: int
     chunks: int
     paced_s: float
-    """From the first chunk to the last, as the inhibit time spaces them."""
+    """Time from the first chunk to the last at the pace of the inhibit time, s."""
     worst_s: float | None
-    """From the SYNC, queued, to the end of the summary, at worst; None where there is no bound."""
+    """Worst-case time from queueing the SYNC to the end of the summary, s; None if it is unbounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusPlan:
-    """All that is planned for one bus."""
+    """The plan of one bus."""
 
     bus: BusConfig
     period_s: float
-    """Between two SYNCs."""
+    """SYNC period, s."""
     frames: tuple[PlannedFrame, ...]
     scans: tuple[ScanTime, ...]
 
     @property
     def frames_per_s(self) -> float:
+        """Frames per second of the whole bus."""
         return sum(frame.frames_per_s for frame in self.frames)
 
     @property
     def load(self) -> float:
-        """Share of the bus that is needed, every frame at its longest; 1 is full."""
+        """Share of the bus with frames of maximum length; 1 is a full bus."""
         return sum(frame.load for frame in self.frames)
 
     @property
     def typical_load(self) -> float:
-        """The same with random data."""
+        """Share of the bus with random data."""
         return sum(frame.typical_load for frame in self.frames)
 
     @property
     def others(self) -> tuple[PlannedFrame, ...]:
-        """Those of the frames that others send, as the hand file names them."""
+        """The frames of others that the hand file names."""
         named = {other.can_id for other in self.bus.others}
         return tuple(frame for frame in self.frames if frame.can_id in named)
 
     @property
     def shortest_period_ms(self) -> int | None:
-        """The shortest SYNC period with which the plan fits; None where none would do."""
+        """Shortest SYNC period that fits, ms; None if no period fits."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
         scan_s = sum(frame.count * frame.worst_s for frame in self.frames if frame.scans)
         return int(-(-scan_s * 1e3 // free)) if free > 0 else None
 
 
 def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """The plan of each bus that has patches. Raises BusLoadError for the first that needs more of its bus
-    than ``max_load``, ConfigError as :func:`plan_of`."""
+    """Return the plan of each bus that has patches, and check their loads.
+
+    Args:
+        hand: the hand.
+
+    Raises:
+        BusLoadError: if a plan needs more of its bus than ``max_load``.
+        ConfigError: as in :func:`plan_of`.
+    """
     plans = plan_of(hand)
     for plan in plans:
         require_room(hand, plan)
@@ -137,7 +151,15 @@ def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def require_room(hand: HandConfig, plan: BusPlan) -> None:
-    """Raises BusLoadError where ``plan`` needs more of its bus than ``max_load``."""
+    """Check the load of a plan.
+
+    Args:
+        hand: the hand.
+        plan: the plan of one of its buses.
+
+    Raises:
+        BusLoadError: if the plan needs more of its bus than ``max_load``.
+    """
     bus, needed = plan.bus, plan.load
     if needed <= bus.max_load:
         return
@@ -164,10 +186,14 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """The plan of each bus that has patches, whatever its load.
+    """Return the plan of each bus that has patches, whatever its load.
 
-    Raises ConfigError for a patch that its wire format cannot carry, and for a frame of others with an
-    identifier of ours.
+    Args:
+        hand: the hand.
+
+    Raises:
+        ConfigError: if the wire format cannot carry a patch, or a frame of others has an identifier of the
+            hand.
     """
     profiles = {patch.name: _profile(hand, i, patch) for i, patch in enumerate(hand.patches)}
     return tuple(
@@ -176,7 +202,12 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Pace at which ``frames`` frames take SCAN_SHARE of the period, in units of 0x1800:3."""
+    """Return the inhibit time (0x1800:3) at which some frames take SCAN_SHARE of a period, 100 µs.
+
+    Args:
+        period_ms: SYNC period, ms.
+        frames: number of frames.
+    """
     return int(period_ms * 10 * SCAN_SHARE / frames)
 
 
@@ -195,7 +226,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # what its node takes, and answers, whether the plan has one for each node or not
+    for patch in patches:  # commands and SDO of every node, although the plan counts SDO once for each bus
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -246,7 +277,7 @@ def _of_a_patch(
     yield _classic(bus, f"heartbeat of {patch.name}", od.heartbeat_cob_id(node_id), 1, beat_s)
 
 
-def _classic(
+def _classic(  # noqa: PLR0913 - one argument for each column of the plan
     bus: BusConfig, name: str, can_id: int, length: int, period_s: float, *, scans: bool = False
 ) -> PlannedFrame:
     worst_s, typical_s = _classic_s(bus, can_id, length)
@@ -277,7 +308,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Worst-case response time of each frame, by its identifier."""
+    """Return the worst-case response time of each frame, s, by its identifier."""
     messages = [
         Message(
             frame.can_id,
@@ -304,8 +335,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """A SYNC waits, a node begins, its chunks follow their pace, each as late as it can be, and its summary
-    follows the last of them."""
+    """Add up the worst case: SYNC, node latency, pace of the chunks, the last chunk and the summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

@@ -1,16 +1,16 @@
-"""Worst-case response times on a CAN bus: from the moment a frame is queued until its last bit has passed.
+"""Worst-case response times on a CAN bus: from queueing a frame to its last bit.
 
 Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: Refuted, revisited and
-revised", Real-Time Systems 35, 2007, section 3: the frame of the lowest identifier goes first, a frame on the
-bus is not interrupted, and every instance in the longest busy period of its priority is looked at, since the
-first is not always the slowest.
+revised", Real-Time Systems 35, 2007, section 3: the lowest identifier wins, a frame on the bus is not
+interrupted, and every instance in the longest busy period of a priority is examined, because the first is not
+always the slowest.
 
-One thing is added: frames may come in bursts, ``count`` of them ``spacing_ns`` apart in each period, as the
-chunks of a scan do. A window that begins with a burst holds the most of them, so that the analysis holds with
-their number in it in place of the paper's ⌈(t + J) / T⌉.
+Extension: frames may come in bursts, ``count`` frames ``spacing_ns`` apart in each period, as the chunks of a
+scan do. A window that begins with a burst holds the maximum number of them, so the analysis holds with that
+number in place of the paper's ⌈(t + J) / T⌉.
 
-Left out: frames that are sent again after an error, and controllers whose buffers let a later frame of lower
-priority go before an earlier one.
+Not covered: retransmission after an error, and controllers whose buffers send a frame of lower priority
+first.
 """
 
 from __future__ import annotations
@@ -23,21 +23,22 @@ from dataclasses import dataclass
 class Message:
     """Frames of one identifier on the bus. Times are whole nanoseconds.
 
-    Raises ValueError for a burst that is longer than its period, and for times that are not positive.
+    Raises:
+        ValueError: if a burst is longer than its period, or a time is not positive.
     """
 
     can_id: int
-    """Priority: the lowest goes first. No two messages of a bus have the same."""
+    """Identifier and priority: the lowest wins. No two messages of a bus share one."""
     time_ns: int
-    """How long a frame takes, at its longest, with inter-frame space."""
+    """Maximum time of a frame with inter-frame space, ns."""
     period_ns: int
-    """Shortest time between two bursts."""
+    """Shortest time between two bursts, ns."""
     count: int = 1
-    """Frames of a burst."""
+    """Number of frames of a burst."""
     spacing_ns: int = 0
-    """Shortest time between two frames of a burst."""
+    """Shortest time between two frames of a burst, ns."""
     jitter_ns: int = 0
-    """How much later than due a frame may be queued; never before an earlier one of the same message."""
+    """Maximum delay of queueing a frame, ns; frames of one message keep their order."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -54,12 +55,12 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """When an instance is due, counted from the first, number 0."""
+        """Return when an instance is due, ns after the first, number 0."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 
     def most_in(self, window_ns: int) -> int:
-        """The most instances that can be queued in a window, its end excluded."""
+        """Return the maximum number of instances queued in a window, its end excluded."""
         bursts, rest_ns = divmod(window_ns + self.jitter_ns, self.period_ns)
         begun = (
             self.count
@@ -70,11 +71,15 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """The longest time from when ``message`` is due until it has passed; None where there is no bound: it and
-    all of higher priority need the whole bus.
+    """Return the longest time from when a message is due to its last bit, ns.
 
-    ``others`` are the other messages of the bus, ``bit_ns`` the time of a bit, during which frames still
-    join an arbitration.
+    Args:
+        message: the message.
+        others: the other messages of the bus.
+        bit_ns: time of a bit, ns, during which frames can still join an arbitration.
+
+    Returns:
+        None if the time is unbounded: the message and those of higher priority need the whole bus.
     """
     higher = [other for other in others if other.can_id < message.can_id]
     blocking_ns = max((other.time_ns for other in others if other.can_id > message.can_id), default=0)
@@ -88,7 +93,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # that of the instance before was shorter
+        wait_ns = max(wait_ns, own_ns)  # the previous instance waited less
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

@@ -1,6 +1,6 @@
 """Compiled kernels of :mod:`skinnode.bus_load.timing`: count the bits of frames on the bus.
 
-Pure functions of arrays of one kind each: uint32 identifiers, uint8 lengths and payloads, int64 bits.
+Pure functions of arrays: uint32 identifiers, uint8 lengths and payloads, int64 bits.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """CRC of a byte; and for run << 8 | byte: the run after the byte and the stuff bits in it.
+    """Return the CRC of each byte; and for run << 8 | byte the run after the byte, and the stuff bits in it.
 
-    A run is 0 before the first bit, else value << 2 | (length − 1) + 1, with lengths 1 … 4: a fifth equal bit
-    brings the stuff bit, which begins a run of its own.
+    A run is 0 before the first bit, otherwise value << 2 | (length − 1) + 1, with lengths 1 … 4: a fifth
+    equal bit causes the stuff bit, which begins another run.
     """
     crc_table = []
     for byte in range(256):
@@ -58,7 +58,7 @@ def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
 
 @functools.cache
 def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """CRC of a byte; and for run << 8 | byte: the run after the byte << 8 | the stuff bits in it."""
+    """Return the tables as arrays: the CRC, and the run after the byte << 8 | the stuff bits in it."""
     crc, next_run, stuffed = (np.array(table, np.uint16) for table in tables())
     return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
 
@@ -67,13 +67,15 @@ _loaded = False
 
 
 def are_loaded() -> bool:
-    """Whether :func:`load_kernels` was called."""
+    """Return whether :func:`load_kernels` was called."""
     return _loaded
 
 
 def load_kernels() -> None:
-    """Compile them, or read them from the cache, now: half a second in which a thread that receives would let
-    questions go unanswered."""
+    """Compile the kernels, or read them from the cache.
+
+    That takes half a second, in which a receiving thread would answer no request, so it is done in advance.
+    """
     global _loaded
     _loaded = True
     none, nothing, bits = np.zeros(0, np.uint32), np.zeros(0, np.uint8), np.zeros(0, np.int64)
@@ -82,19 +84,38 @@ def load_kernels() -> None:
 
 
 def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stride: int, bits: _Int) -> int:
-    """Into ``bits`` (n,) those of standard data frames, and their sum. ``payload`` holds the data of one
-    frame after the other, which begin ``stride`` bytes apart; 0 where nothing is between them."""
+    """Count the bits of classic data frames.
+
+    Args:
+        ids: (n,) identifiers.
+        lengths: (n,) data lengths, bytes.
+        payload: the data of all frames, concatenated.
+        stride: bytes from the start of one frame's data to the next; 0 if there are no gaps.
+        bits: (n,) output, bits of each frame.
+
+    Returns:
+        Sum of the bits.
+    """
     return int(_classic(ids, lengths, payload, stride, *_arrays(), bits))
 
 
 def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: _Int, fast: _Int) -> None:
-    """Into ``nominal`` and ``fast`` (n,) those of CAN FD frames at either rate. Lengths are those that frames
-    can have; nothing is between the data of one frame and the next."""
+    """Count the bits of CAN FD frames.
+
+    Args:
+        ids: (n,) identifiers.
+        lengths: (n,) data lengths that CAN FD has, bytes.
+        payload: the data of all frames, concatenated.
+        nominal: (n,) output, bits at the nominal bit rate.
+        fast: (n,) output, bits at the data bit rate.
+    """
     _fd(ids, lengths, payload, _arrays()[1], nominal, fast)
 
 
 @njit_brief
-def _classic(ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run_of: Any, bits: Any) -> int:
+def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
+    ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run_of: Any, bits: Any
+) -> int:
     total, begin = 0, 0
     for i in range(ids.size):
         length: Any = np.int64(lengths[i])
@@ -104,8 +125,8 @@ def _classic(ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run
         crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # 19 + 15 bits of head and CRC are two more than four bytes: six bits of filler make it five. The
-        # bytes of the stuffed region straddle those of the payload, so they are cut from pairs of neighbours.
+        # Head and CRC have 19 + 15 bits, two more than four bytes, so six filler bits make five bytes. Bytes
+        # of the stuffed region straddle payload bytes, so they are cut from pairs of neighbours.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0
@@ -128,7 +149,9 @@ def _classic(ids: Any, lengths: Any, payload: Any, stride: int, crc_of: Any, run
 
 
 @njit_brief
-def _fd(ids: Any, lengths: Any, payload: Any, run_of: Any, nominal: Any, fast: Any) -> None:
+def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
+    ids: Any, lengths: Any, payload: Any, run_of: Any, nominal: Any, fast: Any
+) -> None:
     begin = 0
     for i in range(ids.size):
         length: Any = np.int64(lengths[i])
@@ -138,8 +161,8 @@ def _fd(ids: Any, lengths: Any, payload: Any, run_of: Any, nominal: Any, fast: A
             code = 6 + length // 4  # 12, 16, 20, 24
         else:
             code = 11 + length // 16  # 32, 48, 64
-        # 22 bits up to the length code are two less than three bytes, and the data follow bytewise. FDF, res
-        # and BRS alternate: no stuff bit stands between the first two bytes (nominal) and ESI.
+        # 22 bits up to the length code are two fewer than three bytes, and the data follow bytewise. FDF, res
+        # and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0
         stuff: Any = 0

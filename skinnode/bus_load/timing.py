@@ -1,19 +1,19 @@
-"""How long a CAN frame occupies the bus, to the bit (ISO 11898-1:2015), and what load that makes.
+"""Exact duration of CAN frames on the bus (ISO 11898-1:2015), and the load that they cause.
 
 Classic frames. From start of frame to the end of the CRC sequence a stuff bit of the other value follows
 every five equal bits, stuff bits included in the count. The tail of 13 bits is not stuffed: CRC delimiter,
 ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space. CRC: polynomial 0x4599, 15 bits,
 initially 0.
 
-Both the CRC and the stuffing run bytewise through tables. The head of a frame is filled up on its left to
-whole bytes: with zeros for the CRC, which leave it 0, and with alternating bits that end in a 1 for the
-stuffing, after which the dominant start of frame begins a new run.
+CRC and stuffing are computed bytewise with tables. The head of a frame is padded on its left to whole bytes:
+with zeros for the CRC, which stays 0, and with alternating bits that end in a 1 for the stuffing, after which
+the dominant start of frame begins a new run.
 
-CAN FD frames, with an 11-bit identifier and bit-rate switch. Such stuffing ends with the data: in the CRC
-field stand 4 bits that count the stuff bits, 17 bits of CRC (21 beyond 16 bytes of data) and a fixed stuff
-bit before them and after each 4, whatever their values. The bits from ESI to the CRC delimiter are sent at
-the data bit rate; the 17 before them and the 12 after them (ACK slot and delimiter, 7 bits end of frame, 3
-bits inter-frame space) at the nominal one.
+CAN FD frames, with an 11-bit identifier and bit-rate switch. This stuffing ends with the data. The CRC field
+holds 4 bits that count the stuff bits, 17 bits of CRC (21 for more than 16 data bytes), and fixed stuff bits:
+one before them and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit
+rate; the 17 bits before them and the 12 bits after them (ACK slot and delimiter, 7 bits end of frame, 3 bits
+inter-frame space) at the nominal bit rate.
 """
 
 from __future__ import annotations
@@ -40,19 +40,23 @@ from skinnode.errors import ConfigError
 from skinnode.text.words import counted
 
 _EXTENDED_HEAD_BITS: Final = 39  # SOF, 11 bits, SRR, IDE, 18 bits, RTR, r1, r0, 4 bits DLC
-"""Bytes that a CAN FD frame can have, by its length code."""
 _RUN: Final = 5
 _NO_RUN: Final = 0
 _Int = NDArray[np.int64]
 
 
 def nominal_bits(dlc: int, *, extended: bool = False) -> int:
-    """Bits of a frame without any stuff bit."""
+    """Return the bits of a frame without stuff bits.
+
+    Args:
+        dlc: data bytes.
+        extended: whether the identifier has 29 bits.
+    """
     return (_EXTENDED_HEAD_BITS if extended else HEAD_BITS) + 8 * dlc + CRC_BITS + TAIL_BITS
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Bits of the longest frame with ``dlc`` bytes: a stuff bit after the first 5 bits and each 4 more.
+    """Return the bits of the longest frame: a stuff bit after the first 5 bits and after every 4 more.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -63,10 +67,17 @@ def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
 def exact_bits(
     can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int | None = None
 ) -> int:
-    """Bits of a classic data frame on the bus, inter-frame space included.
+    """Return the bits of a classic frame on the bus, with inter-frame space.
 
-    A remote frame (``remote``) carries no data; its length code is ``dlc``. Raises ValueError for an
-    identifier that does not fit or more than 8 bytes.
+    Args:
+        can_id: identifier.
+        data: data bytes.
+        extended: whether the identifier has 29 bits.
+        remote: whether it is a remote frame, which carries no data.
+        dlc: length code of a remote frame.
+
+    Raises:
+        ValueError: if the identifier does not fit, or there are more than 8 bytes.
     """
     if not 0 <= can_id < 1 << (29 if extended else 11):
         raise ValueError(f"can_id: got 0x{can_id:X}, must fit {29 if extended else 11} bits")
@@ -102,10 +113,17 @@ def exact_bits(
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
-    """Bits of CAN FD frames of one length: (n,) identifiers and (n, length) bytes to (n,) bits at the nominal
-    bit rate, inter-frame space included, and (n,) at the data bit rate.
+    """Return the bits of CAN FD frames of one length.
 
-    Raises ValueError for other shapes, an identifier of more than 11 bits or a length that no frame has.
+    Args:
+        can_id: (n,) identifiers.
+        data: (n, length) bytes.
+
+    Returns:
+        (n,) bits at the nominal bit rate, with inter-frame space, and (n,) bits at the data bit rate.
+
+    Raises:
+        ValueError: if a shape is wrong, an identifier has more than 11 bits, or no frame has that length.
     """
     ids, payload = np.asarray(can_id, np.int64), np.asarray(data, np.uint8)
     if ids.ndim != 1 or payload.ndim != 2 or len(payload) != len(ids):
@@ -123,15 +141,21 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
 
 @functools.cache
 def fd_worst_case_bits(length: int) -> tuple[int, int]:
-    """Most bits at the nominal and at the data bit rate of a CAN FD frame with ``length`` bytes, as in
-    :func:`fd_bits`: found over all data, run by run.
+    """Return the maximum bits of a CAN FD frame, found over all data run by run.
 
-    Raises ValueError for a length that no frame has.
+    Args:
+        length: data bytes.
+
+    Returns:
+        Bits at the nominal and at the data bit rate, as in :func:`fd_bits`.
+
+    Raises:
+        ValueError: if no frame has that length.
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
-    # From SOF to IDE stand 14 bits, whose first 5 and each 4 more may bring a stuff bit.
-    # FDF, res and BRS alternate, ESI is 0 and the length code is known; the data are what is worst.
+    # 14 bits from SOF to IDE: a stuff bit may follow the first 5 and every 4 more. FDF, res and BRS
+    # alternate, ESI is 0 and the length code is known; the data are the worst possible.
     stuff = {(1 << 2) + 1: 0}  # a run of one recessive bit, BRS
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -144,7 +168,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
                 equal = equal + 1 if bit == value else 1
                 stuffed = equal == _RUN
                 state = ((1 - bit) << 2) + 1 if stuffed else (bit << 2 | equal - 1) + 1
-                # A stuff bit due after the last bit is not sent: the first fixed one stands there.
+                # A stuff bit due after the last bit is not sent: the first fixed stuff bit takes its place.
                 total = count + (stuffed and number < len(choices))
                 after[state] = max(after.get(state, 0), total)
         stuff = after
@@ -154,9 +178,18 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
 
 
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
-    """:func:`exact_bits` of many standard data frames: (n,) identifiers, (n,) lengths, (n, 8) bytes, as (n,).
+    """Return the bits of many classic data frames, as :func:`exact_bits` does.
 
-    Bytes beyond a frame's length are ignored. Raises ValueError for other shapes, identifiers or lengths.
+    Args:
+        can_id: (n,) identifiers of 11 bits.
+        dlc: (n,) data lengths, bytes.
+        data: (n, 8) bytes; bytes beyond the length are ignored.
+
+    Returns:
+        (n,) bits.
+
+    Raises:
+        ValueError: if a shape, an identifier or a length is wrong.
     """
     ids, lengths, payload = (
         np.asarray(can_id, np.int64),
@@ -175,9 +208,16 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counts frames and their exact bits. Adding a frame is cheap; the bits are worked out in batches.
+    """Counts frames and their exact bits. Adding a frame is cheap; the bits are computed in batches.
 
-    Plain code with one owner. Raises ConfigError for a bit rate that is not positive.
+    Plain code with one owner.
+
+    Args:
+        bitrate_bps: nominal bit rate, bit/s.
+        data_bitrate_bps: data bit rate of CAN FD, bit/s; by default the nominal one.
+
+    Raises:
+        ConfigError: if a bit rate is not positive.
     """
 
     _BATCH: Final = 4096
@@ -193,7 +233,7 @@ class BusLoad:
         self._classic: tuple[list[int], list[bytes]] = [], []
         self._fd: tuple[list[int], list[bytes]] = [], []
 
-    def add(
+    def add(  # noqa: PLR0913 - the properties of a frame
         self,
         can_id: int,
         data: bytes,
@@ -203,8 +243,10 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Count a frame, as in :func:`exact_bits` or, where ``fd``, :func:`fd_bits`. ``data`` is kept until
-        the next batch, not copied."""
+        """Count a frame, as in :func:`exact_bits` or, if ``fd``, :func:`fd_bits`.
+
+        ``data`` is kept until the next batch, not copied.
+        """
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
             self._frames += 1
@@ -212,7 +254,12 @@ class BusLoad:
         self.add_all(((can_id, data),), fd=fd)
 
     def add_all(self, frames: Iterable[tuple[int, bytes, *tuple[object, ...]]], *, fd: bool = False) -> None:
-        """Count standard data frames; of each the identifier and the data come first."""
+        """Count data frames with 11-bit identifiers.
+
+        Args:
+            frames: identifier, data and anything else of each frame.
+            fd: whether they are CAN FD frames.
+        """
         ids, data = self._fd if fd else self._classic
         ids += [frame[0] for frame in frames]
         data += [frame[1] for frame in frames]
@@ -221,24 +268,27 @@ class BusLoad:
 
     @property
     def frames(self) -> int:
-        """Frames added so far."""
+        """Number of frames so far."""
         return self._frames + len(self._classic[0]) + len(self._fd[0])
 
     @property
     def bits(self) -> int:
-        """Bits they were on the bus; one at the data bit rate of CAN FD counts as its share of a nominal
-        one."""
+        """Number of bits so far; a bit at the data bit rate counts as its share of a nominal bit."""
         self._work_off()
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Share of ``time_s`` the bus was busy with the frames so far; above 1 they do not fit."""
+        """Return the share of a time that the frames so far take; above 1 they do not fit.
+
+        Args:
+            time_s: the time, s.
+        """
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if not stuffing.are_loaded():  # a command that listens for a second or two does well without
+        if not stuffing.are_loaded():  # a command that listens for a second or two is faster without
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
@@ -258,7 +308,9 @@ class BusLoad:
 def _packed(
     ids: list[int], data: list[bytes]
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """(n,) identifiers and lengths, and the data one after the other, in memory that can be written: kernels
-    are compiled for each kind."""
+    """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable memory.
+
+    Kernels are compiled for each kind of memory.
+    """
     lengths, joined = bytearray(map(len, data)), bytearray().join(data)
     return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

@@ -1,4 +1,4 @@
-"""Abort codes of the SDO protocol (CiA 301 v4.2, table 22), and how a part of the node refuses an access."""
+"""Abort codes of the SDO protocol (CiA 301 v4.2, table 22), and the exception that carries one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class AbortCode(IntEnum):
-    """Why a transfer is aborted. Values and wording of CiA 301."""
+    """Reason why a transfer is aborted. Values of CiA 301."""
 
     TOGGLE_BIT = 0x05030000
     TIMED_OUT = 0x05040000
@@ -42,9 +42,13 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """An access to the object dictionary that is not allowed. Never leaves the node: the SDO server answers
-    it with the abort code."""
+    """A refused access to the object dictionary. Never leaves the node: the SDO server sends the abort code.
+
+    Args:
+        code: reason of the refusal.
+    """
 
     def __init__(self, code: AbortCode) -> None:
         self.code = code
+        """Reason of the refusal."""
         super().__init__(f"0x{code:08X} {code.name}")

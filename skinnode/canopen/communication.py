@@ -1,4 +1,4 @@
-"""The objects 0x1000 to 0x1FFF of a node: what CiA 301 v4.2, 7.5.2, wants there, with a patch's defaults."""
+"""The objects 0x1000 to 0x1FFF of a node as CiA 301 v4.2, 7.5.2, defines them, with a patch's defaults."""
 
 from __future__ import annotations
 
@@ -16,21 +16,29 @@ _GROUPS = ("all", "communication", "application")
 
 @dataclass(frozen=True, slots=True)
 class PdoDefault:
-    """A PDO as it is after a reset."""
+    """A PDO after a reset."""
 
     purpose: str
+    """Purpose, for the name of its records."""
     cob_id: int
-    """Without the node-ID, which is added where ``plus_node_id`` says so; with the bits of 0x1800:1."""
+    """COB-ID with the bits of 0x1800:1; the node-ID is added if ``plus_node_id``."""
     kind: int = 254
     """Transmission type."""
     mapped: tuple[Entry, ...] = ()
+    """Mapped objects, in order."""
     inhibit_100us: int = 0
+    """Inhibit time, 100 µs."""
     plus_node_id: bool = True
+    """Whether the node-ID is added to the COB-ID."""
 
 
 def spare_pdo(cob_id: int | None) -> PdoDefault:
-    """A PDO that is not used until somebody maps something into it and names its COB-ID, which for the first
-    four is that of the pre-defined connection set."""
+    """Return a PDO that is not used until a client maps objects into it and switches it on.
+
+    Args:
+        cob_id: COB-ID without the node-ID, from the pre-defined connection set; None if it has none for this
+            PDO.
+    """
     return PdoDefault("spare", od.PDO_INVALID | (cob_id or 0), plus_node_id=cob_id is not None)
 
 
@@ -40,8 +48,14 @@ def communication_objects(
     slots: int,
     revision: int = od.REVISION_NUMBER,
 ) -> tuple[Object, ...]:
-    """Return all communication objects by ascending index. ``slots``: maximum mapped objects of a PDO.
-    ``revision``: value of 0x1018:3."""
+    """Return all communication objects by ascending index.
+
+    Args:
+        rpdos: the RPDOs.
+        tpdos: the TPDOs.
+        slots: maximum mapped objects of a PDO.
+        revision: value of 0x1018:3.
+    """
     return (
         *_device_objects(revision),
         *(_rpdo_parameter(od.RPDO1_PARAMETER + i, i + 1, pdo) for i, pdo in enumerate(rpdos)),
@@ -146,6 +160,6 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    # Without a limit: too many objects have an abort code of their own, not that of a value out of range.
+    # Without a limit, because too many objects have their own abort code.
     first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

@@ -7,10 +7,18 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Lengths of the data of a CAN FD frame, bytes, by length code."""
 
 
 def fd_length(n_bytes: int) -> int:
-    """The shortest data of a CAN FD frame that holds ``n_bytes``. Raises ValueError for more than 64."""
+    """Return the shortest length of a CAN FD frame that holds some bytes.
+
+    Args:
+        n_bytes: number of bytes.
+
+    Raises:
+        ValueError: if no frame holds them: more than 64.
+    """
     for length in FD_LENGTHS:
         if n_bytes <= length:
             return length

@@ -1,4 +1,4 @@
-"""An object dictionary as plain data: what a CANopen device offers, before anything holds values.
+"""Declaration of an object dictionary as plain data, without values.
 
 Numbers and words are those of CiA 301 (object codes, data types) and CiA 306 (access types).
 """
@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of a value; 0 where it varies."""
+        """Length of a value in bits; 0 if it varies."""
         return _BITS[self]
 
 
@@ -56,24 +56,32 @@ class Entry:
     index: int
     subindex: int
     name: str
+    """Parameter name in the EDS."""
     data_type: DataType
     access: str
-    """ro, rw, wo, const, or rww: read and written, and mappable into an RPDO."""
+    """ro, rw, wo, const, or rww, which is rw and mappable into an RPDO."""
     default: Value | None = None
-    """None where only the device knows: a serial number, a measurement. Zero at start."""
+    """Default value; None, and zero at start, if it is the device's own, such as a serial number."""
     plus_node_id: bool = False
-    """The value at start-up is ``default`` plus the node-ID: COB-IDs."""
+    """Whether the node-ID is added to the default at start, as for a COB-ID."""
     mappable: bool = False
+    """Whether a PDO can map it."""
     low: int | None = None
+    """Minimum value, if limited."""
     high: int | None = None
+    """Maximum value, if limited."""
 
     @property
     def mapping(self) -> int:
-        """The entry as PDO mapping parameters name it: index, sub-index, length in bits."""
+        """Value of a PDO mapping parameter for the entry: index, sub-index, length in bits."""
         return self.index << 16 | self.subindex << 8 | self.data_type.bits
 
     def value_at_start(self, node_id: int) -> Value | None:
-        """``default`` on the node ``node_id``."""
+        """Return the default value on a node.
+
+        Args:
+            node_id: its node-ID.
+        """
         if self.plus_node_id and isinstance(self.default, int):
             return self.default + node_id
         return self.default
@@ -95,7 +103,7 @@ class Object:
         raise KeyError(f"0x{self.index:04X} has no sub-index {subindex}")
 
 
-def var(
+def var(  # noqa: PLR0913 - one argument for each column of the standard's tables
     index: int,
     name: str,
     data_type: DataType,
@@ -106,24 +114,36 @@ def var(
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """A single value, or a domain."""
+    """Declare a single value, or a domain. The arguments are the fields of :class:`Entry`."""
     entry = Entry(index, 0, name, data_type, access, default, plus_node_id, mappable, None, high)
     kind = ObjectType.DOMAIN if data_type is DataType.DOMAIN else ObjectType.VAR
     return Object(index, name, kind, (entry,))
 
 
 def highest(index: int, highest: int) -> Entry:
-    """Sub-index 0 of an array or a record."""
+    """Declare sub-index 0 of an array or a record.
+
+    Args:
+        index: index of the object.
+        highest: highest sub-index.
+    """
     return Entry(index, 0, "Highest sub-index supported", DataType.UNSIGNED8, "const", highest)
 
 
 def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None = None) -> Object:
-    """A record; ``first``: its sub-index 0, if that is not a constant."""
+    """Declare a record.
+
+    Args:
+        index: its index.
+        name: its name.
+        entries: its sub-objects from 1 on, by ascending sub-index.
+        first: its sub-index 0, if that is not a constant.
+    """
     first = first or highest(index, entries[-1].subindex)
     return Object(index, name, ObjectType.RECORD, (first, *entries))
 
 
-def array(
+def array(  # noqa: PLR0913 - one argument for each column of the standard's tables
     index: int,
     name: str,
     labels: Sequence[str],
@@ -135,7 +155,10 @@ def array(
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """An array with one entry for each of ``labels``; ``first`` as in :func:`record`."""
+    """Declare an array with one entry for each of ``labels``.
+
+    ``first`` as in :func:`record`; the other arguments are the fields of :class:`Entry`.
+    """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)
         for sub, label in enumerate(labels, 1)

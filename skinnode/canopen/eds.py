@@ -1,8 +1,8 @@
-"""An object dictionary as an electronic data sheet (EDS), or as the configuration of one device (DCF): the
-INI dialects of CiA 306.
+"""Writes an object dictionary as an EDS or DCF file (CiA 306).
 
-REAL32 defaults are written as the hexadecimal IEEE 754 pattern, as conforming tools expect them. The canopen
-library wants decimals there and leaves such a default out; 0 reads the same in both.
+An EDS is an electronic data sheet, a DCF the configuration of one device. REAL32 defaults are written as the
+hexadecimal IEEE 754 pattern, as conforming tools expect. The canopen library expects decimals and omits such
+a default; 0 is the same in both.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _DUMMY_TYPES: Final = range(1, 8)
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What the head of an EDS says about the device."""
+    """The device as the head of an EDS describes it."""
 
     file_name: str
     description: str
@@ -39,20 +39,22 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """What makes an EDS the DCF of one device."""
+    """The data that a DCF adds to an EDS."""
 
     node_id: int
     bitrate_kbps: int
     node_name: str
     eds_name: str
-    """File that it was made from."""
+    """Name of the EDS file that it is based on."""
 
 
 def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
-    """The EDS, or the DCF of ``device``, as text with ``\\n`` line ends. Depends on nothing but its
-    arguments.
+    """Return the text of an EDS or DCF file. Depends on its arguments only; lines end in LF.
 
-    A DCF gives every object that can be written its value at start on that node.
+    Args:
+        info: the device.
+        objects: its object dictionary.
+        device: the node for a DCF, in which each writable object has its value at start; None for an EDS.
     """
     listed = tuple(objects)
     lines = [*_head(info, device)]
@@ -168,7 +170,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Whether whoever configures a device by its DCF has to write this: not commands and histories."""
+    """Return whether a DCF configures the entry: commands and histories are excluded."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

@@ -52,9 +52,17 @@ class EdsText(NamedTuple):
 
 
 def read_eds_text(data: bytes) -> EdsText:
-    """Return the text of a file and its encoding: that of its byte order mark, or the first of ASCII, UTF-8,
-    Windows-1252 and Latin-1 that fits. Loses nothing but the mark. Raises UnicodeDecodeError if UTF-16 is
-    malformed."""
+    """Return the text of a file and its encoding.
+
+    The encoding is that of its byte order mark, or the first of ASCII, UTF-8, Windows-1252 and Latin-1 that
+    fits. Only the mark is lost.
+
+    Args:
+        data: the bytes of the file.
+
+    Raises:
+        UnicodeDecodeError: if UTF-16 is malformed.
+    """
     bom = data[:2]
     if bom in _UTF_16:
         data, encoding = data[2:].decode(_UTF_16[bom]).encode("utf-8"), "UTF-16 with BOM"

@@ -21,8 +21,15 @@ _LONGEST_SHOWN: Final = 60
 
 
 def check_form(text: str, source: str) -> None:
-    """Check the titles of the sections of objects, and the lists of objects. Raises ProfileError, naming the
-    line."""
+    """Check the titles of the sections of objects, and the lists of objects.
+
+    Args:
+        text: text of the file.
+        source: its name, for the error.
+
+    Raises:
+        ProfileError: at the first mistake, with its line.
+    """
     for line, section, key, value in _lines(text):
         if not key:
             if _OF_OBJECT.fullmatch(section) and not (
@@ -73,8 +80,10 @@ def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = N
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, str, str]]:
-    """Yield the number of each line, its section, and its key and value: both empty for the header of a
-    section. Skips comments and the further lines of a value."""
+    """Yield the number, section, key and value of each line; key and value are empty for a section header.
+
+    Skips comments and continuation lines.
+    """
     section = ""
     for number, line in enumerate(text.split("\n"), 1):
         if header := _HEADER.match(line):

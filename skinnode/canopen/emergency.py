@@ -1,9 +1,12 @@
-"""Emergency messages, the error register and the error history in words (CiA 301 v4.2, 7.2.7, tables 26 and
-48). What a code means beyond that, and what follows it, is the maker's own: it is told of our patches alone.
+"""Emergency messages, the error register and the error history in words.
+
+CiA 301 v4.2, 7.2.7, tables 26 and 48. The meaning of a code beyond that, and of the bytes after it, belongs
+to the manufacturer; it is known for skinnode patches alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
@@ -39,9 +42,11 @@ class EmcyCode(IntEnum):
 
 
 TOO_SLOW: Final = 1
-"""Third byte of the detail of 0x8110, after the u16 count of skipped scans. 1: chunks left later than the
-inhibit time requires, because the computer that runs the node, or its bus, was too slow. 0: a scan takes
-longer than the scan period."""
+"""Third byte of the detail of 0x8110 if a slow computer or bus sent chunks later than the inhibit time
+requires.
+
+It follows the u16 count of skipped scans. 0: a scan takes longer than the scan period.
+"""
 
 _CODES: Final = {
     0x0000: "no error, or an error is over",
@@ -114,9 +119,14 @@ _REGISTER: Final = (
 
 
 def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
-    """Return an emergency error code in words. ``ours``: vendor and product are those of a skinnode patch;
-    otherwise the words are those of CiA 301. ``detail``: the bytes after the code; the first two are also in
-    the history."""
+    """Return an emergency error code in words.
+
+    Args:
+        code: the error code.
+        detail: the manufacturer-specific bytes; the first two are also in the error history.
+        ours: whether vendor and product are those of a skinnode patch; if not, the words are those of CiA
+            301.
+    """
     own = _OWN_CODES.get(code) if ours else None
     text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
     more = _detail_text(code, detail) if ours else ""
@@ -124,55 +134,81 @@ def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
 
 
 def history_text(entry: int, *, ours: bool) -> str:
-    """Return an entry of 0x1003 in words: the code and, above it, two manufacturer-specific bytes, which are
-    decoded if it is ``ours``."""
+    """Return an entry of 0x1003 in words.
+
+    Args:
+        entry: the code and, above it, two manufacturer-specific bytes.
+        ours: whether vendor and product are those of a skinnode patch; the two bytes are then decoded.
+    """
     code, more = entry & 0xFFFF, entry >> 16
     text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
     return text if ours or not more else f"{text} (manufacturer-specific: 0x{more:04X})"
 
 
 def says_too_slow(code: int, detail: bytes) -> bool:
-    """Return whether an emergency with ``detail`` says that scans were skipped because the computer that runs
-    the node, or its bus, was too slow, which is no fault of the skin."""
+    """Return whether an emergency reports scans that were skipped because of a slow computer or bus.
+
+    That is not a fault of the skin.
+
+    Args:
+        code: the error code.
+        detail: the manufacturer-specific bytes.
+    """
     return code == EmcyCode.CAN_OVERRUN and detail[:2] != b"\0\0" and detail[2:3] == bytes((TOO_SLOW,))
 
 
 def register_text(register: int) -> str:
-    """The bits of the error register (0x1001) that are set."""
+    """Return the names of the bits that are set in an error register (0x1001)."""
     return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "no error"
 
 
 def _detail_text(code: int, detail: bytes) -> str:
-    if len(detail) < 2:
+    explain = _DETAILS.get(code)
+    return explain(detail) if explain is not None and len(detail) >= 2 else ""
+
+
+def _word(detail: bytes) -> int:
+    return int.from_bytes(detail[:2], "little")
+
+
+def _wires(detail: bytes) -> str:
+    kind, wire = detail[0], detail[1]
+    if kind >= len(_WIRE_FAULTS):
         return ""
-    first, second = detail[0], detail[1]
-    word = first | second << 8
-    match code:
-        case EmcyCode.HARDWARE if first < len(_WIRE_FAULTS):
-            count = int.from_bytes(detail[2:4], "little") if len(detail) >= 4 else 1
-            return f"{_WIRE_FAULTS[first]} {second}" + (f", {count} wires in all" if count > 1 else "")
-        case EmcyCode.DATA_SET:
-            return _DATA_FAULTS.get(first, "")
-        case EmcyCode.CAN_OVERRUN if word:
-            skipped = f"{counted(word, 'scan')} skipped so far"
-            slow = says_too_slow(code, detail)
-            return f"{skipped} because the computer that runs the node is too slow" if slow else skipped
-        case EmcyCode.HEARTBEAT if first:
-            return f"node {first} restarted" if second else f"of node {first}"
-        case EmcyCode.HEARTBEAT:
-            return "of the master"
-        case EmcyCode.PDO_NOT_PROCESSED | EmcyCode.PDO_LENGTH_EXCEEDED if len(detail) >= 3:
-            return f"RPDO{first}, {counted(second, 'byte')} in place of {detail[2]}"
-        case EmcyCode.PDO_NOT_PROCESSED | EmcyCode.PDO_LENGTH_EXCEEDED:
-            return f"RPDO{first}, {counted(second, 'byte')}"
-        case EmcyCode.SYNC_LENGTH:
-            return f"{counted(first, 'byte')} in place of {second}"
-        case EmcyCode.SYNC_WINDOW if word:
-            return f"TPDO{word}"
-        case EmcyCode.RPDO_TIMEOUT:
-            return f"RPDO{word}"
-        case EmcyCode.CAN_ID_COLLISION:
-            return f"0x{word:03X}"
-        case EmcyCode.SOURCE:
-            return _SOURCE_FAULTS.get(first, "")
-    return ""
+    count = int.from_bytes(detail[2:4], "little") if len(detail) >= 4 else 1
+    return f"{_WIRE_FAULTS[kind]} {wire}" + (f", {count} wires in all" if count > 1 else "")
+
+
+def _skipped(detail: bytes) -> str:
+    if not _word(detail):
+        return ""
+    skipped = f"{counted(_word(detail), 'scan')} skipped so far"
+    slow = says_too_slow(EmcyCode.CAN_OVERRUN, detail)
+    return f"{skipped} because the computer that runs the node is too slow" if slow else skipped
+
+
+def _silent(detail: bytes) -> str:
+    if not detail[0]:
+        return "of the master"
+    return f"node {detail[0]} restarted" if detail[1] else f"of node {detail[0]}"
+
+
+def _wrong_length(detail: bytes) -> str:
+    got = f"RPDO{detail[0]}, {counted(detail[1], 'byte')}"
+    return f"{got} in place of {detail[2]}" if len(detail) >= 3 else got
+
+
+_DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
+    EmcyCode.HARDWARE: _wires,
+    EmcyCode.DATA_SET: lambda detail: _DATA_FAULTS.get(detail[0], ""),
+    EmcyCode.CAN_OVERRUN: _skipped,
+    EmcyCode.HEARTBEAT: _silent,
+    EmcyCode.PDO_NOT_PROCESSED: _wrong_length,
+    EmcyCode.PDO_LENGTH_EXCEEDED: _wrong_length,
+    EmcyCode.SYNC_LENGTH: lambda detail: f"{counted(detail[0], 'byte')} in place of {detail[1]}",
+    EmcyCode.SYNC_WINDOW: lambda detail: f"TPDO{_word(detail)}" if _word(detail) else "",
+    EmcyCode.RPDO_TIMEOUT: lambda detail: f"RPDO{_word(detail)}",
+    EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
+    EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
+}
+"""Text for the manufacturer-specific bytes of a skinnode patch, at least two of them."""

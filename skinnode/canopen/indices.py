@@ -1,7 +1,7 @@
-"""Where things are on the wire: identity, COB-IDs, indices and sub-indices. Who needs one takes it from here.
+"""Identity, COB-IDs, indices and sub-indices: the one place for each of these numbers.
 
-What stands at each index is said by :mod:`skinnode.canopen.communication` (CiA 301) and
-:mod:`skinnode.protocol.profile` (the patch).
+:mod:`skinnode.canopen.communication` (CiA 301) and :mod:`skinnode.protocol.objects` (the patch) declare the
+objects at these indices.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import Final
 
 # --- identity (0x1018)
 VENDOR_ID: Final = 0
-"""No vendor-ID has been assigned by CiA to this project; 0 is never assigned to anybody."""
+"""Vendor-ID. CiA has assigned none to this project, and never assigns 0."""
 PRODUCT_CODE: Final = 0x534B494E
-"""'SKIN'."""
+"""Product code: 'SKIN'."""
 REVISION_NUMBER: Final = 0x0001_0001
-"""Major revision (CANopen behaviour) in the upper half, minor in the lower."""
+"""Revision number: major revision (CANopen behaviour) in the upper half, minor revision in the lower."""
 UNCHECKED_REVISION_NUMBER: Final = 0x0001_0000
-"""Revision of the patches whose scan summaries carry no check."""
+"""Revision number of patches whose scan summaries carry no check."""
 DEVICE_NAME: Final = "skinnode patch"
 
 MAX_NODE_ID: Final = 127
@@ -31,53 +31,53 @@ NMT_COB_ID: Final = 0x000
 SYNC_COB_ID: Final = 0x080
 TIME_COB_ID: Final = 0x100
 LSS_RESPONSE_COB_ID: Final = 0x7E4
-"""Slave to master (CiA 305)."""
+"""COB-ID from LSS slave to master (CiA 305)."""
 LSS_REQUEST_COB_ID: Final = 0x7E5
-"""Master to slaves."""
+"""COB-ID from LSS master to slaves."""
 
 
 def emcy_cob_id(node_id: int) -> int:
-    """Emergency message of a node."""
+    """Return the COB-ID of the emergency messages of a node."""
     return 0x080 + node_id
 
 
 def tpdo_cob_id(number: int, node_id: int) -> int:
-    """TPDO ``number`` of the pre-defined connection set, 0 to 3."""
+    """Return the COB-ID of TPDO ``number``, 0 to 3, of a node."""
     return 0x180 + 0x100 * number + node_id
 
 
 def rpdo_cob_id(number: int, node_id: int) -> int:
-    """RPDO ``number`` of the pre-defined connection set, 0 to 3."""
+    """Return the COB-ID of RPDO ``number``, 0 to 3, of a node."""
     return 0x200 + 0x100 * number + node_id
 
 
 def chunk_cob_id(node_id: int) -> int:
-    """TPDO1: a chunk of a scan."""
+    """Return the COB-ID of TPDO1, a chunk of a scan."""
     return tpdo_cob_id(0, node_id)
 
 
 def command_cob_id(node_id: int) -> int:
-    """RPDO1: tare, single scan, send mode."""
+    """Return the COB-ID of RPDO1, a command."""
     return rpdo_cob_id(0, node_id)
 
 
 def summary_cob_id(node_id: int) -> int:
-    """TPDO2: the end of a scan."""
+    """Return the COB-ID of TPDO2, the summary of a scan."""
     return tpdo_cob_id(1, node_id)
 
 
 def sdo_response_cob_id(node_id: int) -> int:
-    """SDO server to client."""
+    """Return the COB-ID from the SDO server of a node to its client."""
     return 0x580 + node_id
 
 
 def sdo_request_cob_id(node_id: int) -> int:
-    """SDO client to server."""
+    """Return the COB-ID from a client to the SDO server of a node."""
     return 0x600 + node_id
 
 
 def heartbeat_cob_id(node_id: int) -> int:
-    """Boot-up, heartbeat and node guarding."""
+    """Return the COB-ID of boot-up, heartbeat and node guarding of a node."""
     return 0x700 + node_id
 
 
@@ -89,7 +89,7 @@ def predefined_cob_ids(node_id: int) -> frozenset[int]:
 
 
 BIT_RATES_BPS: Final = (125_000, 250_000, 500_000, 1_000_000)
-"""What the bit rate of a patch may be set to."""
+"""Bit rates of a patch, bit/s."""
 
 # --- communication objects (CiA 301)
 DEVICE_TYPE: Final = 0x1000
@@ -124,18 +124,21 @@ TPDO1_PARAMETER: Final = 0x1800
 TPDO2_PARAMETER: Final = 0x1801
 TPDO1_MAPPING: Final = 0x1A00
 TPDO2_MAPPING: Final = 0x1A01
-"""Those of the n-th PDO, counted from 0, are n further on."""
+"""Indices of the first PDOs; those of the n-th PDO, counted from 0, are n higher."""
 MAX_PDOS: Final = 512
-"""Each way: 0x1400 to 0x15FF and so on."""
+"""Maximum number of RPDOs, and of TPDOs: 0x1400 to 0x15FF and so on."""
 PDO_MAPPING_OFFSET: Final = 0x200
 """From the index of a PDO's communication parameter to that of its mapping."""
 PDO_INVALID: Final = 1 << 31
-"""Bit of a PDO's COB-ID that switches it off."""
+"""Bit of a COB-ID that switches its PDO off."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication parameter."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Data types that an RPDO can map, at sub-index 0, where bytes of it are not for this node. Not BOOLEAN: PDOs
-are made of bytes."""
+"""Data types that an RPDO can map at sub-index 0 for bytes that this node ignores, with their lengths in
+bits.
+
+BOOLEAN is missing because PDOs consist of bytes.
+"""
 ERROR_FIELD_LENGTH: Final = 8
 HEARTBEAT_CONSUMERS: Final = 8
 
@@ -144,21 +147,21 @@ DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
 PDO_BYTES: Final = 12
-"""8, or 64 where PDOs travel over CAN FD."""
+"""Sub-index of the length of a PDO: 8 bytes, or 64 over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""The codes follow; over CAN FD the index is that of the upper wire, and the first column stands before
-them."""
+"""Sub-indices before the codes; over CAN FD the index is that of the upper wire, and the first column
+follows."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
-"""From revision 1.1 on TPDO2 carries these two in place of the device time in µs."""
+"""Sub-indices that TPDO2 carries since revision 1.1 in place of the device time in µs."""
 SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
 COMMANDS: Final = frozenset({(ACQUISITION, SELF_TEST), (ACQUISITION, TARE), (ACQUISITION, SINGLE_SCAN)})
-"""Written to have something done: no parameters, so nothing to store or to verify."""
+"""Objects that a client writes as commands: not parameters, so neither stored nor verified."""
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 SELF_TEST_RESULT: Final = 0x2023
@@ -166,17 +169,17 @@ TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
 TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
-"""Masks of 32 wires: sub-index 2i+1 open, 2i+2 shorted, for the wires from 32 i on."""
+"""Masks of 32 wires from wire 32 i on: sub-index 2i+1 open, 2i+2 shorted."""
 REJECTED_FRAMES: Final = 0x2040
-"""Counters: see :class:`skinnode.node.rejected.Rejected`."""
+"""Counters; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""+ r: the last codes of upper wire r, one sub-index a column."""
+"""Plus r: the last codes of upper wire r, one sub-index for each column."""
 BASELINE: Final = 0x2200
-"""+ r: R0 of upper wire r in ohm, one sub-index a column; 0 where there is none yet."""
+"""Plus r: R0 of upper wire r, ohm, one sub-index for each column; 0 where there is none yet."""
 COORDINATES: Final = 0x2300
-"""DOMAIN: see :func:`skinnode.protocol.coordinates.pack_coordinates`."""
+"""DOMAIN; see :func:`skinnode.protocol.coordinates.pack_coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""DOMAIN: R0 of all wire pairs, U·K REAL32 in ohm, upper wire by upper wire; written whole or not at all."""
+"""DOMAIN: R0 of all crossings, U·K REAL32, ohm, upper wire by upper wire; written as a whole."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")

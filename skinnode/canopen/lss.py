@@ -1,4 +1,4 @@
-"""Layer setting services on the wire (CiA 305 v3.0): what master and slave both must know."""
+"""Layer setting services (CiA 305 v3.0): constants that master and slave share."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""The node-ID of a node that has none."""
+"""Node-ID of a node without a node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -18,20 +18,20 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Table 0 of the bit timing service: 5 is reserved, 9 would be automatic detection."""
+"""Bit rates, bit/s, of table 0 of the bit timing service; 5 is reserved, 9 means automatic detection."""
 
 LSS_DONE: Final = 0
-"""Error code of a configuration service that was carried out."""
+"""Error code of a successful configuration service."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
 """Error code of a configuration service whose next byte is an error code of the manufacturer."""
 
 RESET_SCAN: Final = 0x80
-"""Of a fastscan, as the bit to check: every node without a node-ID answers, and begins at the vendor-ID."""
+"""Fastscan bit-check value that makes every node without a node-ID answer and restart at the vendor-ID."""
 
 
 class LssCommand(IntEnum):
-    """Command specifiers; an answer repeats its request's where it has none of its own."""
+    """Command specifiers. An answer without its own specifier repeats that of its request."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11
@@ -53,14 +53,14 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """States of the slave; the value is the mode of the global switch."""
+    """States of the slave; the value is the mode of *switch state global*."""
 
     WAITING = 0
     CONFIGURATION = 1
 
 
 class LssAddress(NamedTuple):
-    """The identity object, 0x1018, in its order. Unique to a device in the world."""
+    """The identity object (0x1018) in its order: unique to a device worldwide."""
 
     vendor_id: int
     product_code: int

@@ -3,14 +3,15 @@
 ================  ===================  ===========================================================
 state             entered by           served
 ================  ===================  ===========================================================
-INITIALISING      power, both resets   nothing; ends by itself with the boot-up message
+INITIALISING      power, both resets   nothing; ends with the boot-up message
 PRE_OPERATIONAL   itself, command 128  SDO, SYNC, TIME, EMCY, NMT, error control
 OPERATIONAL       command 1            the same, and PDO
 STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
-Every command is obeyed in every state but INITIALISING, which it does not reach. Reset node (129) gives all
-objects their defaults, reset communication (130) those from 0x1000 to 0x1FFF; the node boots up after both.
+A node obeys every command in every state but INITIALISING, in which it receives none. *Reset node* (129)
+gives all objects their defaults, *reset communication* (130) the objects from 0x1000 to 0x1FFF; the node
+boots after both.
 """
 
 from __future__ import annotations
@@ -31,8 +32,7 @@ GUARD_TOGGLE: Final = 0x80
 
 
 class NmtState(IntEnum):
-    """States; the value is what the heartbeat carries. A node without power is INITIALISING too: it is
-    silent."""
+    """States; a heartbeat carries the value. A node without power is INITIALISING too: it is silent."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -41,7 +41,7 @@ class NmtState(IntEnum):
 
     @property
     def communicates(self) -> bool:
-        """SDO, SYNC, TIME and EMCY are served."""
+        """Whether SDO, SYNC, TIME and EMCY are served."""
         return self in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 
 
@@ -68,6 +68,7 @@ AFTER_COMMAND: Final = {
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
 }
+"""State after each command that is not a reset."""
 
 
 def state_name(state: int) -> str:
@@ -90,8 +91,15 @@ def encode(command: NmtCommand, node_id: int) -> bytes:
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:
-    """The command a frame on COB-ID 0 holds for ``node_id``; None for another node's. Raises ValueError for
-    what is no command: not two bytes, or an unknown specifier."""
+    """Return the command in a frame on COB-ID 0, None if it is for another node.
+
+    Args:
+        data: the payload.
+        node_id: the node-ID of this node.
+
+    Raises:
+        ValueError: if the payload does not have two bytes, or the specifier is unknown.
+    """
     if len(data) != 2:
         raise ValueError(f"NMT: got {counted(len(data), 'byte')}, must be 2")
     return NmtCommand(data[0]) if data[1] in (0, node_id) else None

@@ -128,7 +128,7 @@ def _memory(store: Path | None) -> Iterator[FileMemory | None]:
     """Yield the memory in ``store``, claimed for this process."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
-    from skinnode.node.memory import FileMemory
+    from skinnode.node.memory_file import FileMemory
 
     if store is None:
         yield None

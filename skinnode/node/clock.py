@@ -1,36 +1,43 @@
-"""Time in a node is a number handed in: nanoseconds of the monotonic clock of whoever drives it."""
+"""Time in a node: a number that the caller passes in, ns of the caller's monotonic clock."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 NO_DEADLINE_NS: Final = 1 << 63
-"""Later than any time: nothing to wait for."""
+"""Time later than any other: there is nothing to wait for."""
 
 Clock = Callable[[], int]
-"""The time of the event that is being handled."""
+"""Returns the time of the event being handled, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pacing:
-    """How closely the thread that drives a node keeps to its timers, against what that costs."""
+    """How closely a node's thread keeps to its timers: precision against processor time."""
 
     slack_ns: int
-    """How late timers may be, so that one waking serves several. Frames are served at once whatever it is."""
+    """Maximum lateness of a timer, ns, so that one wake-up serves several. Frames are always served at once.
+    """
     catch_up_ns: int
-    """Lateness that the pace of chunks makes up for; 0 for a strict inhibit time. See
+    """Lateness for which the pace of chunks compensates, ns; 0 for a strict inhibit time. See
     :mod:`skinnode.node.patch.scan_stream`."""
 
 
 EXACT: Final = Pacing(slack_ns=0, catch_up_ns=100_000)
-"""For a board. The thread wakes for every chunk. Distances fall short of the inhibit time by one of its units
-at most, so that a scan is lengthened by wakings later than that, and not by every one."""
+"""Pacing of a board: the thread wakes for every chunk.
+
+The distance of two chunks is at most one unit (100 µs) shorter than the inhibit time, so that only later
+wake-ups lengthen a scan.
+"""
 
 THRIFTY: Final = Pacing(slack_ns=2_000_000, catch_up_ns=50_000_000)
-"""For many nodes on one machine. Four at 0.6 ms a chunk, 12.5 scans/s, take 13 % of a core of a small machine
-when the thread wakes for every chunk and 7 % with 2 ms; a bus sees bursts of three frames a node for it.
+"""Pacing of many nodes on one machine.
+
+Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 13 % of a core of a small machine if the thread wakes for
+every chunk, and 7 % with 2 ms of slack; the bus then sees bursts of three frames a node.
 
 A kernel with 100 timer ticks a second wakes a thread 10 to 20 ms late, and a busy machine later still. At
 10 ms of catching up, nodes in a User Mode Linux guest skipped a third of their scans at 10 scans/s and kept
-reporting an overrun (0x8110); at 50 ms they skip none. The mean pace is unchanged; a thread that was away for
-50 ms sends 50 ms of chunks in one burst."""
+reporting an overrun (0x8110); at 50 ms they skip none. The mean pace is unchanged; a thread that was held up
+for 50 ms sends 50 ms of chunks in one burst.
+"""

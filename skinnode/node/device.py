@@ -1,110 +1,70 @@
 """A CANopen device: the communication of CiA 301 around an application.
 
-Synchronous and deterministic: it has no thread and reads no clock. Whoever drives it hands it frames and
-times and asks when it wants to be called again; :class:`~skinnode.node.runner.NodeRunner` does so on a bus, a
-test does so with numbers. No frame whatever raises out of it; an error of the application does, and one of
-``send``.
+Synchronous and deterministic: it has no thread and reads no clock. The caller gives it frames and times, and
+asks when to call again: :class:`~skinnode.node.runner.NodeRunner` on a bus, a test with plain numbers. No
+received frame makes it raise; an error of the application or of ``send`` goes to the caller.
 """
 
 from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.dictionary import Object
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.lss import NOT_CONFIGURED, LssAddress
-from skinnode.canopen.nmt import AFTER_COMMAND, NmtCommand, NmtState, parse
-from skinnode.node.clock import NO_DEADLINE_NS, Clock
+from skinnode.canopen.nmt import NmtCommand, NmtState
+from skinnode.node.application import Application, ApplicationServices
+from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.error_control import ErrorControl
 from skinnode.node.lss import BitRateChange, LssSlave
 from skinnode.node.memory import Memory
+from skinnode.node.nmt import NmtSlave
 from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.rpdo import RpdoEngine
 from skinnode.node.pdo.tpdo import TpdoEngine
 from skinnode.node.rejected import Rejected, RejectedFrames
 from skinnode.node.sdo.server import SdoServer
+from skinnode.node.services import NodeServices, Send
 from skinnode.node.storage import COMMUNICATION, EVERYTHING, Storage
 from skinnode.node.sync import Sync
 from skinnode.node.time_of_day import TimeConsumer
 from skinnode.transport.bus_state import BusState
 
 HARDWARE_VERSION: Final = "none"
-"""A node in software has no board."""
+"""Value of 0x1009: a node in software has no board."""
 
-
-Send = Callable[[int, bytes], None]
-"""Takes COB-ID and payload."""
 Handler = Callable[[bytes, int], None]
-"""Takes the payload of a frame and its time."""
-
-
-class Application(Protocol):
-    """What a device is for. Its objects are in the dictionary from the start."""
-
-    @property
-    def deadline_ns(self) -> int:
-        """When :meth:`on_timer` has something to do."""
-        ...
-
-    def power_on(self, t_ns: int) -> None:
-        """Before the boot-up message of a start; a reset is no start."""
-        ...
-
-    def reset(self) -> None:
-        """The node was reset, its objects have their defaults."""
-        ...
-
-    def enter(self, *, operational: bool) -> None:
-        """The node entered another state."""
-        ...
-
-    def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """A SYNC came, in OPERATIONAL; ``turns`` are the synchronous TPDOs whose turn it is."""
-        ...
-
-    def on_timer(self, t_ns: int) -> None:
-        """Do what is due."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Services:
-    """What a device offers its application."""
-
-    store: ObjectStore
-    storage: Storage
-    tpdos: TpdoEngine
-    emcy: EmcyProducer
-    now: Clock
+"""Takes the payload of a frame and the time in ns at which it was received."""
 
 
 class CanopenDevice:
-    """One node.
+    """One node. It is silent until :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 for none: it then waits for one. What LSS has stored in the memory counts
-            instead.
+        node_id: 1 to 127, or 255 to wait for a node-ID. A node-ID that LSS stored in the memory takes
+            precedence.
         objects: its object dictionary.
-        application: made once, with the services of the device.
-        send: called with COB-ID and payload of every frame the node sends, in order.
+        application: called once, with the services of the device, to make the application.
+        send: called with COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
-        memory: what survives a power cycle; None: nothing does, and the node says so.
-        kind: whose memory it is; see :class:`~skinnode.node.memory.Kept`.
-        set_bit_rate: changes the bit rate (bit/s) for LSS; None where that is not the node's own to do.
+        memory: keeps values over a power cycle; None if nothing is kept, and 0x1010 says so.
+        kind: sizes and layout of the patch, which the memory must match; see
+            :class:`~skinnode.node.memory.Kept`.
+        set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
-    Raises ValueError for an argument out of range. The node is silent until :meth:`power_on`.
+    Raises:
+        ValueError: if an argument is out of range.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the keywords of the public PatchNode, passed on
         self,
         node_id: int,
         objects: Sequence[Object],
-        application: Callable[[Services], Application],
+        application: Callable[[ApplicationServices], Application],
         *,
         send: Send,
         serial: int,
@@ -118,43 +78,41 @@ class CanopenDevice:
             raise ValueError(f"serial: got {serial}, must be an unsigned number of 32 bits")
         self._default_node_id = node_id
         self.node_id = node_id
-        """255 while it has none."""
-        self.nmt_state = NmtState.INITIALISING
+        """Active node-ID; 255 while there is none."""
         self._send = send
         self._now_ns = 0
         self._store = ObjectStore(objects, node_id)
         self._sdo = SdoServer(self._store, self._send_sdo)
         self._rejected = RejectedFrames(self._store)
         self._emcy = EmcyProducer(self._store, send)
-        self._storage = Storage(self._store, self._emcy, memory, kind, self._now)
+        services = NodeServices(self._store, self._emcy, self._rejected, send, self._now)
+        self._nmt = NmtSlave(self._store, self._rejected, self._entered)
+        self._storage = Storage(services, memory, kind)
         self._set_bit_rate = set_bit_rate
         self._bit_rate_change = BitRateChange(set_bit_rate)
-        self._error_control = ErrorControl(
-            self._store,
-            self._emcy,
-            self._rejected,
-            send,
-            self._now,
-            self._reload,
-            self._communication_failed,
-        )
+        self._error_control = ErrorControl(services, self._reload, self._nmt.on_communication_error)
         self._time = TimeConsumer(self._store, self._now)
-        store, emcy, now, rejected = self._store, self._emcy, self._now, self._rejected
         tpdos, rpdos = (_count(objects, first) for first in (od.TPDO1_PARAMETER, od.RPDO1_PARAMETER))
-        self._sync = Sync(store, emcy, rejected, send, now)
-        self._tpdos = TpdoEngine(store, tpdos, send, now, self._sync.window)
-        self._rpdos = RpdoEngine(store, rpdos, emcy, rejected, now, self._sync.window)
+        self._sync = Sync(services)
+        self._tpdos = TpdoEngine(services, tpdos, self._sync.window)
+        self._rpdos = RpdoEngine(services, rpdos, self._sync.window)
         self._bus_state = BusState.ACTIVE
         self._handlers: dict[int, Handler] = {}
-        self._application = application(Services(store, self._storage, self._tpdos, emcy, now))
+        self._application = application(
+            ApplicationServices(self._store, self._storage, self._tpdos, self._emcy, self._now)
+        )
         self._describe(serial)
         self._connect()
         self._lss = self._lss_slave()
 
-    # --- what drives it
+    # --- events
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, send the boot-up message, become PRE-OPERATIONAL; or wait for a node-ID."""
+        """Start the application, send the boot-up message and enter PRE-OPERATIONAL; or wait for a node-ID.
+
+        Args:
+            t_ns: present time, ns.
+        """
         self._now_ns = t_ns
         self._storage.load()
         self._lss = self._lss_slave()
@@ -165,17 +123,24 @@ class CanopenDevice:
         self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
-        """Fall silent at once."""
+        """Stop sending at once."""
         self._enter(NmtState.INITIALISING, self._now_ns)
         self._bit_rate_change.cancel()
         self._handlers = {}
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
-        """A classic frame with an 11-bit identifier was received; ``data`` of a remote frame says nothing."""
+        """Handle a frame with an 11-bit identifier.
+
+        Args:
+            can_id: its identifier.
+            data: its payload; ignored for a remote frame.
+            t_ns: when it was received, ns.
+            remote: whether it is a remote frame.
+        """
         if self._bit_rate_change.silent(t_ns):
             return
         self._now_ns = t_ns
-        # Before it has booted a node has no handler, or that of LSS alone.
+        # Before a node has booted, it has no handler, or the LSS handler alone.
         if not remote and (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
         elif self.nmt_state is NmtState.INITIALISING:
@@ -188,21 +153,27 @@ class CanopenDevice:
             self._tpdos.on_remote(can_id, t_ns)
 
     def on_bus(self, state: BusState, t_ns: int) -> None:
-        """The CAN controller is in ``state``. What there is to tell of a bus that was off is told once it is
-        back; error behaviour (0x1029) does not wait for that."""
+        """Handle a change of the CAN controller's state.
+
+        Bus-off is reported once the bus is back; error behaviour (0x1029) does not wait for that.
+
+        Args:
+            state: state of the controller.
+            t_ns: present time, ns.
+        """
         was, self._bus_state = self._bus_state, state
         if self.nmt_state is NmtState.INITIALISING or state is was:
             return
         self._now_ns = t_ns
         if state is BusState.OFF:
-            self._communication_failed(t_ns)
+            self._nmt.on_communication_error(t_ns)
             return
         if was is BusState.OFF:
-            self._emcy.happened(EmcyCode.BUS_OFF_RECOVERED, b"", t_ns)
-        self._tell_passive(t_ns)
+            self._emcy.report_once(EmcyCode.BUS_OFF_RECOVERED, b"", t_ns)
+        self._report_passive(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """When :meth:`on_timer` is to be called; None while there is nothing to wait for."""
+        """Return when :meth:`on_timer` is to be called, ns; None while there is nothing to wait for."""
         if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
             return self._bit_rate_change.deadline_ns
         if self.nmt_state is NmtState.INITIALISING:
@@ -220,12 +191,18 @@ class CanopenDevice:
 
     @property
     def silent_from_ns(self) -> int:
-        """From when on :meth:`on_timer` calls a master or a monitored node silent. Whoever drives this hands
-        over what came before that first."""
+        """Time from which :meth:`on_timer` reports a master or a monitored node as silent, ns.
+
+        The caller delivers all frames received before that time first.
+        """
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Do what is due at ``t_ns``; too early or too often does no harm."""
+        """Do everything that is due. Calls that are too early or too frequent do no harm.
+
+        Args:
+            t_ns: present time, ns.
+        """
         if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:
             return
         self._now_ns = t_ns
@@ -244,13 +221,13 @@ class CanopenDevice:
 
     # --- states
 
+    @property
+    def nmt_state(self) -> NmtState:
+        """Present NMT state."""
+        return self._nmt.state
+
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
-        try:
-            command = parse(data, self.node_id)
-        except ValueError:
-            self._rejected.count(Rejected.NMT)
-            return
-        match command:
+        match command := self._nmt.command(data, self.node_id):
             case None:
                 return
             case NmtCommand.RESET_NODE:
@@ -259,10 +236,10 @@ class CanopenDevice:
             case NmtCommand.RESET_COMMUNICATION:
                 self._reset(COMMUNICATION, t_ns)
             case _:
-                self._enter(AFTER_COMMAND[command], t_ns)
+                self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Initialise and boot, with the node-ID that LSS has given; without one, wait for it."""
+        """Initialise and boot with the node-ID that LSS has set; without one, wait for it."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -283,39 +260,30 @@ class CanopenDevice:
         self._reload()
         self._error_control.boot_up(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
-        self._tell_passive(t_ns)
-        self._storage.tell(t_ns)
+        self._report_passive(t_ns)
+        self._storage.report(t_ns)
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
-        if state is self.nmt_state:
-            return
-        was, self.nmt_state = self.nmt_state, state
-        self._emcy.allow(state.communicates, t_ns)  # first: what ends now may have to wait
+        self._nmt.enter(state, t_ns)
+
+    def _entered(self, state: NmtState, before: NmtState, t_ns: int) -> None:
+        self._emcy.allow(state.communicates, t_ns)  # first: errors that end now may have to wait
         if not state.communicates:
             self._sdo.reset()
         if state is NmtState.OPERATIONAL:
             self._tpdos.start(t_ns)
-        elif was is NmtState.OPERATIONAL:
+        elif before is NmtState.OPERATIONAL:
             self._tpdos.stop()
         self._sync.window.forget(t_ns)
         self._rpdos.enter(operational=state is NmtState.OPERATIONAL)
         self._sync.enter(communicates=state.communicates)
         self._application.enter(operational=state is NmtState.OPERATIONAL)
 
-    def _tell_passive(self, t_ns: int) -> None:
+    def _report_passive(self, t_ns: int) -> None:
         if self._bus_state is BusState.PASSIVE:
-            self._emcy.present(EmcyCode.CAN_PASSIVE, b"", t_ns)
+            self._emcy.report(EmcyCode.CAN_PASSIVE, b"", t_ns)
         else:
-            self._emcy.over(EmcyCode.CAN_PASSIVE, t_ns)
-
-    def _communication_failed(self, t_ns: int) -> None:
-        """Heartbeat or guarding failed, or the bus. Error behaviour, 0x1029: 0 pre-operational, 1 nothing,
-        2 stopped."""
-        behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
-        if behaviour == 2:
-            self._enter(NmtState.STOPPED, t_ns)
-        elif behaviour == 0 and self.nmt_state is NmtState.OPERATIONAL:
-            self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+            self._emcy.clear(EmcyCode.CAN_PASSIVE, t_ns)
 
     # --- services
 
@@ -335,8 +303,7 @@ class CanopenDevice:
             self._synchronise(data, t_ns)
 
     def _synchronise(self, sync: bytes, t_ns: int) -> None:
-        """What was received before the SYNC takes effect, the application samples, what was sampled is
-        sent."""
+        """Apply the RPDOs received before the SYNC, let the application sample, and send the samples."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
@@ -375,7 +342,7 @@ class CanopenDevice:
     # --- object dictionary
 
     def _describe(self, serial: int) -> None:
-        """Values that only this device knows."""
+        """Set the objects whose values belong to this device alone."""
         self._store.put(od.IDENTITY, od.IDENTITY_SERIAL, serial)
         self._store.put(od.HARDWARE_VERSION, 0, HARDWARE_VERSION)
         self._store.put(od.SOFTWARE_VERSION, 0, importlib.metadata.version("skinnode"))
@@ -391,11 +358,11 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Listen to the COB-IDs that the object dictionary names, other than those of RPDOs."""
+        """Listen to the COB-IDs that the object dictionary names, except those of RPDOs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
-        # Last, so that no configuration can take the node its SYNC, SDO and NMT.
+        # Last, so that no configuration can replace the handlers of SYNC, SDO, NMT and LSS.
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt
@@ -404,5 +371,5 @@ class CanopenDevice:
 
 
 def _count(objects: Sequence[Object], first: int) -> int:
-    """PDOs whose parameters stand from ``first`` on."""
+    """Return the number of PDOs whose parameters are at ``first`` and above."""
     return sum(first <= item.index < first + od.MAX_PDOS for item in objects)

@@ -1,5 +1,7 @@
-"""Emergency messages (0x1014, 0x1015), error register (0x1001) and error history (0x1003): CiA 301 v4.2,
-7.2.7."""
+"""EMCY producer: emergency messages (0x1014, 0x1015), error register (0x1001) and error history (0x1003).
+
+CiA 301 v4.2, 7.2.7.
+"""
 
 from __future__ import annotations
 
@@ -18,26 +20,31 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Messages kept while inhibit time, a stopped node or the bus hold them back; the oldest give way."""
+"""Maximum messages kept while inhibit time, a stopped node or the bus delays them; the oldest are dropped."""
 _RESERVED_BIT: Final = 1 << 30
 
 
 class EmcyProducer:
-    """Which errors are present, what was told about them and when more may be told."""
+    """Keeps the present errors and sends messages when they come and go.
+
+    Args:
+        store: object dictionary.
+        send: called with COB-ID and payload of each message.
+    """
 
     def __init__(self, store: ObjectStore, send: Callable[[int, bytes], None]) -> None:
         self._store, self._send = store, send
         self._present: dict[tuple[EmcyCode, int], bytes] = {}
         self._history: deque[int] = deque(maxlen=od.ERROR_FIELD_LENGTH)  # the newest first
         self._waiting: deque[bytes] = deque()
-        self._lost = 0  # messages that gave way, and nobody knows yet
+        self._lost = 0  # dropped messages that have not been reported yet
         self._sent_ns = -NO_DEADLINE_NS
         self._allowed = False
         self._connect()
 
     @property
     def register(self) -> int:
-        """Error register: bit 0 is set as long as any error is present."""
+        """Value of the error register: bit 0 is set while any error is present."""
         bits = 0
         for code, _ in self._present:
             bits |= code.register_bit | 1
@@ -45,37 +52,54 @@ class EmcyProducer:
 
     @property
     def deadline_ns(self) -> int:
-        """When a waiting message may be sent."""
+        """Time at which a waiting message may be sent, ns."""
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
-    def happened(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """An error that is over as soon as it is told: it comes and goes, and both are told. ``detail`` is up
-        to five bytes."""
-        self._tell(code, self.register | code.register_bit | 1, detail, t_ns)
-        self._tell_over(code, t_ns)
+    def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
+        """Report an error that is over at once: one message for the error and one for its end.
 
-    def present(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """An error that lasts until :meth:`over`; told again only if ``detail`` says something new. ``who``
-        tells apart errors of one code that come and go by themselves."""
+        Args:
+            code: error code.
+            detail: up to five manufacturer-specific bytes.
+            t_ns: present time, ns.
+        """
+        self._send_error(code, self.register | code.register_bit | 1, detail, t_ns)
+        self._send_end(code, t_ns)
+
+    def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
+        """Report an error that lasts until :meth:`clear`; again only if ``detail`` has changed.
+
+        Args:
+            code: error code.
+            detail: up to five manufacturer-specific bytes.
+            t_ns: present time, ns.
+            who: distinguishes errors of one code that come and go independently.
+        """
         if self._present.get((code, who)) != detail:
             self._present[code, who] = detail
-            self._tell(code, self.register, detail, t_ns)
+            self._send_error(code, self.register, detail, t_ns)
 
-    def over(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
-        """A lasting error has gone; nothing happens if it was not there."""
+    def clear(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
+        """Report that a lasting error is over, if it was present.
+
+        Args:
+            code: error code.
+            t_ns: present time, ns.
+            who: as in :meth:`report`.
+        """
         if self._present.pop((code, who), None) is not None:
-            self._tell_over(code, t_ns)
+            self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Whether the state of the node lets messages out; they wait otherwise."""
+        """Let messages out, or make them wait, as the state of the node demands."""
         self._allowed = allowed
         self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send what may be sent. What the bus refuses stays to be sent later."""
+        """Send the messages that may be sent. A message that the bus refuses is sent later."""
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
-            if self._lost:  # older than anything that waits
+            if self._lost:  # older than all waiting messages
                 self._send(cob_id, self._loss())
                 self._lost = 0
             else:
@@ -84,22 +108,22 @@ class EmcyProducer:
             self._sent_ns = t_ns
 
     def reset(self) -> None:
-        """As after power-on."""
+        """Forget all errors and messages, as after power-on."""
         self._present.clear()
         self._history.clear()
         self._waiting.clear()
         self._lost, self._sent_ns = 0, -NO_DEADLINE_NS
 
-    def _tell(self, code: EmcyCode, register: int, detail: bytes, t_ns: int) -> None:
+    def _send_error(self, code: EmcyCode, register: int, detail: bytes, t_ns: int) -> None:
         self._remember(code, detail)
         self._queue(_message(code, register, detail), t_ns)
 
-    def _tell_over(self, code: EmcyCode, t_ns: int) -> None:
-        """An error reason is gone; the register holds what is left."""
+    def _send_end(self, code: EmcyCode, t_ns: int) -> None:
+        """Queue the message that ends an error; the register holds the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
-        # The upper half of an entry is ours: the first two bytes of the detail.
+        # The upper half of an entry is manufacturer-specific: the first two bytes of the detail.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
 
     def _queue(self, message: bytes, t_ns: int) -> None:
@@ -112,21 +136,22 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send at once if the bus lets it. Whoever tells of an error has more to do because of it than to
-        tell, so what the bus refuses is left to the next turn of the timer."""
+        """Send at once if the bus accepts it; otherwise the next timer event does.
+
+        The caller has more to do because of its error than to report it, so a refusal is not raised.
+        """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """How many emergencies gave way; the first two bytes are those of the application's lost scans. Those
-        that wait follow, and the last of them has the register as it is."""
+        """Return the message that reports dropped messages. Bytes 0 and 1 count lost scans, here 0."""
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
         return _message(EmcyCode.CAN_OVERRUN, self.register | EmcyCode.CAN_OVERRUN.register_bit | 1, detail)
 
     @property
     def _free_ns(self) -> int:
-        """From when on the inhibit time lets out another message."""
+        """Time from which the inhibit time allows another message, ns."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary
@@ -145,7 +170,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """The count at sub-index 0, then the errors, the newest first."""
+        """Return the count at sub-index 0, then the errors, the newest first."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):
@@ -158,7 +183,7 @@ class EmcyProducer:
         check_cob_id(value, self._store.integer(od.COB_ID_EMCY))
 
     def _on_cob_id(self) -> None:
-        if not self._exists:  # nobody wants to hear of it later what was told to nobody
+        if not self._exists:  # messages that were never due are not sent later
             self._waiting.clear()
             self._lost = 0
 

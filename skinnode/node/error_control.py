@@ -1,6 +1,7 @@
-"""Error control of a node: boot-up, heartbeat, guarding, heartbeats of others (CiA 301 v4.2, 7.2.8.3).
+"""Error control: boot-up, heartbeat, node guarding, heartbeats of other nodes (CiA 301 v4.2, 7.2.8.3).
 
-A node beats or is guarded, never both: with a producer heartbeat time (0x1017) guarding is not served.
+A node sends heartbeats or is guarded, never both: with a producer heartbeat time (0x1017) it ignores
+guarding.
 """
 
 from __future__ import annotations
@@ -14,40 +15,43 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.emergency import EmcyCode
 from skinnode.canopen.nmt import NmtState
 from skinnode.errors import BusError
-from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyProducer
+from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.guarding import Guarding
 from skinnode.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from skinnode.node.object_dictionary import ObjectStore
-from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.node.rejected import Rejected
+from skinnode.node.services import NodeServices
 
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
 """Number of own heartbeat periods without a frame after which another node with this node-ID counts as gone.
-As a rule the same master configured it, and one of its heartbeats may be lost."""
+The same master usually configured it, and one of its heartbeats may be lost."""
 _RIVAL_NS: Final = 750_000_000
-"""The same time in ns for a node that sends no heartbeats itself: three default periods."""
+"""Time in ns after which the other node counts as gone if this node sends no heartbeats: three default
+periods."""
 
 
 class ErrorControl:
-    """``send`` takes COB-ID and payload; ``now`` is the time of the event being handled; ``listen`` is called
-    when :meth:`handlers` has changed, ``failed`` with the time of a heartbeat or life guarding event."""
+    """The error control services of a node.
+
+    Args:
+        services: the shared parts of the node.
+        listen: called when :meth:`handlers` has changed.
+        failed: called with the time in ns of a heartbeat event or life guarding event.
+    """
 
     def __init__(
         self,
-        store: ObjectStore,
-        emcy: EmcyProducer,
-        rejected: RejectedFrames,
-        send: Callable[[int, bytes], None],
-        now: Clock,
+        services: NodeServices,
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
         self._cob_id = 0  # known when there is a node-ID
-        self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
+        store, emcy, now = services.store, services.emcy, services.now
+        self._store, self._emcy, self._now = store, emcy, now
+        self._rejected, self._send = services.rejected, services.send
         self._listen = listen
-        self._booted_ns: int | None = None  # when there is a boot-up message that nobody has got yet
+        self._booted_ns: int | None = None  # time of a boot-up message that has not been sent yet
         self._rival_until_ns = NO_DEADLINE_NS  # when another node with this node-ID counts as gone
         self._producer = HeartbeatProducer()
         self._guarding = Guarding(store, emcy, failed)
@@ -59,17 +63,17 @@ class ErrorControl:
 
     @property
     def deadline_ns(self) -> int:
-        """When :meth:`on_timer` has something to do."""
+        """Time at which :meth:`on_timer` has something to do, ns."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
         return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
     @property
     def silent_from_ns(self) -> int:
-        """When somebody who is listened for is called silent."""
+        """Time at which a monitored node or the guarding master counts as silent, ns."""
         return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:
-        """What is listened to: data frames by COB-ID."""
+        """Return the handlers of data frames, by COB-ID."""
         handlers: dict[int, Handler] = {
             od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
             for node_id in self._consumer.node_ids
@@ -78,46 +82,52 @@ class ErrorControl:
         return handlers
 
     def reset(self, node_id: int) -> None:
-        """The node is being reset: nobody guards it, and nobody has been heard."""
+        """Reset: the node is not guarded, and no other node has been heard.
+
+        Args:
+            node_id: the node-ID from now on.
+        """
         self._cob_id = od.heartbeat_cob_id(node_id)
         self._rival_until_ns = NO_DEADLINE_NS
         self._guarding.reset()
         self._consumer.reset()
 
     def boot_up(self, t_ns: int) -> None:
-        """Tell that the node is there, as soon as the bus lets it; heartbeats follow if 0x1017 says so."""
+        """Send the boot-up message as soon as the bus accepts it; heartbeats follow if 0x1017 says so."""
         self._producer.boot_up(self._store.integer(od.HEARTBEAT_PRODUCER), t_ns)
         self._booted_ns = t_ns
         with contextlib.suppress(BusError):
-            self._tell_boot_up()
+            self._send_boot_up()
 
     def on_request(self, state: NmtState, t_ns: int) -> None:
-        """A remote frame asked for the state."""
+        """Answer a remote frame that asks for the state."""
         if not self._producer.period_ns:
             self._send(self._cob_id, self._guarding.answer(state, t_ns))
 
     def on_timer(self, state: NmtState, t_ns: int) -> None:
-        """Do what is due."""
-        self._tell_boot_up()
+        """Do everything that is due at ``t_ns``."""
+        self._send_boot_up()
         if self._producer.beat(t_ns):
             self._send(self._cob_id, bytes((state,)))
         self._guarding.on_timer(t_ns)
         self._consumer.on_timer(t_ns)
         if t_ns >= self._rival_until_ns:
             self._rival_until_ns = NO_DEADLINE_NS
-            self._emcy.over(EmcyCode.CAN_ID_COLLISION, t_ns)
+            self._emcy.clear(EmcyCode.CAN_ID_COLLISION, t_ns)
 
-    def _tell_boot_up(self) -> None:
+    def _send_boot_up(self) -> None:
         if self._booted_ns is not None:
             self._send(self._cob_id, bytes((NmtState.INITIALISING,)))
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Report another node with this node-ID: once, and as cleared after it has been silent for three
-        heartbeat periods. Every frame is counted. The node takes no other action; that is up to people."""
+        """Report another node with this node-ID once, and clear that after three silent heartbeat periods.
+
+        Every frame is counted. The node takes no other action: that is up to the operator.
+        """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)
-        self._emcy.present(EmcyCode.CAN_ID_COLLISION, self._cob_id.to_bytes(2, "little"), t_ns)
+        self._emcy.report(EmcyCode.CAN_ID_COLLISION, self._cob_id.to_bytes(2, "little"), t_ns)
 
     def _on_period(self) -> None:
         self._producer.set_period(self._store.integer(od.HEARTBEAT_PRODUCER), self._now())

@@ -13,9 +13,12 @@ from skinnode.node.object_dictionary import ObjectStore
 
 
 class Guarding:
-    """Answers a master that asks for the state, and notices when it stops asking.
+    """Answers a master that asks for the state, and detects when it stops asking.
 
-    ``failed`` is called with the time of a life guarding event, after its EMCY.
+    Args:
+        store: object dictionary.
+        emcy: reports a life guarding event.
+        failed: called with the time in ns of a life guarding event, after its EMCY.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
@@ -23,17 +26,21 @@ class Guarding:
         self._toggle = 0
         self._guarded = False  # from the first request on
         self.deadline_ns = NO_DEADLINE_NS
-        """When the life time is over."""
+        """Time at which the life time is over, ns."""
 
     def reset(self) -> None:
-        """The state 'reset communication' was passed, which is the only one that resets the toggle bit."""
+        """Reset the toggle bit and end guarding. Only *reset communication* resets the toggle bit."""
         self._toggle = 0
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
 
     def answer(self, state: NmtState, t_ns: int) -> bytes:
-        """What to send on a remote frame with the COB-ID of error control. Starts life guarding, or goes on
-        with it."""
+        """Return the answer to a remote frame with the COB-ID of error control, and restart the life time.
+
+        Args:
+            state: state of the node.
+            t_ns: when the remote frame was received, ns.
+        """
         answer = bytes((state | self._toggle,))
         self._toggle ^= GUARD_TOGGLE
         self._guarded = True
@@ -41,23 +48,25 @@ class Guarding:
         return answer
 
     def on_written(self, t_ns: int) -> None:
-        """Guard time or life time factor changed: a life time that runs begins anew, and without one there
-        is no life guarding error."""
+        """Take over a new guard time or life time factor.
+
+        A running life time restarts. Without a life time there is no life guarding error.
+        """
         if self._guarded or not self._life_ns:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """Heartbeats take the place of guarding; there is no life time until the next request."""
+        """End guarding, because heartbeats replace it; the next request starts it again."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
-        self._emcy.over(EmcyCode.HEARTBEAT, t_ns)
+        self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Tell the life guarding event if it is time: once, until the master asks again."""
+        """Report a life guarding event if the life time is over: once, until the master asks again."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS
-            self._emcy.present(EmcyCode.HEARTBEAT, bytes(1), t_ns)  # of node 0: the master
+            self._emcy.report(EmcyCode.HEARTBEAT, bytes(1), t_ns)  # node 0: the master
             self._failed(t_ns)
 
     @property
@@ -68,4 +77,4 @@ class Guarding:
     def _start(self, t_ns: int) -> None:
         life_ns = self._life_ns
         self.deadline_ns = t_ns + life_ns if life_ns else NO_DEADLINE_NS
-        self._emcy.over(EmcyCode.HEARTBEAT, t_ns)
+        self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)

@@ -1,4 +1,4 @@
-"""Heartbeats: sent by this node (0x1017) and expected from others (0x1016). CiA 301 v4.2, 7.2.8.3.2.2."""
+"""Heartbeat producer (0x1017) and heartbeat consumer (0x1016): CiA 301 v4.2, 7.2.8.3.2.2."""
 
 from __future__ import annotations
 
@@ -15,29 +15,40 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second byte of an emergency's detail: the monitored node was not silent, but started anew."""
+"""Second byte of an emergency's detail if the monitored node was not silent but restarted."""
 
 
 class HeartbeatProducer:
-    """When the next heartbeat is due. Free of drift: late by less than a period, it keeps to its beat."""
+    """Computes when the next heartbeat is due, without drift unless one is late by a period or more."""
 
     def __init__(self) -> None:
         self.period_ns = 0
+        """Heartbeat period, ns; 0 for no heartbeats."""
         self.deadline_ns = NO_DEADLINE_NS
+        """Time at which the next heartbeat is due, ns."""
 
     def boot_up(self, period_ms: int, t_ns: int) -> None:
-        """The boot-up message, sent at ``t_ns``, is the first heartbeat."""
+        """Take the boot-up message as the first heartbeat.
+
+        Args:
+            period_ms: heartbeat period, ms; 0 for no heartbeats.
+            t_ns: when the message was sent, ns.
+        """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Beat every ``period_ms`` from now on, so that no consumer waits for longer than it used to; 0 ends
-        it."""
+        """Send a heartbeat at once and then every period, so that no consumer waits longer than before.
+
+        Args:
+            period_ms: heartbeat period, ms; 0 for no heartbeats.
+            t_ns: present time, ns.
+        """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
 
     def beat(self, t_ns: int) -> bool:
-        """Whether a heartbeat is due at ``t_ns``; the next one is then planned."""
+        """Return whether a heartbeat is due at ``t_ns``, and plan the next if so."""
         if t_ns < self.deadline_ns:
             return False
         self.deadline_ns += self.period_ns
@@ -55,30 +66,33 @@ class _Monitored:
 
 
 class HeartbeatConsumer:
-    """Watches the nodes of object 0x1016.
+    """Monitors the nodes of object 0x1016.
 
-    ``failed`` is called with the time when heartbeats were missed, after their EMCY.
+    Args:
+        store: object dictionary.
+        emcy: reports missed heartbeats and restarts.
+        failed: called with the time in ns at which heartbeats were missed, after their EMCY.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
-        """When the next heartbeat is missed."""
+        """Time at which the next heartbeat is missed, ns."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property
     def node_ids(self) -> list[int]:
-        """Who is listened to."""
+        """Node-IDs of the monitored nodes."""
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Take over 0x1016 as it is after a reset: nobody has been heard yet."""
+        """Take over 0x1016 after a reset: no node has been heard yet."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Take over what was written to 0x1016: the monitoring of a changed entry begins anew."""
+        """Take over a write to 0x1016: monitoring of a changed entry restarts."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -89,29 +103,37 @@ class HeartbeatConsumer:
                 self._monitored[item.node_id] = old if old is not None and same else item
         for node_id, old in before.items():
             if self._monitored.get(node_id) is not old:
-                self._emcy.over(EmcyCode.HEARTBEAT, t_ns, node_id)
+                self._emcy.clear(EmcyCode.HEARTBEAT, t_ns, node_id)
         self._plan()
 
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
-        """A monitored node says in which state it is. A boot-up starts no monitoring, since it does not say
-        that heartbeats will follow; of a node that beat before it tells that it restarted."""
+        """Handle a heartbeat or boot-up message of a monitored node.
+
+        A boot-up message does not start monitoring, because heartbeats need not follow; after a heartbeat it
+        shows that the node restarted.
+
+        Args:
+            node_id: node-ID of the monitored node.
+            state: the state it sent.
+            t_ns: when it was received, ns.
+        """
         item = self._monitored[node_id]
         if state == NmtState.INITIALISING:
             if item.deadline_ns == NO_DEADLINE_NS:
                 return
-            self._emcy.happened(EmcyCode.HEARTBEAT, bytes((node_id, _BOOTED)), t_ns)
+            self._emcy.report_once(EmcyCode.HEARTBEAT, bytes((node_id, _BOOTED)), t_ns)
         item.deadline_ns = t_ns + item.within_ns
-        self._emcy.over(EmcyCode.HEARTBEAT, t_ns, node_id)
+        self._emcy.clear(EmcyCode.HEARTBEAT, t_ns, node_id)
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Tell whose heartbeat has just been missed: once, until it is heard again."""
+        """Report heartbeats that are missed at ``t_ns``: once, until the node is heard again."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():
             if t_ns >= item.deadline_ns:
                 item.deadline_ns = NO_DEADLINE_NS
-                self._emcy.present(EmcyCode.HEARTBEAT, bytes((item.node_id,)), t_ns, item.node_id)
+                self._emcy.report(EmcyCode.HEARTBEAT, bytes((item.node_id,)), t_ns, item.node_id)
         self._plan()
         self._failed(t_ns)
 
@@ -121,11 +143,11 @@ class HeartbeatConsumer:
         )
 
     def _guard(self, subindex: int, value: int) -> None:
-        """An entry without a time, or with a node-ID that no node has, is not used."""
+        """Refuse an entry that monitors a node twice. An entry without time or valid node-ID is not used."""
         if value >> 24:
             raise Refused(AbortCode.INVALID_VALUE)
         node_id, time_ms = value >> 16, value & 0xFFFF
         others = (i for i in range(1, od.HEARTBEAT_CONSUMERS + 1) if i != subindex)
         taken = {self._store.integer(od.HEARTBEAT_CONSUMER, i) for i in others}
         if node_id and time_ms and any(word >> 16 == node_id and word & 0xFFFF for word in taken):
-            raise Refused(AbortCode.INCOMPATIBLE)  # one node, two times
+            raise Refused(AbortCode.INCOMPATIBLE)  # one node with two times

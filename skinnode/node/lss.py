@@ -1,9 +1,8 @@
-"""Layer setting services, the slave's side (CiA 305 v3.0): who gets which node-ID and bit rate, and who is
-there.
+"""LSS slave (CiA 305 v3.0): sets node-ID and bit rate, and answers the search for nodes.
 
-Bytes in, bytes out: no bus and no clock. What a service brings about outside (storing, another bit rate) is
-a callback; whether the node is to boot is asked of :attr:`LssSlave.may_boot`. Requests are served in every
-NMT state, and are all a node without a node-ID serves.
+Takes and returns bytes, without bus or clock. Callbacks store the configuration and change the bit rate;
+:attr:`LssSlave.may_boot` shows whether the node must boot. Requests are served in every NMT state, and a node
+without a node-ID serves nothing else.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from skinnode.node.clock import NO_DEADLINE_NS
 _CIA_301_TABLE: Final = 0
 
 _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
-"""Error codes of the configuration services; 1 has its meaning from the service."""
+"""Error codes of the configuration services; the meaning of 1 depends on the service."""
 
 
-# What each frame of a switch selective and of an identify asks of which part of the address.
+# Part of the address that each frame of *switch selective* and *identify* concerns, and the comparison.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -51,16 +50,16 @@ class LssSlave:
 
     Args:
         address: its identity.
-        node_id: the persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
-        bit_rates_bps: those it can be set to; none where the bit rate is not its own to change.
-        bit_rate_bps: the one configured before; None if none was.
-        store: keeps the pending node-ID and bit rate over a power cycle and raises OSError if that fails;
-            None where nothing can be kept.
+        node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
+        bit_rates_bps: bit rates that it can be set to, bit/s; empty if it cannot change its bit rate.
+        bit_rate_bps: bit rate configured before, bit/s; None if there is none.
+        store: keeps the pending node-ID and bit rate over a power cycle, and raises OSError if that fails;
+            None if nothing can be kept.
         activate: begins the change to the pending bit rate; takes it and the delay in ms, see
             :meth:`on_request`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - keywords with defaults, one for each ability of a slave
         self,
         address: LssAddress,
         node_id: int,
@@ -74,30 +73,33 @@ class LssSlave:
         self._bit_rates_bps = frozenset(bit_rates_bps)
         self._store, self._activate = store, activate
         self.state = LssState.WAITING
+        """Present LSS state."""
         self.node_id = node_id
-        """The active node-ID."""
+        """Active node-ID."""
         self.pending_node_id = node_id
-        """The one from the next reset of communication on."""
+        """Node-ID from the next reset of communication on."""
         self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
+        """Bit rate from the next activation on, bit/s; None to keep the present one."""
         self._next_question = 0
         self._scan_part = 0
 
     @property
     def configured(self) -> bool:
-        """Whether there is a node-ID; without one a node serves LSS and nothing else."""
+        """Whether there is a node-ID; without one a node serves LSS only."""
         return self.node_id != NOT_CONFIGURED
 
     @property
     def may_boot(self) -> bool:
-        """Whether a node without a node-ID has been given one and let go: it is to boot by itself."""
+        """Whether a node without a node-ID has got one and left LSS configuration state: it must boot."""
         return (
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
 
     def reset_node(self) -> None:
-        """Copy the persistent node-ID to the pending node-ID, as at NMT *reset node*: a pending node-ID that
-        was never stored is lost. Call :meth:`reset_communication` afterwards.
+        """Copy the persistent node-ID to the pending node-ID, as at NMT *reset node*.
+
+        A pending node-ID that was never stored is lost. Call :meth:`reset_communication` afterwards.
 
         Two public stacks that follow CiA 305 agree: c-open copies the persistent to the pending node-ID in
         the NMT sub-state *reset application* and the pending to the active node-ID in *reset communication*
@@ -113,13 +115,19 @@ class LssSlave:
         self._scan_part = 0
 
     def on_request(self, data: bytes) -> bytes | None:
-        """Serve a frame of the master; returns the answer, if there is one.
+        """Serve a frame of the master.
 
-        Frames that are not of 8 bytes, not of this protocol, or not for the present state, are ignored as the
-        standard wants it: they may be meant for other slaves.
+        A frame that does not have 8 bytes, belongs to another protocol or does not fit the present state is
+        ignored, as the standard demands: it may be meant for other slaves.
 
-        After *activate bit timing* the node falls silent at once, changes its bit rate one delay later and
-        may speak again after another: time for the slowest on the bus to have changed.
+        After *activate bit timing* the node stops sending at once, changes its bit rate after one delay, and
+        may send again after another: all other nodes have changed by then.
+
+        Args:
+            data: the payload.
+
+        Returns:
+            The answer, if there is one.
         """
         if len(data) != 8:
             return None
@@ -152,7 +160,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Whether this question and all before it, asked in their order, were answered with yes."""
+        """Return whether the address agrees with this question and with all before it, asked in order."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -160,8 +168,10 @@ class LssSlave:
         return agreed
 
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
-        """One question of the search: are the bits of the address from ``bit`` up those of ``value``? Silence
-        means no, so that many slaves can be asked at once."""
+        """Answer whether the address agrees with ``value`` from ``bit`` upwards.
+
+        No answer means no, so that many slaves can be asked at once.
+        """
         if bit == RESET_SCAN:
             self._scan_part = 0
         else:
@@ -170,7 +180,7 @@ class LssSlave:
             if (self._address[part] ^ value) >> bit:
                 return None
             self._scan_part = next_part
-            if bit == 0 and next_part < part:  # all four parts agree: this one is found
+            if bit == 0 and next_part < part:  # all four parts agree: this slave is found
                 self._enter(LssState.CONFIGURATION)
         return _frame(LssCommand.IDENTIFIED)
 
@@ -212,10 +222,10 @@ class LssSlave:
 
 
 class BitRateChange:
-    """The two delays of *activate bit timing*: silence until one after the change, which comes one after the
-    request.
+    """The two delays of *activate bit timing*, before and after the change of the bit rate.
 
-    ``set_bit_rate`` changes it; None where that is not the node's own to do.
+    Args:
+        set_bit_rate: changes the bit rate (bit/s); None if the node cannot change it.
     """
 
     def __init__(self, set_bit_rate: Callable[[int], None] | None) -> None:
@@ -223,16 +233,22 @@ class BitRateChange:
         self._bit_rate_bps: int | None = None
         self._change_ns = self._over_ns = NO_DEADLINE_NS
         self.deadline_ns = NO_DEADLINE_NS
-        """When :meth:`silent` is to be asked next."""
+        """Time of the next call of :meth:`silent`, ns."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
-        """The request came at ``t_ns``; None for a bit rate that stays as it is."""
+        """Begin the change.
+
+        Args:
+            bit_rate_bps: new bit rate, bit/s; None to keep the present one.
+            delay_ms: the delay of the request, ms.
+            t_ns: when the request was received, ns.
+        """
         self._bit_rate_bps = bit_rate_bps
         self._change_ns = self.deadline_ns = t_ns + delay_ms * 1_000_000
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Whether the node has to keep silent and is deaf. Changes the bit rate when it is time."""
+        """Return whether the node must neither send nor receive. Changes the bit rate when it is time."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:
@@ -244,7 +260,7 @@ class BitRateChange:
         return self.deadline_ns != NO_DEADLINE_NS
 
     def cancel(self) -> None:
-        """The power is gone."""
+        """Cancel the change at power-off."""
         self.deadline_ns = NO_DEADLINE_NS
 
 

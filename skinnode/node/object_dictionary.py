@@ -1,10 +1,10 @@
-"""The object dictionary of a running node: the declarations of the profile, and the values.
+"""The object dictionary of a running node: declarations and values.
 
-Declarations come from :mod:`skinnode.protocol.profile`, which also generates the EDS files. Values
+Declarations come from :mod:`skinnode.protocol.objects`, from which the EDS files are generated too. Values
 are the bytes that travel (little-endian), so that an SDO answer and a PDO are slices and a joined list. An
-object may be computed when it is read (:meth:`ObjectStore.bind`), may refuse a value
-(:meth:`ObjectStore.guard`) and may act on one that was accepted (:meth:`ObjectStore.watch`); a DOMAIN may be
-kept by somebody else (:meth:`ObjectStore.bind_domain`). A refused write changes nothing.
+object can be computed when it is read (:meth:`ObjectStore.bind`), refuse a value (:meth:`ObjectStore.guard`)
+or act on an accepted value (:meth:`ObjectStore.watch`); a DOMAIN can be stored elsewhere
+(:meth:`ObjectStore.bind_domain`). A refused write changes nothing.
 """
 
 from __future__ import annotations
@@ -17,40 +17,59 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Memory there is for a value whose length nothing limits."""
+"""Maximum length of a value without a limit of its own, bytes."""
 
 Reader = Callable[[int], bytes]
-"""Sub-index to value; may refuse."""
+"""Takes a sub-index and returns the value; may raise Refused."""
 Guard = Callable[[int, int], None]
-"""Sub-index and proposed value (the bit pattern of a REAL32); raises Refused."""
+"""Takes sub-index and proposed value (the bit pattern of a REAL32); may raise Refused."""
 Watcher = Callable[[int], None]
-"""Called with the sub-index that has just been written."""
+"""Takes the sub-index that has just been written."""
 ChangeWatcher = Callable[[int, int], None]
-"""Called with index and sub-index of a parameter that has another value now."""
+"""Takes index and sub-index of a parameter whose value has changed."""
 DomainWriter = Callable[[bytes], None]
-"""Takes a whole value, or refuses it and changes nothing."""
+"""Takes a whole value; may raise Refused, and then changes nothing."""
 
 
 class Lengths(NamedTuple):
-    """Bytes that a client may write to an object."""
+    """The lengths of a value that a client may write to an object, bytes."""
 
     least: int
+    """Minimum length, bytes."""
     most: int
+    """Maximum length, bytes."""
 
     def check(self, length: int) -> None:
-        """Refuse a value of another length."""
+        """Check the length of a whole value.
+
+        Raises:
+            Refused: if the object does not take it.
+        """
         self.check_not_above(length)
         if length < self.least:
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Refuse what is too long already."""
+        """Check the length of the first part of a value.
+
+        Raises:
+            Refused: if it is too long already.
+        """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
 
 
 def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
-    """A value as it travels. Raises OverflowError or struct.error for one that the type cannot hold."""
+    """Return the bytes of a value as they are sent.
+
+    Args:
+        entry: declaration of the object.
+        value: its value; bytes are returned unchanged.
+
+    Raises:
+        OverflowError: if the integer type cannot hold the value.
+        struct.error: if REAL32 cannot hold the value.
+    """
     if isinstance(value, bytes):
         return value
     if isinstance(value, str):
@@ -61,18 +80,21 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
 
 class ObjectStore:
-    """Values of all objects of one node.
+    """The values of all objects of one node.
 
-    ``read`` and ``write`` are a client's accesses and refuse with :class:`~skinnode.canopen.abort.Refused`;
-    ``raw``,
-    ``integer`` and ``put`` are the node's own, on objects it knows to exist.
+    ``read`` and ``write`` are accesses of a client and raise :class:`~skinnode.canopen.abort.Refused`;
+    ``raw``, ``integer`` and ``put`` are accesses of the node to objects that exist.
+
+    Args:
+        objects: the declarations.
+        node_id: added to COB-IDs by default.
     """
 
     def __init__(self, objects: Iterable[Object], node_id: int) -> None:
         self._entries = {(e.index, e.subindex): e for item in objects for e in item.entries}
         self._indices = {index for index, _ in self._entries}
         self.node_id = node_id
-        """What COB-IDs follow by default; see :meth:`renumber`."""
+        """Node-ID that is added to COB-IDs by default; see :meth:`renumber`."""
         self._values = {key: self._at_start(entry) for key, entry in self._entries.items()}
         self._readers: dict[tuple[int, int], Reader] = {}
         self._guards: dict[int, Guard] = {}
@@ -85,16 +107,27 @@ class ObjectStore:
         return bytes(entry.data_type.bits // 8) if value is None else to_bytes(entry, value)
 
     def bind(self, index: int, reader: Reader, *, count: bool = False) -> None:
-        """Compute the sub-objects of ``index`` when they are read; sub-index 0 of an array or record, its
-        count, only if ``count`` is set."""
+        """Compute the sub-objects of an object when they are read.
+
+        Args:
+            index: the object.
+            reader: returns the value of a sub-index.
+            count: whether to compute sub-index 0 of an array or record too.
+        """
         whole = count or (index, 1) not in self._entries
         for key in self._entries:
             if key[0] == index and (key[1] or whole):
                 self._readers[key] = reader
 
     def bind_domain(self, index: int, length: int, reader: Reader, writer: DomainWriter) -> None:
-        """Let ``reader`` and ``writer`` keep the value of a writable DOMAIN, which always has ``length``
-        bytes."""
+        """Store the value of a writable DOMAIN elsewhere.
+
+        Args:
+            index: the object.
+            length: length of every value, bytes.
+            reader: returns the value.
+            writer: takes the value.
+        """
         self._readers[index, 0] = reader
         self._domains[index] = Lengths(length, length), writer
 
@@ -107,23 +140,30 @@ class ObjectStore:
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Call ``watcher`` after a client gave a parameter, a writable object that is not computed, another
-        value."""
+        """Call ``watcher`` after a client has changed a parameter: a writable object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
-        """The declaration. Refuses an object or a sub-object that does not exist."""
+        """Return the declaration of an object.
+
+        Raises:
+            Refused: if the object or sub-object does not exist.
+        """
         entry = self._entries.get((index, subindex))
         if entry is None:
             raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
         return entry
 
     def has(self, index: int, subindex: int) -> bool:
-        """Whether there is such an object."""
+        """Return whether the object exists."""
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Bytes that may be written to an object; refuses one that may not be written."""
+        """Return the lengths of a value that a client may write.
+
+        Raises:
+            Refused: if the object does not exist or is read-only.
+        """
         entry = self.find(index, subindex)
         if entry.access in ("ro", "const"):
             raise Refused(AbortCode.READ_ONLY)
@@ -133,13 +173,21 @@ class ObjectStore:
         return Lengths(size, size) if size else Lengths(0, MAX_BYTES)
 
     def read(self, index: int, subindex: int) -> bytes:
-        """A client's upload."""
+        """Read an object for a client.
+
+        Raises:
+            Refused: if the object does not exist or is write-only.
+        """
         if self.find(index, subindex).access == "wo":
             raise Refused(AbortCode.WRITE_ONLY)
         return self.raw(index, subindex)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """A client's download: checked against declaration and guard, stored, then announced."""
+        """Write an object for a client: check declaration and guard, store, then call the watcher.
+
+        Raises:
+            Refused: if the value is not allowed; nothing has changed then.
+        """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
             self._domains[index][1](data)
@@ -164,30 +212,32 @@ class ObjectStore:
             guard(subindex, value)
 
     def raw(self, index: int, subindex: int) -> bytes:
-        """The bytes of an object, computed if it is bound."""
+        """Return the bytes of an object, computed if it is bound."""
         reader = self._readers.get((index, subindex))
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """The bytes a client has written, also where reading computes something else."""
+        """Return the bytes that a client has written, even if reading computes others."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:
-        """The value of an unsigned object that is not bound."""
+        """Return the value of an unsigned object that is not bound."""
         return int.from_bytes(self._values[index, subindex], "little")
 
     def put(self, index: int, subindex: int, value: Value | bytes) -> None:
-        """Set an object from within the node; nobody is asked or told."""
+        """Set an object from within the node, without guard or watcher."""
         self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
 
     def restore(self, first: int, last: int) -> None:
-        """Writable objects from ``first`` to ``last`` as they were at start."""
+        """Give the writable objects from index ``first`` to ``last`` their default values."""
         for key in self._writable(first, last):
             self._values[key] = self._at_start(self._entries[key])
 
     def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
-        """Parameters from ``first`` to ``last`` that have another value than after :meth:`restore`; what is
-        computed is no parameter."""
+        """Return the parameters from index ``first`` to ``last`` that differ from their defaults.
+
+        Computed objects are not parameters.
+        """
         return {
             key: self._values[key]
             for key in self._writable(first, last)
@@ -200,8 +250,10 @@ class ObjectStore:
                 yield key
 
     def renumber(self, node_id: int) -> None:
-        """The node has another node-ID from now on. COB-IDs that may be written follow with the next
-        :meth:`restore`, the others at once."""
+        """Change the node-ID.
+
+        Read-only COB-IDs follow at once, writable COB-IDs with the next :meth:`restore`.
+        """
         self.node_id = node_id
         for key, entry in self._entries.items():
             if entry.plus_node_id and entry.access in ("ro", "const"):

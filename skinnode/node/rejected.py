@@ -1,4 +1,4 @@
-"""Counters of frames that no standard answers: ignored, and yet somebody on the bus sends them."""
+"""Counters of malformed frames, which a node ignores because the standard defines no answer (0x2040)."""
 
 from __future__ import annotations
 
@@ -12,39 +12,43 @@ _MOST: Final = 0xFFFF_FFFF
 
 
 class Rejected(IntEnum):
-    """What was wrong; the value is the sub-index of object 0x2040."""
+    """Reason for a rejection; the value is the sub-index of object 0x2040."""
 
     NMT = 1
     """Not two bytes, or an unknown command for this node."""
     SYNC = 2
-    """Longer or shorter than 0x1019 says."""
+    """Longer or shorter than 0x1019 demands."""
     TIME = 3
-    """Not six bytes, or no time of a day."""
+    """Not six bytes, or not a time of day."""
     HEARTBEAT = 4
-    """Of a monitored node, not one byte."""
+    """From a monitored node, but not one byte."""
     SDO = 5
     """A request that is not eight bytes."""
     RPDO = 6
-    """Shorter than what is mapped."""
+    """Shorter than the mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """A boot-up or heartbeat with this node's own node-ID: there is another one."""
+    """A boot-up or heartbeat with this node's own node-ID: another node has it too."""
 
 
 class RejectedFrames:
-    """Object 0x2040. Counts from power-on or reset node on, and stays at its maximum."""
+    """Object 0x2040: counts from power-on or *reset node*, and stops at its maximum.
+
+    Args:
+        store: object dictionary.
+    """
 
     def __init__(self, store: ObjectStore) -> None:
         self._counts = dict.fromkeys(Rejected, 0)
         store.bind(od.REJECTED_FRAMES, lambda sub: self._counts[Rejected(sub)].to_bytes(4, "little"))
 
     def count(self, kind: Rejected) -> None:
-        """One more."""
+        """Count one frame."""
         self._counts[kind] = min(self._counts[kind] + 1, _MOST)
 
     def counted(self, kind: Rejected) -> int:
-        """How many so far."""
+        """Return the number of frames so far."""
         return self._counts[kind]
 
     def reset(self) -> None:
-        """As after power-on."""
+        """Set all counters to 0, as after power-on."""
         self._counts = dict.fromkeys(Rejected, 0)

@@ -1,4 +1,4 @@
-"""Drives nodes on a bus: one thread for all boards that share an endpoint."""
+"""Runs nodes on a bus: one thread for all nodes that share a port."""
 
 from __future__ import annotations
 
@@ -18,29 +18,34 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Longest wait for a frame: how soon the thread sees that it should end."""
+"""Longest wait for a frame, s; also the longest delay before the thread ends."""
 
 _RETRY_S: Final = 0.02
-"""Pause after an error of the bus: a queue that was full has drained by then."""
+"""Pause after a bus error, s: a full queue has drained by then."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Frames that are heard before somebody is called silent: half a second of a full bus at 1 Mbit/s."""
+"""Maximum frames served before a node counts as silent: half a second of a full bus at 1 Mbit/s."""
 
 OFF_AFTER_S: Final = 0.1
-"""A bus on which everything has failed for this long is off to the nodes: a full queue drains sooner."""
+"""Time without any success after which the nodes take the bus as off, s; a full queue drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""An interface that does nothing but fail for this long may be another one by now, plugged in again: it is
-opened anew, and again after as long."""
+"""Time of nothing but failures after which the interface is opened again, s: it may have been replugged."""
 
 
 class NodeRunner:
-    """Powers ``nodes`` on and keeps them going until :meth:`stop`.
+    """Powers nodes on and runs them until :meth:`stop`.
 
-    Raises ValueError for no nodes, or for two with the same node-ID; any number may have none yet. A runner
-    runs once. It does not end because of the bus, however long that is away. The nodes belong to the thread
-    from :meth:`start` to :meth:`stop`; only counters may be looked at meanwhile. The port stays open. Timers
-    are kept as closely as the most exact of the nodes wants it.
+    A runner runs once, and does not end because of bus errors. Its thread owns the nodes from :meth:`start`
+    to :meth:`stop`; other threads may read their counters only. The port stays open. Timers are as exact as
+    the most exact of the nodes demands.
+
+    Args:
+        port: the port that all nodes share.
+        nodes: the nodes; several may have no node-ID yet.
+
+    Raises:
+        ValueError: if there are no nodes, or two have the same node-ID.
     """
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
@@ -54,30 +59,35 @@ class NodeRunner:
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
         self._slack_ns = min(node.pacing.slack_ns for node in self.nodes)
         self.bus_errors = 0
-        """Errors of the bus that the nodes got over."""
+        """Number of bus errors that the nodes survived."""
         self.bus_error = ""
-        """What they began with the last time, in one line."""
+        """First error of the latest series, in one line."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        self._sent_before = 0  # frames, when everything had begun to fail: one more, and the bus is back
+        self._sent_before = 0  # frames sent when the bus went off: one more, and it is back
         self._powered, self._stopping = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
 
     @property
     def failed(self) -> bool:
-        """Whether the thread has ended by an error; :meth:`stop` raises it."""
+        """Whether an error has ended the thread; :meth:`stop` raises it."""
         return self._error is not None
 
     def start(self) -> None:
-        """Power on, in the order of the nodes, and return when they have their node-IDs; what goes wrong is
-        raised by :meth:`stop`."""
+        """Power the nodes on in their order, and return when they have their node-IDs.
+
+        :meth:`stop` raises an error of the thread.
+        """
         self._thread.start()
         self._powered.wait()
 
     def stop(self) -> None:
-        """End and join the thread; the nodes are off. Raises what ended the thread before, and does nothing
-        when called again."""
+        """End and join the thread and power the nodes off. Does nothing when called again.
+
+        Raises:
+            BaseException: the error that ended the thread before.
+        """
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -96,7 +106,7 @@ class NodeRunner:
         try:
             self.stop()
         except Exception:
-            if error is None:  # otherwise what went wrong first is on its way already
+            if error is None:  # otherwise the first error is being raised already
                 raise
 
     def _run(self) -> None:
@@ -106,7 +116,7 @@ class NodeRunner:
                 node.power_on(now_ns)
             self._powered.set()
             self._drive()
-        except BaseException as error:  # whatever it is, it belongs to whoever calls stop()
+        except BaseException as error:  # stop() raises it
             self._error = error
         finally:
             self._powered.set()
@@ -121,26 +131,26 @@ class NodeRunner:
             try:
                 self._turn()
             except BusError as error:
-                # What could not be sent is lost, as on any bus; the nodes go on.
+                # A frame that could not be sent is lost, as on any bus; the nodes continue.
                 self.bus_errors += 1
                 now_s = time.monotonic()
                 if failing_since_s is None:
                     failing_since_s = opened_s = now_s
                     self.bus_error = str(error)
                 if now_s - failing_since_s > OFF_AFTER_S and self._bus_state is not BusState.OFF:
-                    self._tell(BusState.OFF)
+                    self._set_bus_state(BusState.OFF)
                     self._sent_before = self._port.sent
                 if now_s - opened_s > REOPEN_S:
                     opened_s = now_s
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            if self._port.sent + self._heard > moved:  # a turn with nothing to do proves nothing
+            if self._port.sent + self._heard > moved:  # a round without frames proves nothing
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
-                self._tell(BusState.ACTIVE)
+                self._set_bus_state(BusState.ACTIVE)
 
-    def _tell(self, state: BusState) -> None:
+    def _set_bus_state(self, state: BusState) -> None:
         self._bus_state = state
         now_ns = time.monotonic_ns()
         for node in self.nodes:
@@ -148,16 +158,16 @@ class NodeRunner:
                 node.on_bus(state, now_ns)
 
     def _on_error_frame(self, frame: Frame) -> None:
-        if self._port.config.interface == "socketcan":  # others put other things into them
+        if self._port.config.interface == "socketcan":  # other interfaces define error frames differently
             state = bus_state(frame)
             if state is not None:
-                self._tell(state)
+                self._set_bus_state(state)
                 self._sent_before = 1 << 63  # frames queued for a controller that is off are not sent
 
     def _turn(self) -> None:
-        """Serve all nodes and at most one frame; returns when there is something to do, or now and then."""
+        """Serve all timers and at most one frame; return when there is something to do, or after a while."""
         nodes, clock = self.nodes, time.monotonic_ns
-        # One time for all: nodes that started together stay together, and the thread wakes once for all.
+        # One time for all nodes, so that nodes that started together share one wake-up of the thread.
         now_ns, first_ns = clock(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
@@ -179,8 +189,10 @@ class NodeRunner:
             raise failure
 
     def _catch_up(self, now_ns: int) -> BusError | None:
-        """Serve the frames that came before ``now_ns``: a heartbeat that came in time has not been missed,
-        whatever kept this thread from hearing it."""
+        """Serve the frames received before ``now_ns``.
+
+        A heartbeat received in time is not missed, even if this thread was held up.
+        """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):
             frame = self._port.recv(0.0)
@@ -192,14 +204,14 @@ class NodeRunner:
         return failure
 
     def _serve(self, frame: Frame) -> BusError | None:
-        """Give a frame to all nodes. An error of one is returned, the others are served all the same."""
+        """Give a frame to all nodes. An error of one node is returned after the others have been served."""
         failure: BusError | None = None
         if frame.error:
             self._on_error_frame(frame)
         elif not (frame.extended or (frame.fd and not self._fd)):
             self._heard += 1
             if self._bus_state is BusState.OFF:
-                self._tell(BusState.ACTIVE)
+                self._set_bus_state(BusState.ACTIVE)
             for node in self.nodes:
                 try:
                     node.on_frame(frame.can_id, frame.data, frame.t_ns, frame.remote)

@@ -1,33 +1,34 @@
-"""SYNC consumer and producer: objects 0x1005, 0x1006, 0x1007 and 0x1019 (CiA 301 v4.2, 7.2.5, 7.5.2.5 to
-7.5.2.7 and 7.5.2.22)."""
+"""SYNC consumer and producer: objects 0x1005, 0x1006, 0x1007 and 0x1019.
+
+CiA 301 v4.2, 7.2.5, 7.5.2.5 to 7.5.2.7 and 7.5.2.22.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 from skinnode.canopen import indices as od
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.emergency import EmcyCode
-from skinnode.node.clock import NO_DEADLINE_NS, Clock
+from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
-from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.node.rejected import Rejected
+from skinnode.node.services import NodeServices
 
 PRODUCER_BIT: Final = 1 << 30
-"""Of 0x1005: the device generates SYNC."""
+"""Bit of 0x1005 that makes the device produce SYNC."""
 
 SHORTEST_PERIOD_US: Final = 100
-"""Of 0x1006: a SYNC takes half of it at 1 Mbit/s."""
-
+"""Shortest cycle period (0x1006), µs: a SYNC takes half of it at 1 Mbit/s."""
 
 _DO_NOT_CARE_BIT: Final = 1 << 31
 """Bit of 0x1005 that may be written and has no meaning (CiA 301 v4.2, table 44)."""
 
 
 class SyncWindow:
-    """Time after a SYNC within which synchronous PDOs are valid (0x1007, µs; 0: no limit)."""
+    """The time after a SYNC within which synchronous PDOs are valid (0x1007, µs; 0 for no limit)."""
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
         self._store, self._emcy = store, emcy
@@ -42,7 +43,7 @@ class SyncWindow:
         """Forget the last SYNC and any missed TPDO, because the node entered another NMT state."""
         self._sync_ns = None
         for number in tuple(self._missed):
-            self._over(number, t_ns)
+            self._clear(number, t_ns)
 
     def is_open(self, t_ns: int) -> bool:
         """Return whether synchronous PDOs are valid at ``t_ns``. Before the first SYNC they are."""
@@ -50,45 +51,51 @@ class SyncWindow:
         return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
 
     def lets_out(self, number: int, t_ns: int) -> bool:
-        """Return whether the synchronous TPDO ``number``, counted from 0, may be sent at ``t_ns``. If not,
-        the caller discards it; an emergency reports this once until the TPDO is in time again."""
+        """Return whether a synchronous TPDO may be sent; if not, the caller discards it.
+
+        An emergency reports a discarded TPDO once, until it is in time again.
+
+        Args:
+            number: number of the TPDO, counted from 0.
+            t_ns: present time, ns.
+        """
         if self.is_open(t_ns):
-            self._over(number, t_ns)
+            self._clear(number, t_ns)
             return True
         self._missed.add(number)
-        self._emcy.present(EmcyCode.SYNC_WINDOW, (number + 1).to_bytes(2, "little"), t_ns, number)
+        self._emcy.report(EmcyCode.SYNC_WINDOW, (number + 1).to_bytes(2, "little"), t_ns, number)
         return False
 
-    def _over(self, number: int, t_ns: int) -> None:
+    def _clear(self, number: int, t_ns: int) -> None:
         if number in self._missed:
             self._missed.discard(number)
-            self._emcy.over(EmcyCode.SYNC_WINDOW, t_ns, number)
+            self._emcy.clear(EmcyCode.SYNC_WINDOW, t_ns, number)
 
 
 class Sync:
-    """Takes SYNC messages, checks their counter, and makes them where 0x1005 says so.
+    """Consumes SYNC messages, checks their length, and produces them if 0x1005 says so.
 
-    A device that produces SYNC obeys its own too, so whoever drives this does the same for :meth:`on_frame`
-    and :meth:`on_timer`.
+    A device that produces SYNC obeys its own, so the caller treats a SYNC that :meth:`on_timer` returns like
+    one that :meth:`accept` accepts.
+
+    Args:
+        services: the shared parts of the node.
     """
 
-    def __init__(
-        self,
-        store: ObjectStore,
-        emcy: EmcyProducer,
-        rejected: RejectedFrames,
-        send: Callable[[int, bytes], None],
-        now: Clock,
-    ) -> None:
-        self._store, self._emcy, self._rejected, self._send, self._now = store, emcy, rejected, send, now
-        self.window = SyncWindow(store, emcy)
+    def __init__(self, services: NodeServices) -> None:
+        store = services.store
+        self._store, self._emcy, self._rejected = store, services.emcy, services.rejected
+        self._send, self._now = services.send, services.now
+        self.window = SyncWindow(store, services.emcy)
+        """The synchronous window."""
         self._communicates = False
         self._period_ns = 0
         self._counter = 0  # of the last SYNC produced
         self._wrong_length: int | None = None  # of the last SYNC consumed
         self.cob_id = od.SYNC_COB_ID
+        """COB-ID of SYNC messages."""
         self.deadline_ns = NO_DEADLINE_NS
-        """When a SYNC is to be sent."""
+        """Time at which a SYNC is to be sent, ns."""
         store.guard(od.COB_ID_SYNC, self._guard_cob_id)
         store.guard(od.CYCLE_PERIOD, _guard_period)
         store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_overflow)
@@ -102,14 +109,19 @@ class Sync:
         return bool(self._store.integer(od.COB_ID_SYNC) & PRODUCER_BIT)
 
     def reload(self) -> None:
-        """Objects were written, or all were reset. The next SYNC of a producer comes one period later; it is
-        the first, and its counter 1, if there was none before."""
+        """Take over written or reset objects.
+
+        The next SYNC of a producer comes one period later; the first one has counter 1.
+        """
         self.cob_id = self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK
         self._start()
 
     def enter(self, *, communicates: bool) -> None:
-        """The node entered another state. SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL;
-        whoever comes from another state begins to count at 1."""
+        """Follow a change of the NMT state.
+
+        SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL; the counter restarts at 1 on entry
+        from another state.
+        """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
             self._start()
@@ -122,7 +134,7 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """Send the SYNC that is due, and return it. Free of drift; what was missed is not made up for."""
+        """Send the SYNC that is due, and return it. Without drift; missed SYNCs are not sent later."""
         if t_ns < self.deadline_ns:
             return None
         self.deadline_ns += (t_ns - self.deadline_ns) // self._period_ns * self._period_ns + self._period_ns
@@ -134,7 +146,14 @@ class Sync:
         return message
 
     def accept(self, message: bytes, t_ns: int) -> bool:
-        """Whether a SYNC is one: a length other than that of 0x1019 is told, once until it changes."""
+        """Return whether a SYNC has the length that 0x1019 demands.
+
+        Another length is reported once, until it changes.
+
+        Args:
+            message: the payload.
+            t_ns: when it was received, ns.
+        """
         counted = self._overflow > 0
         if len(message) == counted:
             self._wrong_length = None
@@ -142,7 +161,7 @@ class Sync:
         self._rejected.count(Rejected.SYNC)
         if len(message) != self._wrong_length:
             self._wrong_length = len(message)
-            self._emcy.happened(EmcyCode.SYNC_LENGTH, bytes((len(message), counted)), t_ns)
+            self._emcy.report_once(EmcyCode.SYNC_LENGTH, bytes((len(message), counted)), t_ns)
         return False
 
     # --- guards

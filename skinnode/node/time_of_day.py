@@ -1,7 +1,7 @@
-"""TIME: the time of day that somebody on the bus sends (CiA 301 v4.2, 7.2.6 and object 0x1012).
+"""TIME consumer: the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A device has no clock on the wall. It keeps the last time it was told and when that was on its own clock, so
-that object 0x2022 says the time at any moment, and a scan's device time can be dated.
+A device has no real-time clock. It keeps the last time received and when that was on its own clock, so that
+object 0x2022 gives the time of day at any moment, and a scan's device time can be dated.
 """
 
 from __future__ import annotations
@@ -24,42 +24,55 @@ _MS_MASK: Final = (1 << 28) - 1
 
 
 class TimeConsumer:
-    """The time of day by TIME messages. ``now`` is the time of the event being handled."""
+    """The time of day from TIME messages.
+
+    Args:
+        store: object dictionary.
+        now: time of the event being handled, ns.
+    """
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        self._told_ms = 0  # since 1984-01-01, at _told_ns of the node's clock
-        self._told_ns = 0
+        self._received_ms = 0  # since 1984-01-01, at _received_ns of the node's clock
+        self._received_ns = 0
         self._messages = 0
         store.guard(od.COB_ID_TIME, self._guard)
         store.bind(od.TIME_OF_DAY, self._read)
 
     @property
     def cob_id(self) -> int | None:
-        """Where to listen; None if not at all."""
+        """COB-ID of TIME messages; None if the node does not consume them."""
         word = self._store.integer(od.COB_ID_TIME)
         return word & COB_ID_MASK if word & _CONSUMES else None
 
     def on_time(self, data: bytes, t_ns: int) -> bool:
-        """A TIME message, received at ``t_ns``. False, and nothing changes, if it holds no time of a day."""
+        """Take a TIME message.
+
+        Args:
+            data: the payload.
+            t_ns: when it was received, ns.
+
+        Returns:
+            False, without any change, if the payload is not a time of day.
+        """
         if len(data) != _FORMAT.size:
             return False
         ms, days = _FORMAT.unpack(data)
         ms &= _MS_MASK
         if ms >= _DAY_MS:
             return False
-        self._told_ms, self._told_ns = days * _DAY_MS + ms, t_ns
+        self._received_ms, self._received_ns = days * _DAY_MS + ms, t_ns
         self._messages = min(self._messages + 1, 0xFFFF_FFFF)
         return True
 
     def reset(self) -> None:
-        """The node was reset: it knows no time."""
-        self._told_ms = self._told_ns = self._messages = 0
+        """Forget the time, as after a reset."""
+        self._received_ms = self._received_ns = self._messages = 0
 
     def _read(self, subindex: int) -> bytes:
-        """Object 0x2022; all zero before the first message."""
-        passed_ms = (self._now() - self._told_ns) // 1_000_000 if self._messages else 0
-        days, ms = divmod(self._told_ms + passed_ms, _DAY_MS)
+        """Return a sub-object of 0x2022; zero before the first message."""
+        passed_ms = (self._now() - self._received_ns) // 1_000_000 if self._messages else 0
+        days, ms = divmod(self._received_ms + passed_ms, _DAY_MS)
         match subindex:
             case od.TIME_DAYS:
                 return (days & 0xFFFF).to_bytes(2, "little")
@@ -68,14 +81,13 @@ class TimeConsumer:
             case od.TIME_MESSAGES:
                 return self._messages.to_bytes(4, "little")
             case _:
-                return (self._told_ns // 1000 & 0xFFFF_FFFF).to_bytes(4, "little")
+                return (self._received_ns // 1000 & 0xFFFF_FFFF).to_bytes(4, "little")
 
     def _guard(self, _: int, value: int) -> None:
-        """This node does not produce TIME. It stops consuming before it is given another COB-ID."""
+        """Refuse to produce TIME, and a new COB-ID while the node consumes TIME."""
         current = self._store.integer(od.COB_ID_TIME)
         if value & _PRODUCES:
             raise Refused(AbortCode.INVALID_VALUE)
-        # The other way round than elsewhere: bit 31 says that it is used. Restricted CAN-IDs are refused
-        # either way.
+        # Bit 31 means "in use" here, not "invalid" as in other COB-IDs. Restricted CAN-IDs are never allowed.
         check_cob_id(value ^ _CONSUMES, current ^ _CONSUMES)
         check_cob_id(value & ~_CONSUMES, INVALID_BIT)

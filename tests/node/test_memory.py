@@ -18,16 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinnode.files.file_lock import FileInUse
-from skinnode.node.memory import (
-    Fault,
-    FileMemory,
-    Kept,
-    MemoryFault,
-    Parameters,
-    VolatileMemory,
-    pack,
-    unpack,
-)
+from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters, VolatileMemory
+from skinnode.node.memory_file import FileMemory, pack, unpack
 
 KEPT = Kept(
     "2x6-u16-00c0ffee",
@@ -105,11 +97,11 @@ class TestFilesOfNoUse:
         [("node_id", 0), ("node_id", "9"), ("bit_rate_bps", 1), ("application", []), ("baseline_ohm", [1])],
     )
     def test_a_right_checksum_does_not_make_it_right(self, key: str, value: object) -> None:
-        from skinnode.node import memory
+        from skinnode.node import memory_file
 
         document = json.loads(pack(KEPT))
         document["content"][key] = value
-        document["checksum"] = memory._checksum(document["content"])
+        document["checksum"] = memory_file._checksum(document["content"])
         with pytest.raises(MemoryFault, match="no memory of a node"):
             unpack(json.dumps(document).encode())
 
@@ -216,7 +208,7 @@ class TestOthersInTheFolder:
 
 OWNER = """
 import sys
-from skinnode.node.memory import FileMemory
+from skinnode.node.memory_file import FileMemory
 
 memory = FileMemory(sys.argv[1])
 memory.claim()
@@ -260,7 +252,7 @@ class TestOneOwner:
     def test_many_at_once(self, path: Path) -> None:
         """Processes that claim and release as fast as they can: never two owners."""
         script = (
-            "import os, sys\nfrom skinnode.node.memory import FileMemory\n"
+            "import os, sys\nfrom skinnode.node.memory_file import FileMemory\n"
             "memory, mark, had = FileMemory(sys.argv[1]), sys.argv[1] + '.mark', 0\n"
             "for _ in range(2000):\n"
             "    try: memory.claim()\n"
@@ -280,7 +272,8 @@ class TestOneOwner:
 
 WRITER = """
 import os, sys
-from skinnode.node.memory import FileMemory, Kept, Parameters
+from skinnode.node.memory import Kept, Parameters
+from skinnode.node.memory_file import FileMemory
 
 def configuration(i):
     group = Parameters(i % 127 + 1, {(0x2000 + j, i % 255): i.to_bytes(4, "little") for j in range(i % 50)})

@@ -235,28 +235,28 @@ class TestLastingErrors:
 
     def test_told_once(self, emcy: EmcyProducer, told: list[str]) -> None:
         for t_ns in range(5):
-            emcy.present(EmcyCode.HARDWARE, b"\x01", t_ns)
+            emcy.report(EmcyCode.HARDWARE, b"\x01", t_ns)
         assert told == ["084 00 50 81 01 00 00 00 00"]
 
     def test_told_again_with_something_new_to_say(self, emcy: EmcyProducer, told: list[str]) -> None:
-        emcy.present(EmcyCode.HARDWARE, b"\x01", 0)
-        emcy.present(EmcyCode.HARDWARE, b"\x02", 1)
-        emcy.over(EmcyCode.HARDWARE, 2)
+        emcy.report(EmcyCode.HARDWARE, b"\x01", 0)
+        emcy.report(EmcyCode.HARDWARE, b"\x02", 1)
+        emcy.clear(EmcyCode.HARDWARE, 2)
         assert told[1:] == ["084 00 50 81 02 00 00 00 00", "084 00 00 00 00 50 00 00 00"]
 
     def test_what_is_over_at_once_leaves_the_others(self, emcy: EmcyProducer, told: list[str]) -> None:
-        emcy.present(EmcyCode.HARDWARE, b"", 0)
-        emcy.happened(EmcyCode.BUS_OFF_RECOVERED, b"", 1)
+        emcy.report(EmcyCode.HARDWARE, b"", 0)
+        emcy.report_once(EmcyCode.BUS_OFF_RECOVERED, b"", 1)
         assert told[1:] == ["084 40 81 91 00 00 00 00 00", "084 00 00 81 40 81 00 00 00"]
 
     def test_register_holds_what_is_left(self, emcy: EmcyProducer, told: list[str]) -> None:
-        emcy.present(EmcyCode.HARDWARE, b"", 0)
-        emcy.present(EmcyCode.HEARTBEAT, b"\x05", 1, 5)
-        emcy.present(EmcyCode.HEARTBEAT, b"\x06", 2, 6)
+        emcy.report(EmcyCode.HARDWARE, b"", 0)
+        emcy.report(EmcyCode.HEARTBEAT, b"\x05", 1, 5)
+        emcy.report(EmcyCode.HEARTBEAT, b"\x06", 2, 6)
         assert emcy.register == 0x91
         for t_ns, who in ((3, 5), (4, 6)):
-            emcy.over(EmcyCode.HEARTBEAT, t_ns, who)
-            emcy.over(EmcyCode.HEARTBEAT, t_ns, who)  # says nothing
+            emcy.clear(EmcyCode.HEARTBEAT, t_ns, who)
+            emcy.clear(EmcyCode.HEARTBEAT, t_ns, who)  # says nothing
         assert told[3:] == ["084 00 00 91 30 81 00 00 00", "084 00 00 81 30 81 00 00 00"]
 
 

@@ -1,4 +1,4 @@
-"""Sources by name: what a user plugs into a node without touching this project."""
+"""Finds a source by name, so that a user can plug one into a node without a change to this project."""
 
 from __future__ import annotations
 
@@ -12,33 +12,45 @@ from skinnode.model.layout import PatchLayout
 from skinnode.node.patch.source import ResistanceSource, SourceFailed, read_source
 
 GROUP: Final = "skinnode.sources"
-"""Entry points of this group in the metadata of any installed package are sources with a name."""
+"""Entry-point group in which installed packages register named sources."""
 
 
 def registered() -> dict[str, importlib.metadata.EntryPoint]:
-    """Sources that installed packages have registered, by name."""
+    """Return the registered sources, by name."""
     return {point.name: point for point in importlib.metadata.entry_points(group=GROUP)}
 
 
 def load(reference: str, option: str) -> Any:
-    """What ``MODULE:NAME`` refers to. Raises ConfigError naming ``option``: no such module or name, or a
-    module that cannot be imported."""
+    """Import the object that ``MODULE:NAME`` refers to.
+
+    Args:
+        reference: ``MODULE:NAME``.
+        option: named in the error.
+
+    Raises:
+        ConfigError: if the module cannot be imported, or does not have the name.
+    """
     module, _, name = reference.partition(":")
     try:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+    except (Exception, SystemExit) as error:  # a module can raise anything when it is imported
         raise ConfigError(option, reference, f"MODULE:NAME that can be imported ({_line(error)})") from error
     return found
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """The source ``name``, of an entry point or ``MODULE:NAME``, for a patch of ``layout``.
+    """Make a source for a patch, and read it once, so that a faulty one is found before a node is on the bus.
 
-    The name stands for a class or a function that takes the layout and returns a
-    :class:`~skinnode.node.patch.source.ResistanceSource`. It is read once, so that one that does not work is
-    found before a node is on the bus. Raises ConfigError naming ``option`` for all that can be wrong with it.
+    Args:
+        name: name of an entry point, or ``MODULE:NAME``, of a class or function that takes the layout and
+            returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
+        layout: the electrodes of the patch.
+        option: named in the error.
+
+    Raises:
+        ConfigError: if there is no such source, or it does not work.
     """
     points = registered()
     if ":" in name:

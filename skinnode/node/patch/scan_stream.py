@@ -1,25 +1,25 @@
-"""Scans on their way: chunks, paced by the inhibit time of the TPDO that carries them, then the summary.
+"""Sends scans: chunks, paced by the inhibit time of the TPDO that carries them, then the summary.
 
-The TPDO whose first object is 0x2010 carries the chunks of a scan, as long as it is event-driven or it was
-its turn at the SYNC that started the scan. Those of 0x2011 carry the summary when the scan has been sent: on
-event, or synchronous ones if it was their turn at that SYNC, otherwise after the next SYNC whose turn it is.
-Event-driven TPDOs of any other object are sent then too.
+The TPDO whose first object is 0x2010 carries the chunks of a scan if it is event-driven or was due at the
+SYNC that started the scan. TPDOs whose first object is 0x2011 carry the summary after the chunks:
+event-driven TPDOs at once, synchronous TPDOs at once if they were due at that SYNC, otherwise at the next
+SYNC at which they are due. Event-driven TPDOs of other objects are sent after the chunks too.
 
-Pacing. The standard's inhibit time is a shortest distance. A thread of a general-purpose system wakes late,
-and distances that only ever grow would let a scan outgrow its SYNC period; so lateness up to ``catch_up_ns``
-is made up for, with several frames at once if need be, while the mean rate is never exceeded (the generic
-cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the shortest distance is strict.
+Pacing. The inhibit time of the standard is a shortest distance. A thread of a general-purpose system wakes
+late, and with a strict shortest distance a scan would outgrow its SYNC period. Lateness of up to
+``catch_up_ns`` is therefore compensated, if necessary with several frames at once, and the mean rate is never
+exceeded (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the shortest distance is strict.
 
-Whoever drives the node hands it the time of a SYNC, and sampling takes a while after that. So the node asks
-for a turn of the timer right after the first chunk of a scan, which says what time it is by then; the second
-one keeps its distance from that.
+The node knows the time of a SYNC, and sampling takes a while after it. So the node asks for a timer event
+right after the first chunk of a scan, which gives the present time; the second chunk keeps its distance from
+that.
 
-Synchronous TPDOs keep to the synchronous window (0x1007): chunks and a summary not yet sent when it closes
-are discarded. The window does not apply to event-driven TPDOs.
+Synchronous TPDOs keep to the synchronous window (0x1007): chunks and a summary that are not sent when it
+closes are discarded. The window does not apply to event-driven TPDOs.
 
-A scan that is offered while one is being sent waits for it to end, and there is room for one to wait. Chunks
-of two scans are never sent in turns, and a scan once begun is sent whole unless the node leaves OPERATIONAL
-or its chunk TPDO is disabled; then its summary says so, or there is none.
+A scan that is offered while another is being sent waits for its end; one scan can wait. Chunks of two scans
+are never interleaved. A scan that has begun is sent as a whole unless the node leaves OPERATIONAL, which
+omits its summary, or its chunk TPDO is disabled, which its summary shows.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Share of the sending time that may be lost before chunks count as held up; thread jitter stays below it."""
+"""Share of the sending time that may be lost before chunks count as delayed; thread jitter stays below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +44,28 @@ class OutgoingScan:
     """A scan ready to be sent."""
 
     counter: int
+    """Scan counter, u8."""
     chunks: list[bytes]
-    """Payloads of the chunk record, in order; only those to be sent."""
+    """Payloads of the chunks to be sent, in order."""
     flags: int
+    """Bits of :class:`~skinnode.protocol.summary.SummaryFlag`."""
     device_time_us: int
+    """Clock of the node, µs; wraps at 2³²."""
     check_of_codes: int | None = None
     """CRC over the codes that a receiver holds after this scan; None for a summary without a check."""
     turns: frozenset[int] = frozenset()
-    """Numbers of the synchronous TPDOs whose turn it was at the SYNC that started the scan."""
+    """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
 
 
 class ScanStream:
-    """The scans of a patch that pass through its TPDOs. ``chunk`` is the chunk record (0x2010) until there is
-    one."""
+    """Sends the scans of a patch through its TPDOs.
+
+    Args:
+        store: object dictionary.
+        tpdos: the TPDOs of the node.
+        chunk: the chunk record (0x2010) until the first chunk is sent.
+        catch_up_ns: maximum lateness that is compensated, ns.
+    """
 
     def __init__(self, store: ObjectStore, tpdos: TpdoEngine, chunk: bytes, catch_up_ns: int) -> None:
         self._tpdos, self._catch_up_ns = tpdos, catch_up_ns
@@ -64,35 +73,38 @@ class ScanStream:
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
         self._unsent: deque[bytes] = deque()
-        self._carrier: Tpdo | None = None  # of the chunks of the scan being sent
-        self._verbatim = False  # whether it carries nothing but the record as it is
+        self._carrier: Tpdo | None = None  # carries the chunks of the scan being sent
+        self._verbatim = False  # whether it carries the record unchanged
         self._chunks_sent = 0
         self._just_begun = False
         self._busy_ns = 0  # start of the present run of scans without a pause
         self._paced_ns = 0  # sum of the inhibit times since then
         self.chunk = chunk
-        """The chunk record as last sent."""
+        """Chunk record sent last."""
         self.summary = bytes(12)
-        """The summary record (0x2011) of the last scan."""
+        """Summary record (0x2011) of the last scan."""
         self.scans_sent = 0
+        """Number of scans sent to their end."""
         tpdos.claim(od.CHUNK, self)
         tpdos.claim(od.SUMMARY, self)
 
     @property
     def full(self) -> bool:
-        """Whether a scan is being sent and another one waits already."""
+        """Whether a scan is being sent and another waits already."""
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
-        """Return whether chunks leave late, so that scans take longer than their inhibit times require: the
-        node's thread gets too little processor time, or the bus refuses frames."""
+        """Return whether scans take longer than their inhibit times require.
+
+        The node's thread then gets too little processor time, or the bus refuses frames.
+        """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns
         return self._scan is not None and lost_ns > max(self._catch_up_ns, _HELD_UP * busy_ns)
 
     @property
     def deadline_ns(self) -> int:
-        """When :meth:`on_timer` has something to do."""
+        """Time at which :meth:`on_timer` has something to do, ns."""
         if self._scan is None:
             return NO_DEADLINE_NS
         return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
@@ -100,11 +112,11 @@ class ScanStream:
     # --- as the owner of TPDOs
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Whether chunks of a scan are on their way through it."""
+        """Return whether chunks of a scan are being sent through a TPDO."""
         return tpdo is self._carrier
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """End a scan whose TPDO has been taken away."""
+        """End a scan whose TPDO no longer carries chunks."""
         if tpdo is not self._carrier:
             return
         if tpdo.parameters.enabled and tpdo.first_index == od.CHUNK:
@@ -116,18 +128,23 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """The node left OPERATIONAL: a scan in progress ends without a summary."""
+        """End a scan in progress without a summary: the node has left OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """A SYNC came that starts no scan: send summaries that waited for it."""
+        """Send summaries that waited for a SYNC that starts no scan."""
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.waiting and tpdo.number in turns:
                 self._tpdos.transmit(tpdo, t_ns)
 
     def offer(self, scan: OutgoingScan, t_ns: int) -> None:
-        """Send ``scan``, at once or after the one being sent. Must not be called while :attr:`full`."""
+        """Send a scan, at once or after the one being sent. Must not be called while :attr:`full`.
+
+        Args:
+            scan: the scan.
+            t_ns: present time, ns.
+        """
         if self._scan is None:
             self._busy_ns, self._paced_ns = t_ns, 0
             self._begin(scan, t_ns)
@@ -162,14 +179,14 @@ class ScanStream:
                 self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # an idle while earns no burst
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # a pause earns no burst
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:
         return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
 
     def _stream(self, t_ns: int) -> bool:
-        """Send the chunks that the pace allows. True when there are no more."""
+        """Send the chunks that the pace allows; return whether all have been sent."""
         unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True
@@ -183,7 +200,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # after it has been sent: a bus may refuse it
+            self._chunks_sent += 1  # only now: the bus may refuse the chunk
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

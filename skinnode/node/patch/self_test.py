@@ -1,7 +1,7 @@
-"""The self-test (0x2021:3): what can be known of a patch by reading its source a few times.
+"""The self-test (0x2021:3): checks a patch by reading its source several times.
 
-A node in software has no board of its own to test: it tests what it measures with. Whoever runs it leaves the
-skin alone meanwhile, or the noise is that of the touch.
+A node in software has no board to test, so it tests its source. The skin must not be touched meanwhile, or
+the noise is that of the touch.
 """
 
 from __future__ import annotations
@@ -12,24 +12,34 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float
-from skinnode.node.patch.acquisition import find_faults
 from skinnode.node.patch.source import SourceFailed
+from skinnode.node.patch.wire_faults import find_faults
 from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
-"""As many as a tare takes. The standard deviation of a crossing is then known to 18 % (1/√30), that of the
-patch, over 300 crossings, to 1 %."""
+"""Number of readings, as many as a tare takes.
+
+The standard deviation of a crossing is then known to 18 % (1/√30), that of a patch of 300 crossings to 1 %.
+"""
 
 NOISE_LIMIT: Final = 1e-3
-"""Relative noise of a reading above which something is broken: a hundred times that for which the accuracy of
-the solver is promised."""
+"""Relative noise of a reading above which the test fails: a hundred times that for which the solver's
+accuracy is specified."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # numbers that no converter gives
+@np.errstate(over="ignore", invalid="ignore")  # for numbers that no converter gives
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
-    """Test a patch. ``read`` gives (U, K) resistances in ohm or raises SourceFailed; ``baseline_ohm`` is of
-    the same shape."""
+    """Test a patch.
+
+    Args:
+        read: returns (U, K) resistances in ohm, or raises SourceFailed.
+        baseline_ohm: (U, K) R0, ohm.
+        scale: the mapping of R/R0 to codes.
+
+    Returns:
+        The findings.
+    """
     readings: list[Float] = []
     for _ in range(READINGS):
         try:
@@ -64,7 +74,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """RMS over the crossings (n readings × crossings) of their relative standard deviations; 0 of nothing."""
+    """Return the RMS relative standard deviation of (readings, crossings); 0 without crossings."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

@@ -1,4 +1,4 @@
-"""The analogue port of a patch: where a converter, or the simulator, is plugged in."""
+"""The analogue port of a patch: the interface of a converter, or of the simulator."""
 
 from __future__ import annotations
 
@@ -9,25 +9,31 @@ from skinnode.model.layout import Float, require_array
 
 
 class ResistanceSource(Protocol):
-    """Whatever measures the resistances between upper and lower wires."""
+    """Measures the resistances between upper and lower wires."""
 
     def read(self, t_ns: int) -> Float:
-        """(U, K) wire-to-wire resistances at ``t_ns`` (monotonic), ohm: infinite where a wire is open, 0
-        where it is shorted. The array is only read, and not kept beyond the call. An exception is a failure
-        of the source: the node says so and asks again at the next scan."""
+        """Return (U, K) wire-to-wire resistances, ohm: infinite if a wire is open, 0 if it is shorted.
+
+        The node copies the array. An exception is a failure of the source: the node reports it and reads
+        again at the next scan.
+
+        Args:
+            t_ns: present time, ns of the monotonic clock.
+        """
         ...
 
 
 class SourceFault(IntEnum):
-    """What was wrong with a reading: the first byte of the emergency message."""
+    """Kind of a failed reading: the first byte of the emergency message."""
 
     RAISED = 1
+    """The source raised an exception."""
     WRONG_ARRAY = 2
-    """Not an array of numbers, or not one of the patch's shape."""
+    """The source returned no array of numbers, or one of another shape."""
 
 
 class SourceFailed(Exception):
-    """A reading that could not be had. Never leaves the node."""
+    """A failed reading. Never leaves the node."""
 
     def __init__(self, fault: SourceFault, message: str) -> None:
         self.fault = fault
@@ -35,8 +41,20 @@ class SourceFailed(Exception):
 
 
 def read_source(source: ResistanceSource, shape: tuple[int, int], t_ns: int) -> Float:
-    """A reading of ``source``, as (U, K) float64, copied. Raises SourceFailed, with one line, whatever it
-    did."""
+    """Read a source.
+
+    Args:
+        source: the source.
+        shape: (U, K).
+        t_ns: present time, ns.
+
+    Returns:
+        (U, K) float64, ohm; a copy.
+
+    Raises:
+        SourceFailed: if the source raises anything or returns no array of that shape; the message is one
+            line.
+    """
     try:
         reading = source.read(t_ns)
     except (Exception, SystemExit) as error:  # a source does not end the thread that reads it

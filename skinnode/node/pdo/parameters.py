@@ -1,6 +1,6 @@
-"""PDO parameters: what may be written to them, and what they say (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
+"""PDO parameters: which values a client may write, and what they mean (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-Where the standard leaves the abort code open, the ones of CANopenNode, the open reference, are used.
+Where the standard does not define the abort code, CANopenNode's is used.
 """
 
 from __future__ import annotations
@@ -15,12 +15,17 @@ from skinnode.node.object_dictionary import ObjectStore
 
 INVALID_BIT: Final = od.PDO_INVALID
 NO_RTR_BIT: Final = 1 << 30
+"""Bit of a COB-ID that forbids remote frames."""
 EXTENDED_BIT: Final = 1 << 29
+"""Bit of a COB-ID with a 29-bit CAN-ID."""
 COB_ID_MASK: Final = 0x7FF
+"""Bits of a COB-ID that hold an 11-bit CAN-ID."""
 SYNC_CYCLIC_MAX: Final = 240
+"""Highest synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types on remote request only: sampled at SYNC, and when asked."""
+"""Transmission types on remote request only: sampled at SYNC, and sampled on request."""
 EVENT_TYPES: Final = (254, 255)
+"""Event-driven transmission types."""
 
 _MOST_MAPPED: Final = 64  # entries of a mapping record
 
@@ -35,10 +40,19 @@ _RESTRICTED: Final = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
+"""Restricted CAN-IDs (CiA 301 v4.2, table 40)."""
 
 
 def check_cob_id(value: int, current: int) -> None:
-    """Refuse a COB-ID that no configurable service may use, or that changes while it is in use."""
+    """Check a COB-ID that a client writes.
+
+    Args:
+        value: the COB-ID.
+        current: the present COB-ID.
+
+    Raises:
+        Refused: if no configurable service may use it, or if it changes while it is in use.
+    """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
     if not value & INVALID_BIT and any(value & COB_ID_MASK in block for block in _RESTRICTED):
@@ -50,45 +64,54 @@ def check_cob_id(value: int, current: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """An object in a PDO. One at the index of a data type is a dummy: so many bytes that say nothing."""
+    """An object in a PDO. An object at the index of a data type is a dummy: bytes without meaning."""
 
     index: int
     subindex: int
     size: int
-    """Bytes."""
+    """Length, bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """A PDO as its two records describe it. Times in ns, 0 where not used."""
+    """A PDO as its two records describe it. Times are in ns; 0 means not used."""
 
     enabled: bool
+    """Whether the PDO exists and maps anything."""
     cob_id: int
+    """Its 11-bit CAN-ID."""
     answers_rtr: bool
-    """Whether the COB-ID lets it be asked for by a remote frame."""
+    """Whether its COB-ID allows remote frames."""
     kind: int
     """Transmission type."""
     inhibit_ns: int
     event_timer_ns: int
     sync_start: int
     mapping: tuple[Mapped, ...]
+    """The mapped objects, in order."""
     size: int
-    """Bytes of the payload."""
+    """Length of the payload, bytes."""
 
     @property
     def event_driven(self) -> bool:
+        """Whether an event triggers it."""
         return self.kind in EVENT_TYPES
 
     @property
     def synchronous(self) -> bool:
-        """Cyclic or acyclic; what is sampled at SYNC but sent on request is not counted as that."""
+        """Whether SYNC triggers it. A PDO that is sampled at SYNC but sent on request does not count."""
         return self.kind <= SYNC_CYCLIC_MAX
 
 
 class PdoRecords:
-    """The communication and the mapping record of one PDO in an object dictionary: guards them, reads them.
+    """The communication record and the mapping record of one PDO: guards writes and reads the parameters.
 
-    ``taken`` says whether another PDO has a CAN-ID already; None where several may share one.
+    Args:
+        store: object dictionary.
+        parameter: index of the communication record.
+        mapping: index of the mapping record.
+        transmits: whether it is a TPDO.
+        taken: returns whether another PDO uses a CAN-ID; None if several PDOs may share one.
     """
 
     def __init__(
@@ -103,13 +126,13 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # Bytes of a PDO, and entries of its mapping record: the smallest is a byte.
+        # Maximum bytes of a PDO, which is the number of entries: the smallest object is a byte.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
     def _word(self, subindex: int) -> int:
-        """A communication parameter; 0 for one that this PDO does not have."""
+        """Return a communication parameter; 0 if this PDO does not have it."""
         has = self._store.has(self._parameter, subindex)
         return self._store.integer(self._parameter, subindex) if has else 0
 
@@ -118,7 +141,7 @@ class PdoRecords:
         return not self._word(od.PDO_COB_ID) & INVALID_BIT
 
     def read(self) -> PdoParameters:
-        """The parameters as they are now."""
+        """Return the present parameters."""
         store = self._store
         count = store.integer(self._mapping, 0)
         words = [store.integer(self._mapping, sub) for sub in range(1, count + 1)]
@@ -152,7 +175,7 @@ class PdoRecords:
         check_cob_id(value, self._word(od.PDO_COB_ID))
         if value & INVALID_BIT:
             return
-        if not self._store.integer(self._mapping, 0):  # a PDO of nothing
+        if not self._store.integer(self._mapping, 0):  # nothing is mapped
             raise Refused(AbortCode.INVALID_VALUE)
         if not self._enabled and self._taken is not None and self._taken(value & COB_ID_MASK):
             raise Refused(AbortCode.INCOMPATIBLE)
@@ -162,7 +185,7 @@ class PdoRecords:
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
         if not subindex:
             self._check_mapping(value)
-        elif value:  # an entry may be emptied, but not mapped then
+        elif value:  # an entry may be 0, but must not be counted then
             self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:

@@ -1,9 +1,9 @@
-"""RPDOs: takes what others send and writes it into the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
+"""RPDOs: writes received PDOs into the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
-Types 0 to 240 act at the next SYNC on the last PDO received within the synchronous window (0x1007), 254 and
-255 at once. Bytes beyond the mapping are
-left alone, a PDO that is too short is not taken at all; both are told by EMCY once, until the length is right
-again. An event timer watches over its RPDO from the first one on that comes, in OPERATIONAL.
+At each SYNC, types 0 to 240 apply the last PDO received within the synchronous window (0x1007); types 254 and
+255 apply a PDO at once. Bytes beyond the mapping are ignored, and a PDO that is too short is not applied;
+both are reported by EMCY once, until the length is right again. An event timer monitors its RPDO in
+OPERATIONAL, from the first PDO received.
 """
 
 from __future__ import annotations
@@ -15,32 +15,31 @@ from skinnode.canopen import indices as od
 from skinnode.canopen.abort import Refused
 from skinnode.canopen.data_length import fd_length
 from skinnode.canopen.emergency import EmcyCode
-from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.emcy import EmcyProducer
-from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import PdoRecords
-from skinnode.node.rejected import Rejected, RejectedFrames
+from skinnode.node.rejected import Rejected
+from skinnode.node.services import NodeServices
 from skinnode.node.sync import SyncWindow
 from skinnode.node.timers import Timers
 
 
 class _Rpdo:
-    """One RPDO: its parameters, and what is wrong with it."""
+    """One RPDO: its parameters and its present error."""
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.wrong: EmcyCode | None = None
-        """What was told about the length of the last one."""
+        """Reported error in the length of the last PDO."""
         self.parameters = records.read()
         self.fields = self._fields()
 
     def reload(self) -> None:
-        """Take over parameters that were written."""
+        """Take over written parameters."""
         self.parameters = self._records.read()
         self.fields = self._fields()
 
     def _fields(self) -> list[tuple[int, int, int, int]]:
-        """Index, sub-index, first byte and the one after the last, of everything but dummies."""
+        """Return index, sub-index, first byte and byte after the last, of each mapped object but dummies."""
         at, fields = 0, []
         for each in self.parameters.mapping:
             if each.index not in od.DUMMY_BITS:
@@ -50,24 +49,23 @@ class _Rpdo:
 
 
 class RpdoEngine:
-    """The RPDOs of a node. ``now`` is the time of the event being handled."""
+    """The RPDOs of a node.
 
-    def __init__(
-        self,
-        store: ObjectStore,
-        count: int,
-        emcy: EmcyProducer,
-        rejected: RejectedFrames,
-        now: Clock,
-        window: SyncWindow,
-    ) -> None:
-        self._store, self._emcy, self._rejected, self._now = store, emcy, rejected, now
-        self._window = window
+    Args:
+        services: the shared parts of the node.
+        count: number of RPDOs.
+        window: the synchronous window.
+    """
+
+    def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
+        store = services.store
+        self._store, self._emcy, self._rejected = store, services.emcy, services.rejected
+        self._now, self._window = services.now, window
         self._operational = False
         self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
-        self._pending: dict[int, bytes] = {}  # of synchronous ones, until the next SYNC
-        # Numbers of those with an error that lasts.
+        self._pending: dict[int, bytes] = {}  # synchronous RPDOs received, until the next SYNC
+        # Numbers of the RPDOs with a lasting error.
         self._short: set[int] = set()
         self._late: set[int] = set()
         self._rpdos: list[_Rpdo] = []
@@ -81,13 +79,13 @@ class RpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """When an RPDO that is watched over is missed."""
+        """Time at which a monitored RPDO is late, ns."""
         return self._timers.deadline_ns
 
     # --- parameters
 
     def restore(self) -> None:
-        """All parameters may have changed at once, and all errors have been forgotten: a reset."""
+        """Take over all parameters and forget all errors, after a reset."""
         self._by_cob_id.clear()
         self._pending.clear()
         self._timers.clear()
@@ -116,8 +114,10 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """The node entered another state: what was received before is void, and nothing is waited for. None
-        is late any more: the deadline is monitored in OPERATIONAL only (CiA 301 v4.2, 7.5.2.33)."""
+        """Follow a change of the NMT state: drop received PDOs, and stop monitoring.
+
+        Deadlines are monitored in OPERATIONAL only (CiA 301 v4.2, 7.5.2.33), so no RPDO is late any more.
+        """
         self._operational = operational
         self._pending.clear()
         self._timers.clear()
@@ -125,29 +125,35 @@ class RpdoEngine:
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
-        """A frame came; it may be an RPDO, or several that share the COB-ID."""
+        """Handle a frame that may be an RPDO, or several RPDOs that share the COB-ID.
+
+        Args:
+            cob_id: its identifier.
+            data: its payload.
+            t_ns: when it was received, ns.
+        """
         if self._operational:
             for rpdo in tuple(self._by_cob_id.get(cob_id, ())):
                 self._receive(rpdo, data, t_ns)
 
     def on_sync(self) -> None:
-        """Act on the synchronous ones that came since the last SYNC."""
+        """Apply the synchronous RPDOs received since the last SYNC."""
         pending, self._pending = self._pending, {}
         for number in sorted(pending):
             self._execute(self._rpdos[number], pending[number])
 
     def on_timer(self, t_ns: int) -> None:
-        """Tell of those that have not come in time. They are waited for again from their next one on."""
+        """Report RPDOs that are late at ``t_ns``. Monitoring restarts with the next PDO."""
         for number in self._timers.take(t_ns):
             self._late.add(number)
-            self._emcy.present(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)
+            self._emcy.report(EmcyCode.RPDO_TIMEOUT, (number + 1).to_bytes(2, "little"), t_ns)
 
     def _receive(self, rpdo: _Rpdo, data: bytes, t_ns: int) -> None:
         parameters = rpdo.parameters
         wrong = None
         if len(data) < parameters.size:
             wrong = EmcyCode.PDO_NOT_PROCESSED
-        elif len(data) > fd_length(parameters.size):  # of a classic frame that is what is mapped itself
+        elif len(data) > fd_length(parameters.size):  # for a classic frame the mapped length itself
             wrong = EmcyCode.PDO_LENGTH_EXCEEDED
         self._set_wrong(rpdo, wrong, data, t_ns)
         if wrong is EmcyCode.PDO_NOT_PROCESSED:
@@ -162,8 +168,7 @@ class RpdoEngine:
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
-        """Write the objects mapped. One that refuses its value does not keep the others from theirs: process
-        data have no way to answer."""
+        """Write the mapped objects. A refusal concerns its object alone: process data are not answered."""
         for index, subindex, start, end in rpdo.fields:
             with contextlib.suppress(Refused):
                 self._store.write(index, subindex, data[start:end])
@@ -171,7 +176,7 @@ class RpdoEngine:
     # --- errors
 
     def _set_wrong(self, rpdo: _Rpdo, wrong: EmcyCode | None, data: bytes, t_ns: int) -> None:
-        """Tell of a length that is wrong in another way than before, and of the end of one too short."""
+        """Report a new error in the length, and the end of an error."""
         if wrong is rpdo.wrong:
             return
         rpdo.wrong = wrong
@@ -179,14 +184,14 @@ class RpdoEngine:
         detail = bytes((number & 0xFF, len(data), rpdo.parameters.size, number >> 8))
         if wrong is EmcyCode.PDO_NOT_PROCESSED:
             self._short.add(rpdo.number)
-            self._emcy.present(wrong, detail, t_ns)
+            self._emcy.report(wrong, detail, t_ns)
             return
         self._recover(self._short, rpdo.number, EmcyCode.PDO_NOT_PROCESSED, t_ns)
         if wrong is not None:
-            self._emcy.happened(wrong, detail, t_ns)
+            self._emcy.report_once(wrong, detail, t_ns)
 
     def _recover(self, faulty: set[int], number: int, code: EmcyCode, t_ns: int) -> None:
         if number in faulty:
             faulty.discard(number)
             if not faulty:
-                self._emcy.over(code, t_ns)
+                self._emcy.clear(code, t_ns)

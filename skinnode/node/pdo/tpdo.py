@@ -1,73 +1,76 @@
-"""The TPDO engine: transmits what the object dictionary says, when it says so (CiA 301 v4.2, 7.2.2 and
-7.5.2.37). No clock of its own.
+"""TPDOs: transmits mapped objects when the object dictionary demands it (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
 
 =========  =======================================================================================
 type       sent
 =========  =======================================================================================
-0          after a SYNC, if the values are others than those sent last
-1 to 240   after every n-th SYNC; from the one with the SYNC start value on, if there is one
-252        when asked by a remote frame, with the values of the last SYNC; not before there was one
-253        when asked by a remote frame
-254, 255   when something happened (:meth:`TpdoEngine.trigger`), when the event timer elapses and when
-           asked by a remote frame; all of them no sooner than the inhibit time allows
+0          after a SYNC, if the values differ from those sent last
+1 to 240   after every n-th SYNC, counted from the SYNC start value if there is one
+252        on a remote frame, with the values of the last SYNC; not before the first SYNC
+253        on a remote frame
+254, 255   on an event (:meth:`TpdoEngine.trigger`), when the event timer elapses, and on a remote frame;
+           never before the inhibit time has passed
 =========  =======================================================================================
 
-A TPDO whose first object the application has *claimed* is sent by that where a SYNC or an event would send
-another one; the engine counts its SYNCs, and remote frames and event timer are its own matter as ever.
+If the application has *claimed* the first object of a TPDO, the application sends it where a SYNC or an event
+would; the engine still counts its SYNCs and serves its remote frames and event timer.
 
-However many TPDOs there are: a SYNC costs as much as there are enabled ones that listen to it, a turn of the
-timer as much as there are due ones.
+The cost of a SYNC grows with the number of enabled TPDOs that listen to it, that of a timer event with the
+number of due TPDOs; other TPDOs cost nothing.
 """
 
 from __future__ import annotations
 
 import functools
 from bisect import bisect_left
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Protocol
 
 from skinnode.canopen import indices as od
-from skinnode.node.clock import NO_DEADLINE_NS, Clock
-from skinnode.node.object_dictionary import ObjectStore
+from skinnode.node.clock import NO_DEADLINE_NS
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, REMOTE, SYNC_REMOTE, PdoRecords
+from skinnode.node.services import NodeServices
 from skinnode.node.sync import SyncWindow
 from skinnode.node.timers import Timers
 
-Send = Callable[[int, bytes], None]
-
 
 class Tpdo:
-    """One TPDO: its parameters and when it may send next."""
+    """One TPDO: its parameters and the times at which it may be sent.
+
+    Args:
+        number: number of the TPDO, counted from 0.
+        records: its records in the object dictionary.
+    """
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """From when on the inhibit time allows to send again."""
+        """Time from which the inhibit time allows the next transmission, ns."""
         self.timer_ns = NO_DEADLINE_NS
-        """When the event timer elapses."""
+        """Time at which the event timer elapses, ns."""
         self.waiting = False
-        """There is something to tell that neither SYNC nor inhibit time have let out yet."""
+        """Whether there are values to send that SYNC or inhibit time still delay."""
         self.last: bytes | None = None
-        """What was sent last; of type 252 what was sampled last."""
+        """Payload sent last; for type 252 the payload sampled last."""
         self.owner: Owner | None = None
+        """The part of the application that sends it, if any."""
         self._in_step = False
         self._syncs = 0
         self.parameters = records.read()
 
     @property
     def first_index(self) -> int:
-        """Of the first object mapped; 0 if none is."""
+        """Index of the first mapped object; 0 if nothing is mapped."""
         mapping = self.parameters.mapping
         return mapping[0].index if mapping else 0
 
     @property
     def deadline_ns(self) -> int:
-        """When there is something to send."""
+        """Time at which there is something to send, ns."""
         held = self.waiting and self.parameters.event_driven
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
-        """Take over parameters that were written."""
+        """Take over written parameters at ``t_ns``."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
@@ -76,24 +79,31 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """The node became OPERATIONAL."""
+        """Start in OPERATIONAL, without a history."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
     def start_timer(self, t_ns: int) -> None:
-        """Run the event timer anew from ``t_ns`` on, if the TPDO has one."""
+        """Restart the event timer at ``t_ns``, if the TPDO has one."""
         parameters = self.parameters
         timed = parameters.enabled and parameters.event_driven and parameters.event_timer_ns > 0
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """The event timer elapsed; set it anew. Free of drift, and without bursts when served late."""
+        """Restart the elapsed event timer, without drift and without bursts if served late."""
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
             self.start_timer(t_ns)
 
     def turn(self, counter: int | None) -> bool:
-        """Count a SYNC; True if it is the turn of this synchronous TPDO."""
+        """Count a SYNC.
+
+        Args:
+            counter: the SYNC counter, None without one.
+
+        Returns:
+            Whether this synchronous TPDO is due.
+        """
         parameters = self.parameters
         if not self._in_step and parameters.sync_start and counter is not None:
             if counter != parameters.sync_start:
@@ -108,30 +118,35 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """Whoever sends the TPDOs of objects that it has claimed."""
+    """A part of the application that sends the TPDOs of objects that it has claimed."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Whether it is about to send this TPDO anyway: nothing else needs to."""
+        """Return whether it is about to send this TPDO anyway."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """A TPDO of its own has got other parameters, or is no longer its own."""
+        """Follow a change of parameters of one of its TPDOs, or its loss."""
         ...
 
 
 class TpdoEngine:
-    """The TPDOs of a node. ``now`` is the time of the event being handled."""
+    """The TPDOs of a node.
 
-    def __init__(self, store: ObjectStore, count: int, send: Send, now: Clock, window: SyncWindow) -> None:
-        self._store, self._send, self._now = store, send, now
+    Args:
+        services: the shared parts of the node.
+        count: number of TPDOs.
+        window: the synchronous window.
+    """
+
+    def __init__(self, services: NodeServices, count: int, window: SyncWindow) -> None:
+        store = services.store
+        self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Window in which synchronous TPDOs may be sent. TPDOs without an owner are sent right after the
-        SYNC."""
+        """Window in which synchronous TPDOs may be sent; TPDOs without an owner are sent right after SYNC."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
-        # Numbers of enabled TPDOs, ascending: those that listen to SYNC, those that events concern, and those
-        # that have an owner.
+        # Numbers of enabled TPDOs, ascending: on SYNC, on events, and with an owner.
         self._listening: list[int] = []
         self._eventful: list[int] = []
         self._owned: list[int] = []
@@ -151,18 +166,18 @@ class TpdoEngine:
         return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:
-        """Leave the TPDOs whose first object is of ``index`` to ``owner``."""
+        """Let ``owner`` send the TPDOs whose first object has this index."""
         self._claims[index] = owner
         self.restore()
 
     def owned(self, index: int) -> list[Tpdo]:
-        """The enabled TPDOs that are claimed with ``index``."""
+        """Return the enabled TPDOs that are claimed with ``index``."""
         return [tpdo for tpdo in map(self._tpdos.__getitem__, self._owned) if tpdo.first_index == index]
 
     # --- parameters
 
     def restore(self) -> None:
-        """All parameters may have changed at once: a reset."""
+        """Take over all parameters, after a reset."""
         for number in range(len(self._tpdos)):
             self._reload(number)
 
@@ -189,7 +204,7 @@ class TpdoEngine:
         self._plan(tpdo)
 
     def _taken(self, cob_id: int) -> bool:
-        # Not from the parameters taken over, which are older than the store while it is restored.
+        # From the store, not from the parameters taken over, which lag behind while the store is restored.
         numbers = range(od.TPDO1_PARAMETER, od.TPDO1_PARAMETER + len(self._tpdos))
         words = [self._store.integer(index, od.PDO_COB_ID) for index in numbers]
         return any(not word & INVALID_BIT and word & COB_ID_MASK == cob_id for word in words)
@@ -197,28 +212,40 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """The node became OPERATIONAL."""
+        """Start transmission: the node has entered OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """The node left OPERATIONAL."""
+        """Stop transmission: the node has left OPERATIONAL."""
         self._running = False
         self._timers.clear()
 
     def count_sync(self, counter: int | None) -> frozenset[int]:
-        """A SYNC came: the numbers of the synchronous TPDOs whose turn it is. ``counter`` is the SYNC
-        counter, None without one."""
+        """Count a SYNC for all TPDOs.
+
+        Args:
+            counter: the SYNC counter, None without one.
+
+        Returns:
+            Numbers of the synchronous TPDOs that are due.
+        """
         tpdos = [self._tpdos[number] for number in self._listening]
         return frozenset(
             [each.number for each in tpdos if each.parameters.synchronous and each.turn(counter)]
         )
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """After the application has dealt with the SYNC: send the values of those whose turn it is, sample
-        those that will be asked for."""
+        """Send the TPDOs that are due and sample those of type 252.
+
+        Called after the application has handled the SYNC.
+
+        Args:
+            turns: numbers of the synchronous TPDOs that are due.
+            t_ns: when the SYNC was received, ns.
+        """
         for number in tuple(self._listening):
             tpdo = self._tpdos[number]
             if tpdo.parameters.kind == SYNC_REMOTE:
@@ -229,7 +256,7 @@ class TpdoEngine:
                     self._transmit(tpdo, payload, t_ns)
 
     def trigger(self, t_ns: int) -> None:
-        """Something happened that all event-driven TPDOs tell of."""
+        """Send all event-driven TPDOs that have no owner."""
         for number in tuple(self._eventful):
             self.request(self._tpdos[number], t_ns)
 
@@ -239,7 +266,7 @@ class TpdoEngine:
         self._let_out(tpdo, t_ns)
 
     def on_remote(self, cob_id: int, t_ns: int) -> None:
-        """A remote frame came, in OPERATIONAL. Synchronous TPDOs do not answer any (7.2.2.3)."""
+        """Answer a remote frame in OPERATIONAL. Synchronous TPDOs do not answer (7.2.2.3)."""
         tpdo = self._by_cob_id.get(cob_id)
         if tpdo is None or not tpdo.parameters.answers_rtr or self._sent_anyway(tpdo):
             return
@@ -268,12 +295,12 @@ class TpdoEngine:
     # --- sending
 
     def payload(self, tpdo: Tpdo) -> bytes:
-        """What is mapped into it, as it is now."""
+        """Return the present values of the mapped objects."""
         raw = self._store.raw
         return b"".join([raw(each.index, each.subindex) for each in tpdo.parameters.mapping])
 
     def emit(self, tpdo: Tpdo, payload: bytes) -> None:
-        """Send without a look at any time; the owner of the TPDO does that."""
+        """Send a payload at once; the owner of the TPDO has checked the time."""
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
@@ -290,7 +317,7 @@ class TpdoEngine:
             self._plan(tpdo)
 
     def _transmit(self, tpdo: Tpdo, payload: bytes, t_ns: int, *, timer: bool = True) -> None:
-        """``timer``: let the event timer start anew."""
+        """Send a payload; ``timer``: restart the event timer."""
         tpdo.last, tpdo.waiting = payload, False
         tpdo.ready_ns = t_ns + tpdo.parameters.inhibit_ns
         if timer:
@@ -303,7 +330,7 @@ class TpdoEngine:
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Have ``number`` in the ascending list or not."""
+    """Add ``number`` to the ascending list, or remove it."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

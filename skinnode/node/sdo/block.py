@@ -1,35 +1,46 @@
 """SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
 
-CAN delivers a frame twice when the very last bit of its end is disturbed (ISO 11898-1), and nothing in a
-frame says which block it belongs to: an acknowledgement taken for one of the next block would leave segments
-out. A frame that equals the one before is therefore ignored, where the protocol knows no reason for another.
+CAN delivers a frame twice if the last bit of its end of frame is disturbed (ISO 11898-1), and a frame does
+not show its block: a repeated acknowledgement, taken for that of the next block, would skip segments. A frame
+equal to the previous one is therefore ignored unless the protocol gives a reason for a repetition.
 """
 
 from __future__ import annotations
 
 import binascii
 import struct
+from dataclasses import dataclass
 from enum import Enum, IntEnum, auto
 from typing import Final
 
 from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.sdo import MAX_BLOCK_SEGMENTS, SEGMENT_BYTES
 from skinnode.errors import BusError
-from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Transfer
+from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 SEGMENT_NS: Final = 500_000
-"""Shortest mean time between two segments. PDOs may take 70 % of a bus; of 1 Mbit/s that leaves at least 2200
-frames/s, of which this takes 2000, so that the queue that the PDOs are in, too, does not fill. A block takes
-64 ms, 100 ms where the thread wakes late, and clients wait 300 ms (canopen library) and longer for a single
-frame. Doubled for the rest of a transfer whenever the bus takes no more, as slower ones do."""
+"""Shortest mean time between two segments, ns.
+
+PDOs may take 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this takes 2000, so that the
+transmit queue, which PDOs share, does not fill. A block takes 64 ms, or 100 ms if the thread wakes late;
+clients wait at least 300 ms (canopen library) for a frame. Doubled for the rest of a transfer whenever the
+bus refuses a segment, as slower buses do.
+"""
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""A quarter of 125 kbit/s: what keeps the bus from taking more than that has nothing to do with the pace."""
+"""Longest mean time between two segments, ns: a quarter of a bus of 125 kbit/s. If the bus refuses even that,
+the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Most segments sent in one turn, to make up for a thread that wakes late (2 ms by default). The queue of a
-Linux CAN interface is 10 frames long, and a thread that was held up may take two turns one upon the other."""
+"""Maximum segments sent in one timer event, to compensate for a thread that wakes late (2 ms by default).
+
+The transmit queue of a Linux CAN interface holds 10 frames, and a delayed thread may handle two events in a
+row.
+"""
 TWICE_NS: Final = 3_000_000
-"""Two of the longest frames at 125 kbit/s and the error frame between: how far apart one frame that is
-delivered twice can be. A client that means its second acknowledgement has seen more segments since."""
+"""Maximum distance of the two deliveries of one frame, ns: two of the longest frames at 125 kbit/s and an
+error frame.
+
+A client that means a second acknowledgement has received more segments in between.
+"""
 
 _LAST: Final = 0x80
 _SEQUENCE: Final = 0x7F
@@ -50,43 +61,56 @@ class _Upload(Enum):
 
     START = auto()
     TIME = auto()
-    """To send the next segment."""
+    """The time of the next segment."""
     ACKNOWLEDGEMENT = auto()
     END = auto()
 
 
-class BlockUpload(Transfer):
-    """``data`` on its way to the client, ``block_size`` segments at a time until the client asks for another
-    number. Sends the answer to the initiate request itself."""
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """The value of a block upload, and what the client asked for."""
 
-    def __init__(
-        self,
-        channel: Channel,
-        index: int,
-        subindex: int,
-        data: bytes,
-        block_size: int,
-        t_ns: int,
-        *,
-        crc: bool,
-    ) -> None:
-        super().__init__(channel, index, subindex, t_ns)
+    data: bytes
+    """The value."""
+    block_size: int
+    """Segments of a block until the client asks for another number."""
+    crc: bool
+    """Whether the client offers a CRC."""
+
+
+class BlockUpload(Transfer):
+    """A block upload. Sends the answer to the initiate request itself.
+
+    Args:
+        channel: the server channel.
+        target: the object.
+        upload: its value and the client's options.
+        t_ns: when the initiate request was received, ns.
+
+    Raises:
+        Refused: if the block size is not 1 to 127.
+    """
+
+    def __init__(self, channel: Channel, target: Target, upload: Upload, t_ns: int) -> None:
+        super().__init__(channel, target, t_ns)
+        data, crc = upload.data, upload.crc
         self._data, self._crc = data, crc
-        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # nothing at all takes a segment too
-        self._block_size = _checked(block_size)
+        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value takes a segment too
+        self._block_size = _checked(upload.block_size)
         self._first = 0  # segments before the present block
         self._sent = 0  # segments of the present block
         self._pace_ns = SEGMENT_NS
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
-        # A CRC is agreed on where both sides offer it. Clients are known that expect one, not asked for,
-        # from a server that says it could.
-        channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, index, subindex, len(data)))
+        # Both sides must offer a CRC. Some clients expect one they did not ask for if the server offers it.
+        channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
+        """Return whether a frame of the client belongs to this transfer."""
         return request[0] >> 5 == 5 and request[0] & 3 != 0
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
+        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
         twice = request == self._previous and t_ns - self._previous_ns < TWICE_NS
         if twice and self._waits_for is not _Upload.ACKNOWLEDGEMENT:
             return False
@@ -103,6 +127,7 @@ class BlockUpload(Transfer):
         return False
 
     def on_timer(self, t_ns: int) -> None:
+        """Send the segments that are due at ``t_ns``, or abort if the client has paused for too long."""
         if self._waits_for is not _Upload.TIME:
             super().on_timer(t_ns)
         due_ns = max(self.deadline_ns, t_ns - (SEGMENTS_AT_ONCE - 1) * self._pace_ns)
@@ -125,7 +150,7 @@ class BlockUpload(Transfer):
         head = self._sent + 1 | (_LAST if last else 0)
         try:
             self._channel.send(bytes((head,)) + segment.ljust(SEGMENT_BYTES, b"\0"))
-        except BusError:  # the segment has not gone and is sent again
+        except BusError:  # the segment was not sent and is repeated
             self._pace_ns = min(2 * self._pace_ns, SLOWEST_SEGMENT_NS)
             raise
         self._sent += 1
@@ -133,7 +158,7 @@ class BlockUpload(Transfer):
             self._waits_for = _Upload.ACKNOWLEDGEMENT
 
     def _acknowledge(self, received: int, block_size: int, t_ns: int) -> None:
-        """The client has segments up to number ``received`` of the block; the others are sent again."""
+        """Continue after segment ``received`` of the block; later segments are sent again."""
         if received > self._sent:
             raise Refused(AbortCode.INVALID_SEQUENCE)
         self._block_size = _checked(block_size)
@@ -149,29 +174,42 @@ class BlockUpload(Transfer):
 
 
 class BlockDownload(Transfer):
-    """A value on its way from the client. Sends the answer to the initiate request itself.
+    """A block download. Sends the answer to the initiate request itself.
 
-    Blocks are acknowledged at their end, with the number of the last segment before a gap; a client that does
-    not get to the end of a block runs into the time-out.
+    Each block is acknowledged at its end, with the number of the last segment before a gap; a client that
+    does not reach the end of a block runs into the time-out.
+
+    Args:
+        channel: the server channel.
+        target: the object.
+        announced: size that the client announced, bytes; None if it did not.
+        t_ns: when the initiate request was received, ns.
+        crc: whether the client offers a CRC.
+
+    Raises:
+        Refused: if the object cannot be written, or cannot have that size.
     """
 
     def __init__(
-        self, channel: Channel, index: int, subindex: int, announced: int | None, t_ns: int, *, crc: bool
+        self, channel: Channel, target: Target, announced: int | None, t_ns: int, *, crc: bool
     ) -> None:
-        super().__init__(channel, index, subindex, t_ns)
-        self._incoming = Incoming(channel.store, index, subindex, announced)
+        super().__init__(channel, target, t_ns)
+        self._incoming = Incoming(channel.store, target, announced)
         self._crc = crc
         self._received = 0  # segments of the present block without a gap
-        self._last: bytes | None = None  # the last segment of all, not known yet how much of it is data
+        self._last: bytes | None = (
+            None  # the last segment of the transfer; the end request says how much of it is data
+        )
         self._previous = b""  # the last request, if it was acknowledged
-        channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, index, subindex, MAX_BLOCK_SEGMENTS))
+        channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:
-        """Whatever comes while blocks do is a segment."""
+        """Return whether a frame belongs to the transfer: during a block every frame is a segment."""
         return self._last is None or _is_end(request) or request == self._previous
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
-        if self._last is not None and _is_end(request):  # the last segment may look the same
+        """Handle a frame that belongs to the transfer; return whether the transfer is over."""
+        if self._last is not None and _is_end(request):  # the last segment may have the same bytes
             self._end(request, self._last)
             return True
         if request == self._previous:

@@ -1,0 +1,57 @@
+"""Failures of a source: counted, and reported by EMCY 0xFF00."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Callable, Iterator
+
+from skinnode.canopen.emergency import EmcyCode
+from skinnode.node.emcy import EmcyProducer
+from skinnode.node.patch.source import SourceFailed, SourceFault
+
+
+class SourceMonitor:
+    """Counts and reports the failures of a source.
+
+    Args:
+        emcy: emergency producer.
+        on_failure: called after each failure.
+    """
+
+    def __init__(self, emcy: EmcyProducer, on_failure: Callable[[], None]) -> None:
+        self._emcy, self._on_failure = emcy, on_failure
+        self._fault: SourceFault | None = None
+        self.failures = 0
+        """Number of readings, tares and self-tests that failed."""
+        self.error = ""
+        """Last failure, in one line; empty before the first."""
+
+    def reset(self, t_ns: int) -> None:
+        """Report a present failure again, after a reset."""
+        if self._fault is not None:
+            self._report(self._fault, t_ns)
+
+    @contextlib.contextmanager
+    def watch(self, t_ns: int) -> Iterator[None]:
+        """Report a failure in the block, which then goes on to the caller, or the end of one.
+
+        Args:
+            t_ns: present time, ns.
+        """
+        try:
+            yield
+        except SourceFailed as failure:
+            self.failures += 1
+            self.error = str(failure)
+            if failure.fault is not self._fault:  # once, not with every scan
+                self._report(failure.fault, t_ns)
+            self._on_failure()
+            raise
+        if self._fault is not None:
+            self._fault = None
+            self._emcy.clear(EmcyCode.SOURCE, t_ns)
+
+    def _report(self, fault: SourceFault, t_ns: int) -> None:
+        self._fault = fault
+        self._emcy.report(EmcyCode.SOURCE, struct.pack("<BH", fault, self.failures & 0xFFFF), t_ns)

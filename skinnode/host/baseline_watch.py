@@ -69,7 +69,7 @@ class BaselineWatch:
             return
 
         def read() -> Joined | None:
-            with contextlib.suppress(BusError, ConfigError):  # asked again
+            with contextlib.suppress(BusError, ConfigError):  # it is read again later
                 remote.renew_register()
             return None
 
@@ -92,7 +92,7 @@ class BaselineWatch:
         except Exception as error:
             remote.defects.report("reading the baseline or the error register", error)
             return
-        assert read is not None  # see above
+        assert read is not None  # None is handled above
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
@@ -106,7 +106,7 @@ def note_baseline(node: Supervised) -> None:
     A bring-up finds a new one too: after a reading that failed, or if it changed while the node was away.
     """
     facts, before = node.remote.facts, node.baseline_ohm
-    assert facts is not None  # of a node that was brought up
+    assert facts is not None  # the node was brought up
     node.baseline_ohm = facts.baseline_ohm
     if node.announced or (before is not None and not np.array_equal(before, facts.baseline_ohm)):
         node.announced = False

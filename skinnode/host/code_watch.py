@@ -93,11 +93,11 @@ class CodeWatch:
         self.frozen = False
         self.wires: tuple[WireFault, ...] = ()
         self._last: Codes | None = None
-        self._before: Codes | None = None  # of each code the value it had before the present one
+        self._before: Codes | None = None  # for each code, its value before the present one
         self._run = self._longest = self._flickers = 0
         self._needed: float = math.inf
         self._broken: tuple[WireFault, ...] = ()
-        self._odd: dict[WireFault, int] = {}  # windows running in which a wire was noisy or drifted
+        self._odd: dict[WireFault, int] = {}  # consecutive windows in which a wire was noisy or drifted
         self._window: list[Codes] = []
         self._measured: NDArray[np.bool_] | None = (
             None  # codes that all of its scans contain; None: all codes

@@ -115,8 +115,7 @@ class Configurator:
             if time.monotonic() > end_s:
                 raise NodeTimeout(
                     patch.node_id,
-                    f"patch {patch.name!r} on {patch.bus}: got no answer, "
-                    f"allowed: one within {self.boot_deadline_s:g} s",
+                    f"patch {patch.name!r} on {patch.bus}: got no answer within {self.boot_deadline_s:g} s",
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
@@ -165,7 +164,7 @@ class Configurator:
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
         try:
             return unpack_coordinates(data, profile, resistivity)
-        except ValueError as error:  # ConfigError is one
+        except ValueError as error:  # includes ConfigError
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
@@ -351,7 +350,7 @@ def _watch_master(remote: RemoteOd, watched: int) -> None:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)
 
 
-def _mismatch(patch: PatchConfig, what: str, got: str, allowed: str) -> NodeError:
+def _mismatch(patch: PatchConfig, what: str, got: str, expected: str) -> NodeError:
     return NodeError(
-        patch.node_id, f"patch {patch.name!r} on {patch.bus}: {what}: got {got}, allowed: {allowed}"
+        patch.node_id, f"patch {patch.name!r} on {patch.bus}: {what}: got {got}, expected {expected}"
     )

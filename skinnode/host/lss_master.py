@@ -102,7 +102,7 @@ class LssMaster:
                 self._send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, active))
             return True
 
-    # --- who is there
+    # --- nodes without a node-ID
 
     def any_unconfigured(self) -> bool:
         """Return whether there is a node without a node-ID.
@@ -240,7 +240,7 @@ class LssMaster:
         answer = self._ask(command, data, answer_s=answer_s)
         if answer is None:
             time.sleep(_UNDER_WAY_S)
-            raise LssFailed(f"{what}: got no answer by LSS, allowed: one within {answer_s:g} s")
+            raise LssFailed(f"{what}: got no answer by LSS within {answer_s:g} s")
         return answer
 
     def _ask(
@@ -269,5 +269,5 @@ class LssMaster:
 
 def _require_done(answer: bytes, what: str) -> None:
     if answer[1] != LSS_DONE:
-        detail = f" (the maker's own code {answer[2]})" if answer[1] == LSS_MANUFACTURER_ERROR else ""
-        raise LssFailed(f"{what}: got error code {answer[1]}{detail}, allowed: 0 (done)")
+        detail = f" (manufacturer code {answer[2]})" if answer[1] == LSS_MANUFACTURER_ERROR else ""
+        raise LssFailed(f"{what}: got error code {answer[1]}{detail}, expected 0 (done)")

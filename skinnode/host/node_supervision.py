@@ -107,7 +107,7 @@ class NodeSupervision:
 
     def _join(self, node: Supervised, now_ns: int) -> None:
         remote, job = node.remote, node.job
-        assert job is not None  # of this phase
+        assert job is not None  # there is one in this phase
         if remote.monitor.boot_ups != remote.boot_ups:
             node.abandon.set()  # it booted again: what was written so far is lost
         if not job.done():
@@ -119,7 +119,7 @@ class NodeSupervision:
         node.job = None
         try:
             joined = job.result()
-            assert joined is not None  # of a bring-up
+            assert joined is not None  # a bring-up has a result
             assert joined.solver is not None
             remote.start(joined.solver, joined.withholdings)
             note_baseline(node)
@@ -203,12 +203,14 @@ class NodeSupervision:
                 and monitor.nmt_state == NmtState.STOPPED
                 and now_ns >= node.probe_ns
             ):
-                node.probe_ns = now_ns + _PROBE_NS  # a job waits for a response that it does not send
+                node.probe_ns = (
+                    now_ns + _PROBE_NS
+                )  # a job waits for a response that a stopped node does not send
                 with contextlib.suppress(BusError):
                     nmt_master.stand_by(remote.link.send, remote.patch.node_id)
             if node.phase is Phase.JOINING:
                 _log.warning(
-                    "node %d (%s) left NMT state %d for %s without the host's doing",
+                    "node %d (%s) left NMT state %d for %s without a command of the host",
                     remote.patch.node_id,
                     remote.patch.name,
                     NmtState.OPERATIONAL,
@@ -235,7 +237,7 @@ class NodeSupervision:
 
 def _read_back(node: Supervised) -> None:
     """Find out whether a node that sends no scans lost its configuration."""
-    with contextlib.suppress(BusError, ConfigError):  # asked again
+    with contextlib.suppress(BusError, ConfigError):  # it is read again later
         node.unconfigured = not node.remote.is_configured()
 
 
@@ -252,6 +254,6 @@ def _not_started(remote: RemoteNode, *, silent: bool) -> str:
     """Return why a node does not count as started."""
     node = f"node {remote.patch.node_id}"
     if silent:
-        return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command, allowed: one"
+        return f"{node}: got no heartbeat within {START_DEADLINE_S:g} s of the start command"
     state = known(remote.monitor.nmt_state)
-    return f"{node}: got NMT state {state} after the start command, allowed: {NmtState.OPERATIONAL:d}"
+    return f"{node}: got NMT state {state} after the start command, expected {NmtState.OPERATIONAL:d}"

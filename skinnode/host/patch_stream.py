@@ -170,7 +170,7 @@ class PatchStream:
         if self.tap is not None:
             self.tap.polled(self._patch, t_ns)
         scan = self._assembler.poll(t_ns)
-        if scan is not None:  # it may have been thrown away
+        if scan is not None:  # it may have been discarded
             self._offer(scan)
 
     def withhold(self) -> int:
@@ -286,7 +286,7 @@ class PatchStream:
         try:
             self._token.pop()
         except IndexError:
-            return  # a worker is in the stream and looks into the box when it is done
+            return  # a worker is in the stream and checks the box when it is done
         try:
             self._workers.submit(self._work, self._work_failed)
         except Exception:
@@ -301,7 +301,7 @@ class PatchStream:
         self._leave()
 
     def _solve_next(self) -> None:
-        self._taken += 1  # before it leaves the box, so that no reader of the counters sees it nowhere
+        self._taken += 1  # before it leaves the box, so that the counters always include it
         try:
             scan, stamp, solver = self._box.popleft()
         except IndexError:  # the stream was closed

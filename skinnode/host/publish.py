@@ -51,7 +51,7 @@ class Subscription:
         self._subscribed = patches
         # One counter a patch: a patch has one worker at a time, so each has a single writer.
         self._dropped = dict.fromkeys([*patches, ""], 0)
-        self._wakers: dict[object, Callable[[], object]] = {}  # of event loops that wait
+        self._wakers: dict[object, Callable[[], object]] = {}  # one for each waiting event loop
 
     @property
     def dropped(self) -> int:
@@ -99,14 +99,14 @@ class Subscription:
         try:
             async with limit:
                 while True:
-                    await asyncio.sleep(0)  # others have their turn however fast fields come
+                    await asyncio.sleep(0)  # let other tasks run, however fast fields come
                     arrived.clear()
                     try:
                         return self._open(self._queue.get(0.0))
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # it is what stopped the host
+            if not limit.expired():  # the error that stopped the host
                 raise
             raise queue.Empty from None
         finally:

@@ -188,7 +188,7 @@ class RemoteOd:
             shown = data.hex(" ") or "nothing"
             raise NodeError(
                 self.node_id,
-                f"object {_name(index, subindex)}: got {shown}, allowed: {layout.size} bytes ({kind})",
+                f"object {_name(index, subindex)}: got {shown}, expected {layout.size} bytes ({kind})",
             )
         return layout.unpack(data)[0]
 
@@ -221,7 +221,7 @@ class RemoteOd:
         if kept != value:
             raise NodeError(
                 self.node_id,
-                f"object {_name(index, subindex)}: got {_shown(kept)} back, allowed: {_shown(value)} as set",
+                f"object {_name(index, subindex)}: got {_shown(kept)} back, expected {_shown(value)} as set",
             )
 
     def _transfer(self, index: int, subindex: int, verb: str, ask: Callable[[], Any]) -> Any:
@@ -260,7 +260,7 @@ class RemoteOd:
         than ``most`` or takes too long, and Abandoned.
         """
         if stream.size is not None and stream.size > most:
-            raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, allowed: {most} at most")
+            raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected {most} at most")
         limit_s = _TRANSFER_S + _SEGMENT_S * most / SEGMENT_BYTES
         end_s = time.monotonic() + limit_s
         data = bytearray()
@@ -268,13 +268,13 @@ class RemoteOd:
             data += segment
             if len(data) > (most if stream.size is None else stream.size):
                 if stream.size is None:
-                    raise _UploadTooLong(f"more than {counted(most, 'byte')}, allowed: {most} at most")
+                    raise _UploadTooLong(f"more than {counted(most, 'byte')}, expected {most} at most")
                 break
             if self.abandoned():
                 raise Abandoned
             if time.monotonic() > end_s:
                 raise _UploadTooLong(
-                    f"{counted(len(data), 'byte')} and no end, allowed: within {limit_s:.1f} s"
+                    f"{counted(len(data), 'byte')} and no end, expected it within {limit_s:.1f} s"
                 )
         if stream.size is not None and len(data) != stream.size:
             raise SdoCommunicationError(f"{len(data)} of {stream.size} bytes")
@@ -286,17 +286,18 @@ class RemoteOd:
             return SdoAbort(self.node_id, failure.code, f"{where}: {text}")
         if any(silence in str(failure) for silence in _SILENCES):
             waited_s = ATTEMPTS * self._client.RESPONSE_TIMEOUT
-            return NodeTimeout(self.node_id, f"{where}: got no answer, allowed: one within {waited_s:.1f} s")
+            return NodeTimeout(self.node_id, f"{where}: got no answer within {waited_s:.1f} s")
         if "returned a value for" in str(
             failure
         ):  # the response to another client's request, or from another node
-            got = f"{where}: got the answer for another object, allowed: that for this one"
+            got = f"{where}: got the answer for another object"
             why = f"two nodes answer with node-ID {self.node_id}, or another SDO client asks it"
             return NodeError(self.node_id, f"{got}; {why}")
         if isinstance(failure, SdoError):
-            return NodeError(self.node_id, f"{where}: got {failure}, allowed: an answer of CiA 301")
+            return NodeError(self.node_id, f"{where}: got {failure}, expected an answer as in CiA 301")
         return NodeError(
-            self.node_id, f"{where}: the transfer failed ({one_line(failure)}), allowed: an answer of CiA 301"
+            self.node_id,
+            f"{where}: the transfer failed ({one_line(failure)}), expected an answer as in CiA 301",
         )
 
 

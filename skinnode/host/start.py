@@ -166,7 +166,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
                 raise NodeTimeout(
                     patch.node_id,
                     f"patch {patch.name!r} on {patch.bus}: got NMT state {known(monitor.nmt_state)} after "
-                    f"the start command, allowed: {NmtState.OPERATIONAL:d} (operational) within "
+                    f"the start command, expected {NmtState.OPERATIONAL:d} (operational) within "
                     f"{START_DEADLINE_S:g} s",
                 )
             naps -= 1
@@ -200,13 +200,13 @@ def _silence(
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]
     silent = [other for other in on_bus if other not in answered]
-    allowed = f"allowed: an answer within {deadline_s:g} s"
     names = ", ".join(f"{other.node_id} ({other.name})" for other in silent)
     if len(silent) == len(on_bus):
         return BusError(
-            f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: got no answer from any node, "
-            f"{allowed} from {names}"
+            f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: got no answer within "
+            f"{deadline_s:g} s from any node: {names}"
         )
     return NodeTimeout(
-        patch.node_id, f"patch {patch.name!r} on {bus.name}: got no answer, {allowed} from {names}"
+        patch.node_id,
+        f"patch {patch.name!r} on {bus.name}: got no answer within {deadline_s:g} s from {names}",
     )

@@ -142,7 +142,7 @@ class Supervisor:
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
-            assert node_id is not None  # of these
+            assert node_id is not None  # only buses with one are here
             try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
             except BusError:  # nodes that miss it report that themselves

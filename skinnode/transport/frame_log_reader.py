@@ -149,7 +149,7 @@ class FrameLogReader:
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
         """Return the complete objects of ``data``, and the beginning of an incomplete one at its end."""
         pieces: list[bytes] = []
-        begin = at = 0  # of the objects that follow one another; of the next
+        begin = at = 0  # begin: of the objects read so far; at: of the next object
         while True:
             start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
             if start < 0 and len(data) - at <= _PADDING_BYTES:

@@ -119,7 +119,7 @@ class CanPort:
         self._longest = 64 if config.fd else 8
         self._closed = False
         self._link_gone: Exception | None = None
-        self._counting = threading.Lock()  # sent is counted by several threads; see send()
+        self._counting = threading.Lock()  # several threads count sent frames; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
         self._dropped_before = 0  # by readers before the present one
         self._away = False

@@ -92,7 +92,7 @@ class Intake:
     @property
     def queued(self) -> int:
         """Number of frames waiting."""
-        taken = self._taken  # first: there are never fewer put than taken
+        taken = self._taken  # read first: never more are taken than put
         return self._put - taken
 
     def take(self) -> list[Frame]:
@@ -102,7 +102,7 @@ class Intake:
             BusError: if the bus failed, once the frames received before that have been taken.
             Exception: whatever else receiving raised.
         """
-        error, batches = self._error, self._queue  # the error first: what is queued came before it
+        error, batches = self._error, self._queue  # the error is read first: queued frames came before it
         if not batches:
             if error is not None:
                 raise error
@@ -173,7 +173,7 @@ class Intake:
         now_ns = time.monotonic_ns()
         try:
             frames = self.port.recv_batch(timeout_s)
-        except Exception as error:  # a defect, too, must reach the reader and not die with the thread
+        except Exception as error:  # every exception must reach the reader
             self._error = error
             return True
         if not frames:
@@ -238,7 +238,7 @@ class Receiver:
             self._joining.append(intake)
             return
         if intake in self._alone:
-            self._alone[intake].join()  # it ends after the failure, which must not be forgotten before
+            self._alone[intake].join()  # it ends after the failure; the error must stay set until then
         intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = threading.Thread(target=self._receive_alone, args=(intake,), name=name, daemon=True)
@@ -314,13 +314,13 @@ class Receiver:
                 time.sleep(_POLL_S)
 
     def _notify(self) -> None:
-        if self._news.empty():  # once is enough
+        if self._news.empty():  # one notification is enough
             self._news.put(None)
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
     """Fetch from every intake. Returns whether any has something new to take."""
-    return sum(intake.fetch(0.0) for intake in intakes) > 0  # of each, whatever another has
+    return sum(intake.fetch(0.0) for intake in intakes) > 0  # from every intake, whatever the others have
 
 
 def _together(now_ns: int, pause_ns: int) -> int:

@@ -77,7 +77,7 @@ class MessageBatch:
             OSError: if receiving fails; if messages came before the error, the next call raises it.
         """
         used = self._got * _USED.size
-        self._memory[:used] = self._fresh[:used]  # the kernel wrote there what it used of the room
+        self._memory[:used] = self._fresh[:used]  # the kernel overwrote the buffer sizes with the sizes used
         self._got = 0
         got = _libc.recvmmsg(sock.fileno(), self._messages, min(most, self._count), socket.MSG_DONTWAIT, None)
         if got < 0:

@@ -70,7 +70,9 @@ class SocketReader:
         self.hardware_stamps = False
         """Whether the newest frame had a hardware timestamp."""
         self._delay = HardwareDelay()
-        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0)  # python-can's choice; a socket has one kind
+        sock.setsockopt(
+            socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0
+        )  # python-can set it; a socket has one kind of timestamp
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPING, _RX_SOFTWARE | _SOFTWARE | _RX_HARDWARE | _RAW_HARDWARE
         )

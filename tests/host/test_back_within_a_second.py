@@ -102,7 +102,7 @@ ATTACKS = (
     after_power_off("all SDO answers lost", 3.0, sdo_response_lost=1.0, reason="got no answer"),
     after_power_off("all SDO requests lost", 2.0, sdo_request_lost=1.0, reason="no heartbeat of node"),
     after_power_off("a fifth of the SDO answers lost", 2.0, sdo_response_lost=0.2),
-    after_power_off("NMT lost", 2.0, nmt_lost=1.0, reason="after the start command, allowed: 5"),
+    after_power_off("NMT lost", 2.0, nmt_lost=1.0, reason="after the start command, expected 5"),
     after_power_off("boot-up lost", 0.4, boot_up_lost=1.0),
     after_power_off("wrong identity", 0.8, wrong_identity=True, reason="product code: got 0x"),
     after_power_off("wrong layout", 0.8, wrong_layout=True, reason="layout hash: got 0x"),

@@ -57,7 +57,7 @@ def test_an_upload_that_does_not_end_is_an_error_and_is_aborted(announced: int |
         "large": lambda: remote.read_large(0x2301),
     }
     begun_s = time.monotonic()
-    with pytest.raises(NodeError, match=r"node 5: (block )?read of object 0x\w+:\d: got .*, allowed: "):
+    with pytest.raises(NodeError, match=r"node 5: (block )?read of object 0x\w+:\d: got .*, expected "):
         read[how]()
     assert time.monotonic() - begun_s < 10.0
     assert server.aborted

@@ -309,16 +309,16 @@ def test_the_load_of_each_bus_is_measured_though_in_turn(hand: HandConfig) -> No
 @pytest.mark.parametrize(
     ("response", "error", "line"),
     [
-        (None, NodeTimeout, "node 5: read of object 0x1017:0: got no answer, allowed: one within 0.9 s"),
+        (None, NodeTimeout, "node 5: read of object 0x1017:0: got no answer within 0.9 s"),
         (
             "4f 17 10 00 05 00 00 00",
             NodeError,
-            "node 5: object 0x1017:0: got 05, allowed: 2 bytes (u16)",
+            "node 5: object 0x1017:0: got 05, expected 2 bytes (u16)",
         ),
         (
             "60 17 10 00 00 00 00 00",
             NodeError,
-            "node 5: read of object 0x1017:0: got Unexpected response 0x60, allowed: an answer of CiA 301",
+            "node 5: read of object 0x1017:0: got Unexpected response 0x60, expected an answer as in CiA 301",
         ),
         (
             "80 17 10 00 00 00 02 06",

@@ -104,7 +104,7 @@ def test_a_value_of_another_length_is_named(server: Server, data: bytes) -> None
     server.objects[0x1017, 0] = data
     with pytest.raises(NodeError) as caught:
         server.remote.read(0x1017, 0, "u16")
-    assert str(caught.value) == f"node 5: object 0x1017:0: got {data.hex(' ')}, allowed: 2 bytes (u16)"
+    assert str(caught.value) == f"node 5: object 0x1017:0: got {data.hex(' ')}, expected 2 bytes (u16)"
 
 
 def test_an_abort_is_told_with_its_code(server: Server) -> None:

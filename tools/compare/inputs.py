@@ -139,7 +139,7 @@ def record(folder: Path, name: str) -> None:
             assert process.stdout is not None
             process.stdout.readline()
             file = folder / f"{name}.log"
-            done = subprocess.run([*recorder, "-o", str(file)], capture_output=True, text=True, timeout=120)
+            done = subprocess.run([*recorder, "-o", str(file)], capture_output=True, text=True, timeout=900)
             if not file.exists() or file.stat().st_size < 10_000:
                 raise SystemExit(f"{name}: no recording: {done.stdout[-300:]}{done.stderr[-300:]}")
         finally:

@@ -7,8 +7,8 @@ import numpy as np
 import skinnode as sk
 from skinnode.compiled.jit import is_cold
 
-KERNELS = ("solve_patch", "surprises", "advance")
-"""One kernel of each solver: the exact tracker, the whole-patch estimator, path following."""
+KERNELS = ("solve_patch", "surprises", "_secant", "advance")
+"""One kernel of each solver: exact tracker, whole-patch estimator, path following, systems of equations."""
 
 
 def is_needed() -> bool:
@@ -21,8 +21,8 @@ def main() -> None:
     rest_ohm = sk.resistance_ohm(layout, layout.upper_m)
     for method in ("exact", "posterior"):
         sk.Tracker(layout, method=method).update(rest_ohm)
-    path_ohm = np.stack([rest_ohm, rest_ohm, rest_ohm])
-    sk.solve_path(layout, path_ohm)
+    sk.solve_path(layout, np.stack([rest_ohm, rest_ohm, rest_ohm]))
+    sk.solve_system(lambda x: x - 1.0, lambda x: np.eye(1), [0.0])
 
 
 if __name__ == "__main__":

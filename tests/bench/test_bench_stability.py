@@ -301,7 +301,7 @@ def test_auto_is_not_run_twice_where_it_is_what_it_chose(monkeypatch, different_
 
         return solve
 
-    monkeypatch.setattr(_bench_stability.methods, "of", of)
+    monkeypatch.setattr(_bench_stability.methods, "set_up", of)
     case = dataclasses.replace(small_case(0.0), methods=("exact", "posterior", "auto"))
     rows = {row["method"]: row for row in _bench_stability.run(5, cases=[case])["rows"]}
     assert seen == {"exact": 5, "posterior": 5, "auto": calls}

@@ -1,5 +1,10 @@
-"""A hand that is simulated, gathered and shown: ``skinnode demo`` and the simulated hands of other commands.
+"""A simulated hand, brought up, solved, scored and shown, for ``skinnode demo`` and ``--simulate``.
 
-This package and two benchmarks are the only ones that know the simulator as well as the host. Both talk only
-through the bus; the truth that the simulator keeps is used for the score alone.
+::
+
+    hand -> vcan_sim.fleet (nodes on a virtual bus) -> skinnode.host -> run (score against the truth) -> view,
+    plot
+
+This package and two benchmarks are the only ones that import both simulator and host. Both communicate only
+through the bus; the simulator's truth is used for the score alone.
 """

@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchTrace:
-    """One patch's run as the demo plots it. Times in s since the first scan, lengths in m."""
+    """Data of one patch for the plot. Times in s since the first scan, lengths in m."""
 
     name: str
     rest_m: Float
@@ -23,19 +23,21 @@ class PatchTrace:
     time_s: Float
     """(T,)"""
     depth_m: Float
-    """(T,) true depth of the deepest electrode."""
+    """(T,), true depth of the deepest electrode."""
     error_m: Float
-    """(T,) RMS error of the field."""
+    """(T,), RMS error of the field."""
     reported_m: Float
-    """(T,) RMS of the reported deviations."""
+    """(T,), RMS of the reported standard deviations."""
     snapshot_truth_m: Float
-    """(U, N, 3) true displacement of the deepest scan."""
+    """(U, N, 3), true displacement of the deepest scan."""
     snapshot_m: Float
-    """(U, N, 3) the displacement decoded from it."""
+    """(U, N, 3), decoded displacement of that scan."""
 
 
-def _map(axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: str, low: float) -> Any:
-    """Depth as an image over the patch, in mm, with the tangential displacement as arrows."""
+def _map(  # noqa: PLR0913 - the options of an image
+    axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: str, low: float
+) -> Any:
+    """Draw depth as an image over the patch; axes in mm."""
     x, y = 1e3 * rest_m[..., 0], 1e3 * rest_m[..., 1]
     half = 0.5 * (x[0, 1] - x[0, 0]) if x.shape[1] > 1 else 1.0
     extent = (x.min() - half, x.max() + half, y.min() - half, y.max() + half)
@@ -54,8 +56,15 @@ def _map(axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: 
 
 
 def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
-    """One column a patch: the truth, what was decoded, the difference, and error beside reported deviation
-    over time."""
+    """Draw one column for each patch: truth, estimate, their difference, and error over time.
+
+    Args:
+        file: File to write; its suffix names the format.
+        traces: Data of the patches.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

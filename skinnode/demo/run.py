@@ -1,4 +1,4 @@
-"""The run behind ``skinnode demo``: play the scene, watch the stream, hold it against the truth."""
+"""Runs ``skinnode demo``: plays the scene, follows the fields, and scores them by the truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""No field for this long: the scans of one SYNC are solved and the next are still on their way."""
+"""Seconds without a field after which the scans of a SYNC are solved and the next have not yet arrived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +46,10 @@ class PatchReport:
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Overtaken by a newer scan before a solver was free."""
+    """Scans replaced by a newer scan before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """PDOs the node sent that did not become part of a scan."""
+    """PDOs of the node that did not become part of a scan."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -57,25 +57,25 @@ class PatchReport:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The whole run in figures."""
+    """Figures of the whole run."""
 
     seconds: float
     scan_rate_hz: float
     patches: tuple[PatchReport, ...]
     frames_sent: int
-    """PDOs the nodes sent."""
+    """PDOs that the nodes sent."""
     frames_received: int
     """PDOs that became part of a scan."""
     frames_lost: int
     bus_load: float
-    """Share of a 1 Mbit/s bus that all frames of the scan phase would have taken, stuff bits counted."""
+    """Share of a 1 Mbit/s bus that all frames of the scan phase would have used, with stuff bits."""
     faults: tuple[str, ...]
-    """What makes the exit status 1; empty when all is well."""
+    """Reasons for exit status 1; empty if there are none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a run leaves behind."""
+    """Result of a run."""
 
     report: Report
     traces: tuple[PatchTrace, ...]
@@ -83,14 +83,14 @@ class Run:
 
 @dataclass
 class _Watch:
-    """One patch as it is followed during the run. Owned by the main thread."""
+    """Data of one patch during the run. Owned by the main thread."""
 
     config: PatchConfig
     scorer: Scorer
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
     latency_ms: list[float] = field(default_factory=list)
     history: list[tuple[float, float, float, float]] = field(default_factory=list)
-    """Time, true depth, RMS error, RMS reported deviation of each scan."""
+    """Time, true depth, RMS error and RMS reported standard deviation of each scan."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
 
@@ -136,7 +136,7 @@ class _Watch:
 
 
 def _depth_std_m(frame: FieldFrame) -> float:
-    """Reported deviation of the depth of the deepest electrode."""
+    """Return the reported standard deviation of the depth of the deepest electrode."""
     deepest = frame.displacement_m[..., 2].argmin()
     return float(frame.displacement_std_m[..., 2].flat[deepest])
 
@@ -187,7 +187,16 @@ class _Progress:
 
 
 def play(hand: HandConfig, seconds: float, console: Console) -> Run:
-    """Play ``hand`` for ``seconds`` of scans and score what was decoded. Raises SkinError where it cannot."""
+    """Play a hand and score the decoded fields.
+
+    Args:
+        hand: The hand, on a virtual bus.
+        seconds: Length of the run from the first scan.
+        console: Where progress is printed.
+
+    Raises:
+        SkinError: The hand cannot be run.
+    """
     if jit.is_cold():
         console.print("compiling the kernels, once; the next start is immediate")
     layouts = {patch.name: patch.layout.build() for patch in hand.patches}
@@ -215,12 +224,14 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Between two scans, so that neither score nor screen cost the host time.
+                    # Between two scans, so that score and screen take no time from the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
             bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
-        while (frame := subscription.get(0.0)) is not None:  # what was under way when the host closed
+        while (
+            frame := subscription.get(0.0)
+        ) is not None:  # fields that were being solved when the host closed
             unscored.append(frame)
         for frame in unscored:
             _take(frame, watches, fleet, t_start_ns)
@@ -258,7 +269,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
     assert frame.stamp is not None  # the host stamps every field
-    if frame.stamp.device_time_us == 0:  # its summary was lost: nobody knows which truth it is to be held to
+    if frame.stamp.device_time_us == 0:  # its summary was lost: the time of its truth is unknown
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
     watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
@@ -269,7 +280,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Losses the host itself knows of: frames its queue had no room for and chunks that never came."""
+    """Return the losses that the host knows of: frames dropped by its queue, and chunks that never came."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())
@@ -303,7 +314,7 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
 
 
 def print_report(console: Console, report: Report) -> None:
-    """The table at the end, and one line for each fault."""
+    """Print the final table, and one line for each fault."""
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
     table.add_column("\npatch")
     for heading in (
@@ -345,7 +356,7 @@ def print_report(console: Console, report: Report) -> None:
             soft_wrap=True,
         )
     else:
-        console.print("nothing was pressed in this time; try more --seconds")
+        console.print("nothing was pressed in this time; use more --seconds")
     for fault in report.faults:
         console.print("fault: ", style="bold red", end="")
         console.print(fault)
@@ -361,7 +372,6 @@ def print_report(console: Console, report: Report) -> None:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """The report as plain data; a figure that could not be had is null."""
-
+    """Return the report as plain data; a missing figure is None."""
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

@@ -1,6 +1,8 @@
-"""Simulated patches for a command that shows a host at work: beside the demo, the one place of the package
-that knows the simulator. They run in a process of their own, as the nodes of a real hand do: they share
-neither interpreter nor fate with the host, and its figures are its own."""
+"""Simulated patches for a command that shows a host at work.
+
+They run in a process of their own, as the nodes of a real hand do: they share no interpreter with the host,
+and the host's figures are its own.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,10 @@ from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
-    """The same hand on buses that cross processes on this machine and that nobody else uses: simulated nodes
-    have no business among real ones."""
+    """Return the same hand on unused buses that connect processes on this machine.
+
+    Simulated nodes must not appear among real ones.
+    """
     groups = random.sample(range(1 << 16), len(hand.buses))
     buses = tuple(
         bus.model_copy(
@@ -34,11 +38,14 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
 
 @contextmanager
 def simulated(hand: HandConfig) -> Iterator[None]:
-    """The patches of a hand as nodes on its buses, in a process that ends with this one. Raises SkinError
-    where it does not start."""
+    """Run a hand's patches as nodes on its buses, in a child process that exits with this one.
+
+    Raises:
+        SkinError: The child process cannot run them.
+    """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_be_nodes, args=(hand, theirs), name="simulated patches")
+    process = context.Process(target=_run_nodes, args=(hand, theirs), name="simulated patches")
     with starting_children():
         process.start()
     theirs.close()
@@ -46,22 +53,22 @@ def simulated(hand: HandConfig) -> Iterator[None]:
         try:
             complaint = ours.recv()
         except EOFError:
-            complaint = "they ended at once"
+            complaint = "the process that runs them ended at once"
         if complaint:
             raise SkinError(f"simulated patches: {complaint}")
         yield
     finally:
-        ours.close()  # which tells them
+        ours.close()  # ends the child
         process.join()
 
 
-def _be_nodes(hand: HandConfig, parent: Connection) -> None:
-    """Be the nodes until the parent closes its end, which it does even where it is killed."""
+def _run_nodes(hand: HandConfig, parent: Connection) -> None:
+    """Run the nodes until the parent closes its end of the pipe, which happens even if it is killed."""
     import signal
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group: the parent ends us
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group; the parent ends this process
     try:
         with Fleet(hand):
             parent.send("")

@@ -1,4 +1,4 @@
-"""What the demo shows on a terminal: a height map per patch, health, rates and bus load."""
+"""Live view of the demo on a terminal: a height map for each patch, health, rates and bus load."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Characters across a height map; two pixels above each other make one character, so it is square."""
+"""Width of a height map in characters; each shows two pixels, one above the other, so the map is square."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """One patch as the view shows it. Lengths in metres, NaN where not known yet."""
+    """Data of one patch for the view. Lengths in metres, NaN if not yet known."""
 
     name: str
     health: str
     displacement_m: Float | None
     """(U, N, 3)"""
     depth_std_m: float
-    """Reported deviation of the depth of the deepest electrode."""
+    """Reported standard deviation of the depth of the deepest electrode."""
     error_m: float
-    """RMS error of the last field against the true deformation."""
+    """RMS error of the last field."""
     rate_hz: float
     torn: int
 
 
 @dataclass(frozen=True, slots=True)
 class BusView:
-    """The bus and the clock of the demo as the view shows them."""
+    """Data of the bus and of the run for the view."""
 
     elapsed_s: float
     seconds: float
@@ -102,7 +102,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
 
 
 def panels_in(columns: int, lines: int) -> int:
-    """How many patches a terminal of this size has room for."""
+    """Return the number of patches that fit on a terminal of this size."""
     across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 7)
     return max(1, across) * max(1, down)
 
@@ -110,7 +110,14 @@ def panels_in(columns: int, lines: int) -> int:
 def render(
     patches: Sequence[PatchView], bus: BusView, full_scale_m: float, room: int = 1000
 ) -> RenderableType:
-    """The whole screen. ``full_scale_m`` is the depth drawn brightest, ``room`` the most patches to draw."""
+    """Return the whole screen.
+
+    Args:
+        patches: Data of the patches.
+        bus: Data of the bus.
+        full_scale_m: Depth drawn brightest, metres.
+        room: Maximum number of patches to draw.
+    """
     line = Text.assemble(
         f" {bus.elapsed_s:.1f} of {bus.seconds:g} s   ",
         ("bus load ", "dim"),

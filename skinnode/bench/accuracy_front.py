@@ -21,7 +21,7 @@ from skinnode.bench.solve import Case, Solve, peers
 from skinnode.bench.truth import Press, Skin
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.operators.steps import OPERATORS
+from skinnode.solve.operators.codes import OPERATORS
 from skinnode.solve.paths.path import solve_path
 from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform
 from skinnode.solve.wires.problem import PatchProblem

@@ -15,19 +15,11 @@ from skinnode.bench import dense_kernels
 from skinnode.bench.timing import machine, take_turns
 from skinnode.compiled.jit import njit, njit_part
 from skinnode.model.forward import resistance_ohm
-from skinnode.model.kernels import lower_rows, potential_jacobian
+from skinnode.model.kernels import lower_rows, potential_jacobian, relative_residual, relative_residual_part
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.operators.steps import (
-    LIMIT,
-    OPERATORS,
-    OUTSIDE,
-    Work,
-    begin,
-    judge,
-    propose,
-    shorten,
-    workspace,
-)
+from skinnode.solve.operators.codes import OPERATORS, OUTSIDE
+from skinnode.solve.operators.loop import assess, begin, propose, shorten
+from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
@@ -76,7 +68,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
     The parameter of Levenberg-Marquardt, for which the compiled step searches, is given.
     """
     f, jt = wire(x)
-    r, j = a * f - 1.0, (jt * a).T
+    r, j = relative_residual(a, f), (jt * a).T
     if operator == "gauss_newton":
         step = -np.linalg.solve(j, r)
     else:
@@ -106,14 +98,14 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
             step = -np.linalg.solve(triangle[:n, :n], triangle[:n, n])
     trial = x + step
     f, _ = wire(trial)
-    return np.asarray(a * f - 1.0)
+    return relative_residual(a, f)
 
 
 @njit_part
 def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
     potential_jacobian(x, lower, r, jt)
     for k in range(r.size):
-        r[k] = a[k] * r[k] - 1.0
+        r[k] = relative_residual_part(a[k], r[k])
     for i in range(jt.shape[0]):
         row = jt[i]
         for k in range(r.size):
@@ -137,7 +129,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
         if propose(operator, w, 1e-14, 1e-14) == OUTSIDE:
             shorten(operator, w)
         _evaluate(w.trial, lower, a[u], w.r_trial, jt_trial)
-        judge(operator, w, 1e-14, 1e-14)
+        assess(operator, w, 1e-14, 1e-14)
 
 
 def run(rounds: int) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from skinnode.bench.truth import Press
 from skinnode.model.forward import jacobian, potential_per_m, resistance_ohm
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
-from skinnode.solve.operators.steps import OPERATORS
+from skinnode.solve.operators.codes import OPERATORS
 from skinnode.solve.paths.path import PathResult, solve_path
 from skinnode.solve.paths.step_control import Adaptive, Periodic, Schedule, Uniform, shortest_cycle
 

@@ -19,7 +19,7 @@ from skinnode.bench.timing import machine, take_turns
 from skinnode.model.forward import resistance_ohm
 from skinnode.model.kernels import potential, potential_jacobian
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.operators.steps import OPERATORS
+from skinnode.solve.operators.codes import OPERATORS
 from skinnode.solve.operators.system import solve_system
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.patch_solver import PatchSolver

@@ -8,16 +8,29 @@ instead. Lengths are in any one unit; F is in its inverse.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
-from skinnode.compiled.jit import njit, njit_part
+from skinnode.compiled.jit import njit, njit_body, njit_part
 from skinnode.compiled.simd import LANES, Lanes, fma, load, rough_inverse_root, splat, store
 from skinnode.model.layout import Float
+
+_T = TypeVar("_T", float, Float)
 
 
 def lower_rows(lower: Float) -> Float:
     """Return lower electrodes (K, M, 3) as the rows (3, M, K) that the kernels read."""
     return np.ascontiguousarray(lower.transpose(2, 1, 0))
+
+
+def relative_residual(a: _T, f: _T) -> _T:
+    """Return a F − 1 of numbers or arrays: how far a resistance is from what F predicts, relative to it."""
+    return a * f - 1.0
+
+
+relative_residual_part = njit_body(relative_residual)
+"""The same in kernels."""
 
 
 @njit_part

@@ -44,7 +44,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 from skinnode.model.status import Status
 from skinnode.solve.cramer_rao import patch_std, wire_std
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 
 Mask = NDArray[np.bool_]
 

@@ -15,9 +15,10 @@ from typing import Final
 import numpy as np
 
 from skinnode.compiled.jit import njit
-from skinnode.model.kernels import potential_jacobian
+from skinnode.model.kernels import potential_jacobian, relative_residual_part
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index, dot, largest, lu_factor, lu_solve_transposed, padded
+from skinnode.solve.linalg.lu import lu_factor, lu_solve_transposed
+from skinnode.solve.linalg.vectors import Index, dot, largest, padded
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
@@ -76,7 +77,7 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
     for level in range(noises.size):
         potential_jacobian(x, lower, y, jt)
         for k in range(equations):
-            y[k] = 1.0 - a[k] * y[k]
+            y[k] = -relative_residual_part(a[k], y[k])
         for i in range(n):
             row, moved = jt[i], x[i] - rest[i]
             for k in range(equations):

@@ -9,19 +9,11 @@ from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 from scipy.optimize import minimize_scalar
 
-from skinnode.solve.operators import steps as operators
-from skinnode.solve.operators.steps import (
-    EPS,
-    LAM,
-    LEVENBERG_MARQUARDT,
-    LIMIT,
-    RADIUS,
-    REJECTED,
-    TRY,
-    workspace,
-)
+from skinnode.solve.operators import loop
+from skinnode.solve.operators.codes import EPS, LEVENBERG_MARQUARDT, OPERATORS, REJECTED, TRY
+from skinnode.solve.operators.work import LAM, LIMIT, RADIUS, workspace
 
-DOGLEG = operators.OPERATORS["dogleg"]
+DOGLEG = OPERATORS["dogleg"]
 
 
 @settings(max_examples=60, deadline=None)
@@ -49,8 +41,8 @@ def test_shortened_step_is_the_damped_one_of_the_right_length(n, spare, decades,
     scale = np.linalg.norm(j, axis=0)
     u, sigma, vt = np.linalg.svd(j / scale, full_matrices=False)
     w.s[LIMIT] = 1e-2 * np.linalg.norm(u.T @ r) / np.linalg.norm(scale)  # sigma ≤ √n: Newton's is longer
-    assert operators.start(w) == TRY
-    assert operators.advance(LEVENBERG_MARQUARDT, w, REJECTED, 0.0, 0.0) == TRY
+    assert loop.start(w) == TRY
+    assert loop.advance(LEVENBERG_MARQUARDT, w, REJECTED, 0.0, 0.0) == TRY
     lam, radius = w.s[LAM], w.s[RADIUS]
     assert lam > 0
     assert radius == pytest.approx(1e-2 * np.linalg.norm(u.T @ r))
@@ -95,9 +87,9 @@ def test_a_damping_that_is_too_strong_is_lowered(n, spare, singular, share, kept
     radius = share * np.linalg.norm(along / sigma)
     w = workspace(n, m)
     w.r[:], w.jt[:] = r, j.T
-    assert operators.start(w) == TRY
+    assert loop.start(w) == TRY
     w.s[RADIUS], w.s[LAM] = radius, kept * np.linalg.norm(sigma * along) / radius
-    assert operators.advance(LEVENBERG_MARQUARDT, w, REJECTED, 0.0, 0.0) == TRY
+    assert loop.advance(LEVENBERG_MARQUARDT, w, REJECTED, 0.0, 0.0) == TRY
     assert w.s[RADIUS] == radius
     assert abs(np.linalg.norm(scale * w.step) - radius) <= 0.1001 * radius
     truth = -(vt.T @ (sigma / (sigma**2 + w.s[LAM]) * along))
@@ -119,9 +111,9 @@ def test_a_rejected_step_shrinks_the_radius_to_the_minimiser_of_the_parabola(ope
     w.x[:], w.r[:], w.jt[:] = rng.normal(size=n), r, j.T
     scale = np.linalg.norm(j, axis=0)
     newton = np.linalg.norm(scale * np.linalg.solve(j, r))
-    assert operators.start(w) == TRY
+    assert loop.start(w) == TRY
     w.s[RADIUS] = share * newton
-    assert operators.advance(operator, w, REJECTED, 0.0, 0.0) == TRY
+    assert loop.advance(operator, w, REJECTED, 0.0, 0.0) == TRY
     radius, step = w.s[RADIUS], w.step.copy()
     slope = 2.0 * (r @ j @ step) / (r @ r)
     with np.errstate(invalid="ignore"):
@@ -130,7 +122,7 @@ def test_a_rejected_step_shrinks_the_radius_to_the_minimiser_of_the_parabola(ope
     if growth < 10.0:
         parabola = KroghInterpolator([0.0, 0.0, 1.0], [1.0, slope, growth**2])
         expected = minimize_scalar(parabola, bounds=(0.1, 0.5), method="bounded", options={"xatol": 1e-10}).x
-    assert operators.advance(operator, w, TRY, 0.0, 0.0) == TRY
+    assert loop.advance(operator, w, TRY, 0.0, 0.0) == TRY
     length = np.linalg.norm(scale * step)
     assert w.s[RADIUS] == pytest.approx(expected * min(10.0 * length, radius), rel=1e-6)
     np.testing.assert_array_equal(w.r, r)

@@ -26,8 +26,8 @@ from skinnode.model.forward import jacobian
 from skinnode.model.layout import Float
 from skinnode.solve.exact.recover import recover
 from skinnode.solve.exact.stream import TOLERANCE, Frame, StreamState
-from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.operators import steps as op
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.operators import codes as op
 from skinnode.solve.roots import Z_REFUSE
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile

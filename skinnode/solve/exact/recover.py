@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
 from skinnode.solve.exact.stream import TASKS, TOLERANCE, Frame, StreamState
-from skinnode.solve.operators import steps as op
+from skinnode.solve.operators import codes as op
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE

@@ -15,9 +15,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinnode.model.kernels import relative_residual
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.operators import steps as op
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.operators import codes as op
 from skinnode.solve.roots import on_rest_branch
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolveOptions, solve_options
@@ -127,7 +128,7 @@ class StreamState:
     def relative_residual(self, x: Float, a: Float) -> Float:
         """(K,) a F − 1 of a wire at ``x`` (3N,), pitches."""
         gaps = x.reshape(-1, 1, 3, 1) - self.problem.lower.transpose(1, 0, 2)[None]
-        return np.asarray(a * (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1)) - 1.0)
+        return np.asarray(relative_residual(a, (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))))
 
     def a_at(self, x: Float) -> Float:
         """(K,) the a of a wire whose root is ``x`` (3N,), pitches."""

@@ -26,7 +26,7 @@ from skinnode.solve.exact.leave_out import LeftOut
 from skinnode.solve.exact.recover import recover_lost
 from skinnode.solve.exact.stream import FRAME_STEPS, Frame, StreamState
 from skinnode.solve.inputs import CodeMap, broadcast_noise, checked_codes, checked_mask, checked_noise
-from skinnode.solve.operators import steps as op
+from skinnode.solve.operators import codes as op
 from skinnode.solve.operators.system import operator_code
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires import patch_solver as stage

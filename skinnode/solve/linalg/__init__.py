@@ -1,3 +1,3 @@
-"""Dense linear algebra for kernels: ``factorisations`` (LU, QR, bidiagonal) of one wire's Jacobian,
-``cholesky`` and products of a whole patch.
+"""Dense linear algebra for kernels: ``vectors``, ``lu``, ``qr`` and ``bidiagonal`` for the Jacobian of one
+wire; ``cholesky``, with triangular solves and products, for a whole patch.
 """

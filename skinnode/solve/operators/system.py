@@ -13,8 +13,11 @@ from numpy.typing import ArrayLike
 from skinnode.model.frames import SolveStats
 from skinnode.model.layout import Float, require_array
 from skinnode.model.status import Status
-from skinnode.solve.operators import steps as op
+from skinnode.solve.operators import codes as op
+from skinnode.solve.operators.loop import advance, final_error
+from skinnode.solve.operators.loop import start as start_solve
 from skinnode.solve.operators.result import Solution
+from skinnode.solve.operators.work import workspace
 
 
 def operator_code(name: str) -> int:
@@ -64,7 +67,7 @@ def solve_system(
     n = x.size
     first = require_array("residual(x0)", residual(x.copy()), ("m",), finite=False)
     m = first.size
-    w = op.workspace(n, m)
+    w = workspace(n, m)
     w.x[:], w.r[:] = x, first
     evaluations, jacobians, steps = 1, 0, 0
 
@@ -74,11 +77,11 @@ def solve_system(
     if m >= n:
         refresh_jacobian()
         jacobians += 1
-    went = op.start(w)
+    went = start_solve(w)
     if went == op.TRY:
         went = op.REJECTED if np.isfinite(w.jt).all() else op.INVALID_START
     while went < 0:
-        went = op.advance(code, w, went, tol_f, tol_x)
+        went = advance(code, w, went, tol_f, tol_x)
         if went == op.ACCEPTED:
             refresh_jacobian()
             jacobians += 1
@@ -91,7 +94,7 @@ def solve_system(
             w.r_trial[:] = require_array("residual(x)", residual(w.trial.copy()), (m,), finite=False)
     error = math.inf
     if went == op.CONVERGED:
-        share = op.assure(w, np.empty((n, m)))
+        share = final_error(w, np.empty((n, m)))
         error = share * max(1.0, float(np.abs(w.x).max()))
         if not share <= (op.ROOT_SHARE if m == n else op.MINIMUM_SHARE):
             went = op.ILL_CONDITIONED

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem

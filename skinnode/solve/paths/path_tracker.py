@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
 from skinnode.solve import roots
-from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.operators import steps as op
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.operators import codes as op
 from skinnode.solve.paths.corrector import Accuracy, Corrector
 from skinnode.solve.paths.predictor import euler, secant
 from skinnode.solve.roots import Mask

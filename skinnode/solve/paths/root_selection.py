@@ -15,7 +15,7 @@ import numpy as np
 
 from skinnode.model.layout import Float
 from skinnode.solve import roots
-from skinnode.solve.operators import steps as op
+from skinnode.solve.operators import codes as op
 from skinnode.solve.paths.corrector import Accuracy
 from skinnode.solve.paths.path_tracker import PathTracker
 from skinnode.solve.roots import Mask

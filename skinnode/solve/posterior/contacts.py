@@ -18,7 +18,7 @@ import numpy as np
 from skinnode.compiled.jit import njit
 from skinnode.model.frames import Contact
 from skinnode.model.layout import Float, PatchLayout
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.load_posterior import LoadPosterior
 from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 from skinnode.solve.posterior.prior import ElasticPrior

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 
 QUIET_CHANCE: Final = 0.005

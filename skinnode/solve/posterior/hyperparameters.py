@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.load_posterior import LoadPosterior
 from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation

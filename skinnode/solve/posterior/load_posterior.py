@@ -12,7 +12,7 @@ import numpy as np
 
 from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0

@@ -20,7 +20,7 @@ from skinnode.solve.linalg.cholesky import (
     solve_lower_transposed_vector,
     solve_lower_vector,
 )
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7

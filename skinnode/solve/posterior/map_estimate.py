@@ -19,7 +19,7 @@ import numpy as np
 from skinnode.model.layout import Float
 from skinnode.solve import roots
 from skinnode.solve.linalg.cholesky import cholesky, inverse_diagonal, multiply, solve_lower
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior import measurement_update as kernels
 from skinnode.solve.posterior.gating import Fit
 from skinnode.solve.posterior.load_prior import LoadPrior

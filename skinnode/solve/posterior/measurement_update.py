@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skinnode.compiled.jit import njit, njit_part
-from skinnode.model.kernels import potential, potential_jacobian
+from skinnode.model.kernels import potential, potential_jacobian, relative_residual_part
 from skinnode.model.layout import Float
 from skinnode.solve.linalg.cholesky import (
     multiply,
@@ -43,7 +43,8 @@ from skinnode.solve.linalg.cholesky import (
     solve_lower_transposed_vector,
     solve_lower_vector,
 )
-from skinnode.solve.linalg.factorisations import Index, dot, qr_factor, qr_project
+from skinnode.solve.linalg.qr import qr_factor, qr_project
+from skinnode.solve.linalg.vectors import Index, dot
 
 
 class Buffers(NamedTuple):
@@ -133,7 +134,7 @@ def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
         for k in range(r_u.size):
-            r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+            r_u[k] = w_u[k] * relative_residual_part(a_u[k], r_u[k])
         for j in range(jt_u.shape[0]):
             row = jt_u[j]
             for k in range(r_u.size):
@@ -151,7 +152,7 @@ def residuals(  # noqa: PLR0913 - a kernel: arrays by name
         r_u, a_u, w_u = r[u], a[u], weight[u]
         potential(x[u], lower, r_u)
         for k in range(r_u.size):
-            r_u[k] = w_u[k] * (a_u[k] * r_u[k] - 1.0)
+            r_u[k] = w_u[k] * relative_residual_part(a_u[k], r_u[k])
         for q in range(g.size):
             for k in range(r_u.size):
                 r_u[k] -= h[u, k, q] * g[q]

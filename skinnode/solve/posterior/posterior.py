@@ -22,7 +22,7 @@ from skinnode.model.layout import Float, PatchLayout, require_array
 from skinnode.model.status import Status, as_statuses
 from skinnode.solve import roots
 from skinnode.solve.inputs import NOISE_MAX, broadcast_noise, checked_mask, checked_noise
-from skinnode.solve.linalg.factorisations import Index
+from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.options import PosteriorArguments, PosteriorOptions, merged
 from skinnode.solve.posterior.contacts import ContactFinder
 from skinnode.solve.posterior.gating import Fit, Gate

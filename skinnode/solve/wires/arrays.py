@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from skinnode.compiled.array_table import READONLY, ArrayTable, reader
 from skinnode.model.layout import Float
 from skinnode.solve.inputs import CodeMap
-from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.operators.steps import Work
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.operators.work import Work
 from skinnode.solve.wires.problem import PatchProblem
 
 Bytes = NDArray[np.uint8]
@@ -50,7 +50,7 @@ class SolveOptions(ArrayTable):
     """How to solve wires.
 
     Args:
-        operator: number of the operator, see :data:`skinnode.solve.operators.steps.OPERATORS`.
+        operator: number of the operator, see :data:`skinnode.solve.operators.codes.OPERATORS`.
         tasks: COVARIANCE, SKIP and REUSE, or-ed together.
         tol_f: largest |r| at a root.
         tol_x: largest remaining correction, relative to max(1, max|x|).

@@ -13,28 +13,22 @@ import math
 from typing import Any, Final
 
 from skinnode.compiled.jit import njit_part
-from skinnode.model.kernels import potential_jacobian
+from skinnode.model.kernels import potential_jacobian, relative_residual_part
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index, dot, largest
-from skinnode.solve.operators.steps import (
+from skinnode.solve.linalg.vectors import Index, dot, largest
+from skinnode.solve.operators.codes import (
     ACCEPTED,
     CONVERGED,
     EPS,
-    ERROR,
     ILL_CONDITIONED,
-    LIMIT,
     MAX_STEPS,
-    NORM,
     OUTSIDE,
     ROOT_SHARE,
-    SIGN,
     TRY,
-    begin,
-    certify,
-    judge,
-    propose,
-    shorten,
 )
+from skinnode.solve.operators.gauss_newton import estimate_error
+from skinnode.solve.operators.loop import assess, begin, propose, shorten
+from skinnode.solve.operators.work import ERROR, LIMIT, NORM, SIGN
 from skinnode.solve.roots import Z_REFUSE
 from skinnode.solve.wires.arrays import (
     BRANCH,
@@ -84,7 +78,7 @@ def _evaluate(
             point[3 * j + 2] = x[j]
     potential_jacobian(point, lower, r, raw)
     for k in range(r.size):
-        r[k] = weight[k] * (a[k] * (r[k] + still[k]) - 1.0)
+        r[k] = weight[k] * relative_residual_part(a[k], r[k] + still[k])
 
 
 @njit_part
@@ -152,7 +146,7 @@ def correct(
         evaluations += 1
         jacobians += 1
         _evaluate(w.trial, point, still_u, lower, a_u, w_u, w.r_trial, raw)
-        status = judge(operator, w, tol_r, tol_x)
+        status = assess(operator, w, tol_r, tol_x)
         if status == ACCEPTED:
             _take_jacobian(raw, a_u, w_u, w.jt)
     return status, evaluations, jacobians, steps, False
@@ -189,7 +183,7 @@ def report_correction(
     if not options.tasks & COVARIANCE:
         return status
     inverse_u = solver.inverse[u]
-    share = certify(w, inverse_u)
+    share = estimate_error(w, inverse_u)
     measure[ERROR_ESTIMATE] = share * max(1.0, largest(w.x)) + _data_rounding(inverse_u, w_u)
     if not share <= ROOT_SHARE:
         return ILL_CONDITIONED

@@ -12,9 +12,9 @@ from typing import Final
 
 from skinnode.compiled.jit import njit_part
 from skinnode.compiled.simd import LANES, fma, load, splat, total
-from skinnode.model.kernels import potential
+from skinnode.model.kernels import potential, relative_residual_part
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import largest
+from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
 """Maximum simplified steps; each costs a fifth of a new inverse."""
@@ -61,7 +61,7 @@ def follow(
     for evaluations in range(1, FOLLOW_STEPS + 1):
         potential(x, lower, rho)
         for k in range(rho.size):
-            rho[k] = a[k] * rho[k] - 1.0
+            rho[k] = relative_residual_part(a[k], rho[k])
         size = newton_step(inverse, rho, step)
         if not size <= CONTRACTION * before:
             return -evaluations, evaluations - 1, first

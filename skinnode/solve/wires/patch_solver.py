@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.operators.steps import workspace
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.operators.work import workspace
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import (
     FrameArrays,

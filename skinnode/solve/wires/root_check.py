@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from skinnode.compiled.array_table import ArrayTable, reader
 from skinnode.compiled.jit import njit_brief, njit_part
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index
-from skinnode.solve.operators.steps import CONVERGED
+from skinnode.solve.linalg.vectors import Index
+from skinnode.solve.operators.codes import CONVERGED
 from skinnode.solve.wires.stages import DEADLINE
 
 Mask = NDArray[np.bool_]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from skinnode.compiled.jit import njit_body, njit_part
 from skinnode.model.layout import Float
-from skinnode.solve.linalg.factorisations import Index, dot, largest
-from skinnode.solve.operators.steps import CONVERGED, ILL_CONDITIONED, NON_FINITE, TRY
+from skinnode.solve.linalg.vectors import Index, dot, largest
+from skinnode.solve.operators.codes import CONVERGED, ILL_CONDITIONED, NON_FINITE, TRY
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import SolveOptions, SolverArrays
 from skinnode.solve.wires.correct import coordinate, correct, report_correction

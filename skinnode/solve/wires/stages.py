@@ -12,7 +12,7 @@ from typing import Final
 from skinnode.compiled.jit import njit_part
 from skinnode.model.layout import Float
 from skinnode.model.status import Status
-from skinnode.solve.operators.steps import CONVERGED
+from skinnode.solve.operators.codes import CONVERGED
 from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 

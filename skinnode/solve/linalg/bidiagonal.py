@@ -1,0 +1,140 @@
+"""Bidiagonal form of a small matrix, in which a damped step costs little whatever the damping.
+
+Levenberg-Marquardt tries several dampings of one Jacobian; each costs of the order of n here, and of the
+order of n³ in J itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+from skinnode.compiled.jit import njit_part
+from skinnode.compiled.simd import LANES, fma, load, splat, store, total
+from skinnode.model.layout import Float
+
+
+@njit_part
+def bidiagonalise(
+    a: Float, left: Float, diagonal: Float, upper: Float, across: Float, down: Float, w: Float
+) -> None:
+    """A = P Bᵀ Qᵀ for A (n, m), n ≤ m, with orthogonal P and Q and B upper bidiagonal (n, n).
+
+    ``a`` (n + 3, whole lanes of m) is A with zeros around it: four rows at a time and whole vectors then need
+    no special cases. B is left in ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the
+    reflectors I − β v vᵀ of Q in the rows of ``a`` with β in ``across`` (n,), those of P in the rows of
+    ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch as long as a row of ``a``.
+    Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows for columns).
+    """
+    n, end = diagonal.size, a.shape[1]
+    for k in range(n):
+        row, first = a[k], k - k % LANES
+        for j in range(first, k):
+            row[j] = 0.0
+        squares = splat(0.0)
+        for j in range(first, end, LANES):
+            part = load(row, j, LANES)
+            squares = fma(part, part, squares)
+            store(w, j, LANES, splat(0.0))
+        norm = math.sqrt(total(squares))
+        diagonal[k] = -norm if row[k] > 0.0 else norm
+        across[k] = 1.0 / (norm * (norm + abs(row[k]))) if norm > 0.0 else 0.0
+        row[k] -= diagonal[k]
+        upper[k] = 0.0
+        down[k] = 0.0
+        if k + 1 == n:
+            return
+        column, head = left[k], row[k]
+        for j in range(0, column.size, LANES):
+            store(column, j, LANES, splat(0.0))
+        square = 0.0
+        for i in range(k + 1, n, 4):  # reflect the rows, and sum up what the column's reflector needs of them
+            t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
+            s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+            for j in range(first, end, LANES):
+                part = load(row, j, LANES)
+                s0, s1 = fma(load(t0, j, LANES), part, s0), fma(load(t1, j, LANES), part, s1)
+                s2, s3 = fma(load(t2, j, LANES), part, s2), fma(load(t3, j, LANES), part, s3)
+            f0, f1 = -across[k] * total(s0), -across[k] * total(s1)
+            f2, f3 = -across[k] * total(s2), -across[k] * total(s3)
+            h0, h1, h2, h3 = t0[k] + f0 * head, t1[k] + f1 * head, t2[k] + f2 * head, t3[k] + f3 * head
+            square += (h0 * h0 + h1 * h1) + (h2 * h2 + h3 * h3)
+            column[i], column[i + 1], column[i + 2], column[i + 3] = h0, h1, h2, h3
+            for j in range(first, end, LANES):
+                part, summed = load(row, j, LANES), load(w, j, LANES)
+                p0, p1 = fma(f0, part, load(t0, j, LANES)), fma(f1, part, load(t1, j, LANES))
+                p2, p3 = fma(f2, part, load(t2, j, LANES)), fma(f3, part, load(t3, j, LANES))
+                store(t0, j, LANES, p0)
+                store(t1, j, LANES, p1)
+                store(t2, j, LANES, p2)
+                store(t3, j, LANES, p3)
+                store(w, j, LANES, summed + (fma(h1, p1, h0 * p0) + fma(h3, p3, h2 * p2)))
+        row, head, norm = a[k + 1], column[k + 1], math.sqrt(square)
+        upper[k] = -norm if head > 0.0 else norm
+        down[k] = 1.0 / (norm * (norm + abs(head))) if norm > 0.0 else 0.0
+        column[k + 1] = head - upper[k]
+        for j in range(first, end, LANES):
+            store(w, j, LANES, -down[k] * fma(-upper[k], load(row, j, LANES), load(w, j, LANES)))
+        for i in range(k + 1, n, 4):
+            t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
+            h0, h1, h2, h3 = column[i], column[i + 1], column[i + 2], column[i + 3]
+            for j in range(first, end, LANES):
+                part = load(w, j, LANES)
+                store(t0, j, LANES, fma(h0, part, load(t0, j, LANES)))
+                store(t1, j, LANES, fma(h1, part, load(t1, j, LANES)))
+                store(t2, j, LANES, fma(h2, part, load(t2, j, LANES)))
+                store(t3, j, LANES, fma(h3, part, load(t3, j, LANES)))
+
+
+@njit_part
+def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
+    """(I − β v vᵀ) b in place of ``b`` with reflector ``k`` of :func:`bidiagonalise`."""
+    row, end, along = rows[k], b.size, splat(0.0)
+    first = k - k % LANES
+    for j in range(first, end, LANES):
+        along = fma(load(row, j, end - j), load(b, j, end - j), along)
+    share = -beta[k] * total(along)
+    for j in range(first, end, LANES):
+        store(b, j, end - j, fma(share, load(row, j, end - j), load(b, j, end - j)))
+
+
+@njit_part
+def damped_solve(
+    diagonal: Float, upper: Float, b: Float, lam: float, inverse: Float, ru: Float, x: Float
+) -> None:
+    """Least squares of [B; √lam I] x = [``b``; 0], B as of :func:`bidiagonalise`, by Givens rotations (Eldén,
+    Algorithms for the regularization of ill-conditioned least squares problems, 1977).
+
+    R of BᵀB + lam = RᵀR is bidiagonal too: 1 / its diagonal is left in ``inverse`` (n,), what is above it in
+    ``ru`` (n,). Squares of lam and B must not underflow together.
+    """
+    below, rest = lam, 0.0  # under row i of B: the square of its one element, and its right side
+    for i in range(x.size):
+        radius = 1.0 / (diagonal[i] * diagonal[i] + below)
+        inverse[i] = math.sqrt(radius)
+        root = math.sqrt(below)
+        c, t = diagonal[i] * inverse[i], root * inverse[i]
+        ru[i] = c * upper[i]
+        x[i] = c * b[i] + t * rest
+        filled = -t * upper[i]  # the row under it now, to be rotated into the next of the damping
+        below = lam + below * radius * (upper[i] * upper[i])
+        rest = (c * rest - t * b[i]) * (filled / math.sqrt(below))
+    bidiagonal_solve(inverse, ru, x)
+
+
+@njit_part
+def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
+    """R⁻¹ x in place of ``x`` (n,); R has 1 / ``inverse`` on and ``upper`` above the diagonal."""
+    last = 0.0
+    for i in range(x.size - 1, -1, -1):
+        last = (x[i] - upper[i] * last) * inverse[i]
+        x[i] = last
+
+
+@njit_part
+def bidiagonal_solve_transposed(inverse: Float, upper: Float, x: Float) -> None:
+    """R⁻ᵀ x in place of ``x`` (n,) for the same R."""
+    carried = 0.0
+    for i in range(x.size):
+        value = (x[i] - carried) * inverse[i]
+        carried = upper[i] * value
+        x[i] = value

@@ -1,0 +1,104 @@
+"""Householder QR of a small tall matrix, for the Jacobian of a wire with fewer unknowns than equations.
+
+Normal equations are avoided: they square the condition number (Golub & Van Loan, Matrix Computations, 4th
+ed., 5.2, 5.3).
+"""
+
+from __future__ import annotations
+
+import math
+
+from skinnode.compiled.jit import njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.vectors import dot
+
+
+@njit_part
+def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:
+    """Householder QR of J = ``jt``ᵀ, (m, n) with m ≥ n. 1, or 0 where a diagonal element of R vanishes.
+
+    R is left above the diagonal of ``a`` (m, n) with its own diagonal in ``diagonal`` (n,); the reflectors
+    I − β v vᵀ on and below it with β in ``beta`` (n,). ``w`` (n,) is scratch.
+    """
+    n, m = jt.shape
+    for j in range(n):
+        for i in range(m):
+            a[i, j] = jt[j, i]
+    full = 1
+    for k in range(n):
+        square = 0.0
+        for i in range(k, m):
+            square += a[i, k] * a[i, k]
+        norm = math.sqrt(square)
+        diagonal[k] = -norm if a[k, k] > 0.0 else norm
+        if not (norm > 0.0 and norm < math.inf):
+            beta[k] = 0.0
+            full = 0
+            continue
+        beta[k] = 1.0 / (norm * (norm + abs(a[k, k])))
+        a[k, k] -= diagonal[k]
+        for j in range(k + 1, n):
+            w[j] = 0.0
+        for i in range(k, m):
+            row = a[i]
+            factor = row[k]
+            for j in range(k + 1, n):
+                w[j] += factor * row[j]
+        for i in range(k, m):
+            row = a[i]
+            factor = row[k] * beta[k]
+            for j in range(k + 1, n):
+                row[j] -= factor * w[j]
+    return full
+
+
+@njit_part
+def qr_project(a: Float, beta: Float, b: Float) -> None:
+    """Qᵀ b in place of ``b`` (m,)."""
+    m, n = a.shape
+    for k in range(n):
+        total = 0.0
+        for i in range(k, m):
+            total += a[i, k] * b[i]
+        total *= beta[k]
+        for i in range(k, m):
+            b[i] -= total * a[i, k]
+
+
+@njit_part
+def r_solve(a: Float, diagonal: Float, b: Float) -> None:
+    """Solve R s = b; s replaces the first n elements of ``b``."""
+    for i in range(diagonal.size - 1, -1, -1):
+        row = a[i]
+        total = b[i]
+        for j in range(i + 1, diagonal.size):
+            total -= row[j] * b[j]
+        b[i] = total / diagonal[i]
+
+
+@njit_part
+def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float) -> None:
+    """J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m); ``v`` (m,) is scratch."""
+    m, n = a.shape
+    for j in range(n):
+        row = inverse[j]
+        for i in range(m):
+            row[i] = 0.0
+        row[j] = 1.0
+    for k in range(n - 1, -1, -1):
+        for i in range(m):
+            v[i] = a[i, k] if i >= k else 0.0
+        for j in range(k, n):  # the rows above do not meet this reflector
+            row = inverse[j]
+            share = beta[k] * dot(row, v)
+            for i in range(k, m):
+                row[i] -= share * v[i]
+    for j in range(n - 1, -1, -1):
+        row = inverse[j]
+        for k in range(j + 1, n):
+            other, factor = inverse[k], a[j, k]
+            for i in range(m):
+                row[i] -= factor * other[i]
+        scale = 1.0 / diagonal[j]
+        for i in range(m):
+            row[i] *= scale

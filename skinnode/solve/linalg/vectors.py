@@ -1,0 +1,46 @@
+"""Vectors for kernels: sums, norms, and rows padded to whole vector registers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinnode.compiled.jit import njit_part
+from skinnode.compiled.simd import LANES
+from skinnode.model.layout import Float
+
+Index = NDArray[np.int64]
+
+
+def padded(rows: int, size: int) -> Float:
+    """(rows, ≥ size) zeros, a row of whole vectors at whole cache lines."""
+    size = -(-size // LANES) * LANES
+    room = np.zeros(rows * size + 8)
+    first = (-room.ctypes.data // room.itemsize) % 8
+    return room[first : first + rows * size].reshape(rows, size)
+
+
+@njit_part
+def dot(a: Float, b: Float) -> float:
+    """a·b in four partial sums: as exact as one, and four times less latency."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    whole = a.size - a.size % 4
+    for i in range(0, whole, 4):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+    for i in range(whole, a.size):
+        s0 += a[i] * b[i]
+    return (s0 + s1) + (s2 + s3)
+
+
+@njit_part
+def largest(a: Float) -> float:
+    """max |a_i|; NaN where there is one."""
+    top = 0.0
+    for value in a:
+        size = abs(value)
+        if not size <= top:
+            top = size
+    return top

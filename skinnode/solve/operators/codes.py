@@ -1,0 +1,37 @@
+"""Numbers by which compiled code knows operators and statuses, and the limits of rounding."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from skinnode.model.status import Status
+
+OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
+GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
+LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
+
+# Results of a step besides a terminal Status, which is ≥ 0
+TRY: Final = -1
+ACCEPTED: Final = -2
+REJECTED: Final = -3
+OUTSIDE: Final = -4
+
+CONVERGED: Final = int(Status.CONVERGED)
+MAX_STEPS: Final = int(Status.MAX_STEPS)
+RADIUS_TOO_SMALL: Final = int(Status.RADIUS_TOO_SMALL)
+STEP_TOO_SMALL: Final = int(Status.STEP_TOO_SMALL)
+ILL_CONDITIONED: Final = int(Status.ILL_CONDITIONED)
+NON_FINITE: Final = int(Status.NON_FINITE)
+INVALID_START: Final = int(Status.INVALID_START)
+
+EPS: Final = float(np.finfo(np.float64).eps)
+ROOT_SHARE: Final = EPS ** (1 / 2)
+"""Maximum error estimate of a root as a share of max(1, ‖x‖∞): half of the digits are given."""
+MINIMUM_SHARE: Final = EPS ** (1 / 3)
+"""Maximum error estimate of a minimum as a share of max(1, ‖x‖∞): ‖r‖² does not fix x to better than √eps."""
+STATIONARY: Final = 1e-6
+"""Maximum gradient, as a share of ‖J_j‖ ‖r‖, that counts as zero: r² is then flat to rounding, about √eps."""
+STALL_LIMIT: Final = 30
+"""Maximum steps below the rounding of ‖r‖² that a tall system may take to settle its x."""

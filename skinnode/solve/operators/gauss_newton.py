@@ -1,0 +1,131 @@
+"""Newton's step −J⁺ r, which Gauss-Newton takes in full, as the paper does, and the other operators shorten.
+
+The correction −J⁺ r₊ by the factors at hand is also the error estimate (Deuflhard, Newton methods for
+nonlinear problems, 2004). Source: Xu et al. 2018, eq. 8.
+"""
+
+from __future__ import annotations
+
+import math
+
+from skinnode.compiled.jit import njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.lu import lu_factor, lu_inverse_transposed, lu_solve_transposed
+from skinnode.solve.linalg.qr import qr_factor, qr_inverse, qr_project, r_solve
+from skinnode.solve.linalg.vectors import dot, largest
+from skinnode.solve.operators.codes import EPS
+from skinnode.solve.operators.work import (
+    ANGLE,
+    ERROR,
+    FACTORED,
+    NORM,
+    REDUCED,
+    SIGN,
+    SINGULAR,
+    Work,
+    times_jacobian,
+)
+
+
+@njit_part
+def factor(w: Work) -> bool:
+    """Factor J, LU if it is square and QR if it is tall; set FACTORED, SINGULAR, SIGN, ERROR and ``newton``.
+
+    Returns whether J has full rank.
+    """
+    n, flag = w.x.size, w.flag
+    flag[FACTORED] = 1
+    flag[REDUCED] = 0
+    if w.r.size == n:
+        for j in range(n):
+            target, source = w.lu[j], w.jt[j]
+            for k in range(n):
+                target[k] = source[k]
+        flag[SIGN] = lu_factor(w.lu, w.pivot)
+        full = flag[SIGN] != 0
+    else:
+        full = qr_factor(w.jt, w.qr, w.diagonal, w.beta, w.v) == 1
+    if full:
+        w.s[ERROR] = correction(w, w.r, w.newton)
+        full = w.s[ERROR] < math.inf
+    flag[SINGULAR] = 0 if full else 1
+    return bool(full)
+
+
+@njit_part
+def finite_jacobian(w: Work) -> bool:
+    """Return whether every element of J is finite."""
+    finite = True
+    for j in range(w.x.size):
+        finite &= largest(w.jt[j]) < math.inf
+    return finite
+
+
+@njit_part
+def settled(w: Work, tol_f: float, tol_x: float) -> bool:
+    """Return whether x is a root or minimum, by the factors at hand; sets ANGLE of a tall system."""
+    s = w.s
+    small = largest(w.r) <= tol_f
+    if w.r.size != w.x.size:
+        times_jacobian(w.jt, w.newton, w.js)
+        s[ANGLE] = math.sqrt(dot(w.js, w.js)) / s[NORM] if s[NORM] > 0.0 else 0.0
+        small = small or s[ANGLE] <= tol_f
+    return small and s[ERROR] <= tol_x * max(1.0, largest(w.x))
+
+
+@njit_part
+def correction(w: Work, r: Float, out: Float) -> float:
+    """−J⁺ r into ``out`` (n,) with the factors at hand; its largest element."""
+    n = out.size
+    if w.r.size == n:
+        for j in range(n):
+            out[j] = -r[j]
+        lu_solve_transposed(w.lu, w.pivot, out)
+    else:
+        for k in range(r.size):
+            w.e[k] = -r[k]
+        qr_project(w.qr, w.beta, w.e)
+        r_solve(w.qr, w.diagonal, w.e)
+        for j in range(n):
+            out[j] = w.e[j]
+    return largest(out)
+
+
+@njit_part
+def rounding(w: Work, x: Float) -> float:
+    """What rounding x to the nearest double does to r, eps Σ_j |J_kj x_j|, into ``e``; max |x|."""
+    top = 0.0
+    for k in range(w.e.size):
+        w.e[k] = 0.0
+    for j in range(x.size):
+        row, size = w.jt[j], EPS * abs(x[j])
+        if size > top:
+            top = size
+        for k in range(w.e.size):
+            w.e[k] += abs(row[k]) * size
+    return top / EPS
+
+
+@njit_part
+def estimate_error(w: Work, inverse: Float) -> float:
+    """J⁺ of the last factors into ``inverse`` (n, m); the error estimate of a converged solve.
+
+    That is the correction still to come and what rounding of x leaves open through the condition of J, as a
+    share of max(1, ‖x‖∞). Inf where J is singular.
+    """
+    n, m = w.jt.shape
+    if w.flag[SINGULAR] == 1:
+        return math.inf
+    if m == n:
+        lu_inverse_transposed(w.lu, w.pivot, inverse)
+    else:
+        qr_inverse(w.qr, w.diagonal, w.beta, w.r_trial, inverse)
+    size = rounding(w, w.x)
+    top = 0.0
+    for j in range(n):
+        row, total = inverse[j], 0.0
+        for k in range(m):
+            total += abs(row[k]) * w.e[k]
+        if not total <= top:
+            top = total
+    return float((w.s[ERROR] + top) / max(1.0, size))

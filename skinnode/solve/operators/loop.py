@@ -1,0 +1,198 @@
+"""The loop of every operator, as reverse communication: the caller evaluates the functions.
+
+    begin      r and J at x are in the workspace
+    propose    factor J; x is a root, or Newton's step is the next ``trial``
+    shorten    the trial of the trust region if Newton's step leaves it
+    assess     r at ``trial`` is in ``r_trial``: take the step or not, update the radius, return what is next
+
+So the same compiled steps serve the compiled solver of a skin wire and any pair of Python callables.
+Gauss-Newton takes every step in full; Levenberg-Marquardt and dogleg take a step only if r gets smaller.
+
+What CONVERGED means. Square systems: a root, that is max|r| ≤ tol_f *and* a simplified Newton correction
+‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞), by the factors at hand. Where rounding keeps r above tol_f, r within the
+rounding of J·x counts as zero. Tall systems: a minimum, ‖P r‖ ≤ tol_f ‖r‖ with P the projection on the
+range of J, and the same correction. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED: J
+is singular there.
+"""
+
+from __future__ import annotations
+
+import math
+
+from skinnode.compiled.jit import njit, njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.vectors import dot, largest
+from skinnode.solve.operators.codes import (
+    ACCEPTED,
+    CONVERGED,
+    EPS,
+    GAUSS_NEWTON,
+    ILL_CONDITIONED,
+    INVALID_START,
+    LEVENBERG_MARQUARDT,
+    NON_FINITE,
+    OUTSIDE,
+    REJECTED,
+    TRY,
+)
+from skinnode.solve.operators.dogleg import dogleg_step
+from skinnode.solve.operators.gauss_newton import (
+    correction,
+    estimate_error,
+    factor,
+    finite_jacobian,
+    rounding,
+    settled,
+)
+from skinnode.solve.operators.levenberg_marquardt import marquardt_step
+from skinnode.solve.operators.trust_region import assess_decrease, measure_newton, slope_of
+from skinnode.solve.operators.work import (
+    ANGLE,
+    ERROR,
+    FACTORED,
+    LAM,
+    LENGTH,
+    NEWTON_LENGTH,
+    NORM,
+    RADIUS,
+    SINGULAR,
+    Work,
+    times_jacobian,
+    weighted_norm,
+)
+
+
+@njit_part
+def begin(w: Work) -> int:
+    """Start from x, r and J in the workspace. TRY, or INVALID_START where r is not finite or m < n."""
+    s, flag = w.s, w.flag
+    for k in range(flag.size):
+        flag[k] = 0
+    s[RADIUS] = -1.0  # set by the first propose, which knows D
+    s[LAM] = 0.0
+    s[ERROR] = math.inf
+    s[ANGLE] = 1.0
+    s[NORM] = math.sqrt(dot(w.r, w.r))
+    for j in range(w.scale.size):
+        w.scale[j] = 0.0
+    if w.r.size < w.x.size or not s[NORM] < math.inf:
+        return INVALID_START
+    return TRY
+
+
+@njit_part
+def set_trial(operator: int, w: Work) -> None:
+    """Set ``trial`` to x + step; LENGTH and ``js`` too if there is a trust region."""
+    for j in range(w.x.size):
+        w.trial[j] = w.x[j] + w.step[j]
+    if operator != GAUSS_NEWTON:
+        w.s[LENGTH] = weighted_norm(w.scale, w.step)
+        times_jacobian(w.jt, w.step, w.js)
+
+
+@njit_part
+def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
+    """Set Newton's step as the next trial point.
+
+    Returns TRY with ``trial``, ``step`` and ``js`` set, OUTSIDE if the step is longer than the radius or
+    there is none (call :func:`shorten`), or a Status.
+    """
+    s, flag = w.s, w.flag
+    if flag[FACTORED] == 0:
+        if not factor(w):
+            if not finite_jacobian(w):
+                return NON_FINITE
+        elif settled(w, tol_f, tol_x):
+            return CONVERGED
+        if operator != GAUSS_NEWTON:
+            measure_newton(w)
+    regular = flag[SINGULAR] == 0
+    if operator == GAUSS_NEWTON:
+        if not regular:
+            return ILL_CONDITIONED
+    elif not (regular and s[NEWTON_LENGTH] <= (1.1 if operator == LEVENBERG_MARQUARDT else 1.0) * s[RADIUS]):
+        return OUTSIDE
+    s[LAM] = 0.0
+    for j in range(w.x.size):
+        w.step[j] = w.newton[j]
+    set_trial(operator, w)
+    return TRY
+
+
+@njit_part
+def shorten(operator: int, w: Work) -> int:
+    """The step within the trust region where Newton's leaves it: TRY, or a Status at a stationary point."""
+    if slope_of(w) <= EPS:
+        return CONVERGED if w.flag[SINGULAR] == 0 and w.r.size > w.x.size else ILL_CONDITIONED
+    if operator == LEVENBERG_MARQUARDT:
+        marquardt_step(w)
+    else:
+        dogleg_step(w)
+    set_trial(operator, w)
+    return TRY
+
+
+@njit_part
+def _within_rounding(w: Work, norm: float) -> bool:
+    """Whether rounding of x hides whatever is left of ``r_trial``, whose norm is ``norm``."""
+    if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
+        return False
+    rounding(w, w.trial)
+    hidden = True
+    for k in range(w.r.size):
+        if not abs(w.r_trial[k]) <= 4.0 * w.e[k]:
+            hidden = False
+    return hidden
+
+
+@njit_part
+def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
+    """Take the trial point or not, by ``r_trial``: ACCEPTED (evaluate J at x next), REJECTED or a Status."""
+    s = w.s
+    norm = math.sqrt(dot(w.r_trial, w.r_trial))
+    exhausted = _within_rounding(w, norm)
+    if operator == GAUSS_NEWTON:
+        if not norm < math.inf:
+            return NON_FINITE
+    elif not exhausted:
+        verdict = assess_decrease(w, norm)
+        if verdict != ACCEPTED:
+            return verdict
+    for j in range(w.x.size):
+        w.x[j] = w.trial[j]
+    for k in range(w.r.size):
+        w.r[k] = w.r_trial[k]
+    s[NORM] = norm
+    w.flag[FACTORED] = 0
+    if w.flag[SINGULAR] == 0:
+        s[ERROR] = correction(w, w.r, w.newton)
+        if exhausted or (largest(w.r) <= tol_f and s[ERROR] <= tol_x * max(1.0, largest(w.x))):
+            return CONVERGED
+    return ACCEPTED
+
+
+@njit
+def start(w: Work) -> int:
+    """:func:`begin` for callers in Python."""
+    return begin(w)
+
+
+@njit
+def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
+    """:func:`assess` the trial of the last call, then :func:`propose`, for callers in Python.
+
+    ``went`` is what the last call returned, ``REJECTED`` at first. Returns TRY (evaluate r at ``trial`` into
+    ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
+    """
+    if went == TRY:
+        went = assess(operator, w, tol_f, tol_x)
+        if went != REJECTED:
+            return went
+    went = propose(operator, w, tol_f, tol_x)
+    return shorten(operator, w) if went == OUTSIDE else went
+
+
+@njit
+def final_error(w: Work, inverse: Float) -> float:
+    """:func:`estimate_error` for callers in Python."""
+    return estimate_error(w, inverse)

@@ -1,0 +1,130 @@
+"""The trust region ‖D s‖ ≤ radius: its size, and whether a step is taken.
+
+A step is taken only if it makes r smaller. Radius factors 1/4, 3/4 and 0.0001: Moré, The Levenberg-Marquardt
+algorithm, 1978.
+"""
+
+from __future__ import annotations
+
+import math
+
+from skinnode.compiled.jit import njit_part
+from skinnode.solve.linalg.vectors import dot
+from skinnode.solve.operators.codes import (
+    ACCEPTED,
+    CONVERGED,
+    EPS,
+    ILL_CONDITIONED,
+    RADIUS_TOO_SMALL,
+    REJECTED,
+    STALL_LIMIT,
+    STATIONARY,
+    STEP_TOO_SMALL,
+)
+from skinnode.solve.operators.gauss_newton import rounding
+from skinnode.solve.operators.work import (
+    LAM,
+    LENGTH,
+    LIMIT,
+    NEWTON_LENGTH,
+    NORM,
+    RADIUS,
+    SINGULAR,
+    STALLED,
+    Work,
+    weighted_norm,
+)
+
+
+@njit_part
+def slope_of(w: Work) -> float:
+    """Gradient Jᵀr into the workspace; its largest cosine |J_j·r| / (D_j ‖r‖)."""
+    top = 0.0
+    for j in range(w.x.size):
+        w.gradient[j] = dot(w.jt[j], w.r)
+        top = max(top, abs(w.gradient[j]) / (w.scale[j] * w.s[NORM]))
+    return top
+
+
+@njit_part
+def measure_newton(w: Work) -> None:
+    """Update D and the length of Newton's step; set the first radius."""
+    n, s = w.x.size, w.s
+    for j in range(n):
+        w.scale[j] = max(w.scale[j], math.sqrt(dot(w.jt[j], w.jt[j])))
+        if w.scale[j] == 0.0:
+            w.scale[j] = 1.0
+    if s[RADIUS] < 0.0:
+        size = weighted_norm(w.scale, w.x)
+        s[RADIUS] = 100.0 * size if size > 0.0 else 100.0
+        if s[LIMIT] > 0.0:
+            s[RADIUS] = s[LIMIT] * math.sqrt(dot(w.scale, w.scale))
+    s[NEWTON_LENGTH] = weighted_norm(w.scale, w.newton) if w.flag[SINGULAR] == 0 else math.inf
+
+
+@njit_part
+def _gain_noise(w: Work) -> float:
+    """Rounding error of the relative decrease of ‖r‖² at a step that is predicted to change little."""
+    noise, before = 4.0 * EPS, w.s[NORM]
+    rounding(w, w.x)
+    for k in range(w.r.size):
+        noise += 8.0 * abs(w.r[k]) * w.e[k] / (before * before)
+    return noise
+
+
+@njit_part
+def _stalled(w: Work) -> int:
+    """Return what to do where ‖r‖ cannot tell any more whether a step is better: ACCEPTED, or a Status."""
+    square = w.r.size == w.x.size
+    w.flag[STALLED] += 1
+    if square or w.flag[STALLED] > STALL_LIMIT:
+        if slope_of(w) > STATIONARY:
+            return STEP_TOO_SMALL
+        return CONVERGED if w.flag[SINGULAR] == 0 and not square else ILL_CONDITIONED
+    return ACCEPTED
+
+
+@njit_part
+def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> None:
+    """Update the radius and lam from the ratio of actual to predicted decrease (Moré 1978, section 4)."""
+    s = w.s
+    if ratio < 0.25:
+        shrink = 0.1
+        if gain >= 0.0:
+            shrink = 0.5
+        elif norm < 10.0 * s[NORM]:  # the minimiser of the parabola through both residuals
+            shrink = 0.5 * slope / (slope + 0.5 * gain)
+            shrink = 0.1 if shrink < 0.1 else (0.5 if shrink > 0.5 else shrink)
+        reach = 10.0 * s[LENGTH]
+        s[RADIUS] = shrink * (reach if reach < s[RADIUS] else s[RADIUS])
+        s[LAM] /= shrink
+    elif s[LAM] == 0.0 or ratio >= 0.75:
+        reach = 2.0 * s[LENGTH]
+        if s[LAM] > 0.0 or reach > s[RADIUS]:
+            s[RADIUS] = reach
+        s[LAM] *= 0.5
+
+
+@njit_part
+def assess_decrease(w: Work, norm: float) -> int:
+    """Compare the decrease of ‖r‖ to ``norm`` at the trial point with the predicted one; update the radius.
+
+    Returns ACCEPTED, REJECTED or a Status.
+    """
+    s, before = w.s, w.s[NORM]
+    finite = norm < math.inf
+    gain, predicted, slope = -1.0, 1.0, 0.0
+    if finite:
+        slope = dot(w.r, w.js) / (before * before)
+        gain = 1.0 - (norm / before) * (norm / before)
+        predicted = -2.0 * slope - dot(w.js, w.js) / (before * before)
+    noise = _gain_noise(w) if finite and predicted < 1e-6 else 4.0 * EPS
+    if finite and predicted <= noise and abs(gain) <= 16.0 * noise:
+        return _stalled(w)
+    ratio = gain / predicted if predicted > 0.0 else -1.0
+    _resize(w, norm, gain, slope, ratio)
+    if not ratio >= 1e-4:
+        if s[RADIUS] <= EPS * weighted_norm(w.scale, w.x) or s[RADIUS] < 1e-300:
+            return RADIUS_TOO_SMALL
+        return REJECTED
+    return ACCEPTED

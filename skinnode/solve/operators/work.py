@@ -1,0 +1,103 @@
+"""The workspace of a solve, which every step reads and writes, and products with its Jacobian.
+
+Symbols are the paper's: r residual (m,), J its Jacobian (m, n), stored transposed, lam the
+Levenberg-Marquardt parameter, radius that of the trust region ‖D s‖ ≤ radius, D the running maximum of the
+column norms of J (Moré 1978), so that the unit of an unknown does not matter.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from skinnode.compiled.jit import njit_part
+from skinnode.model.layout import Float
+from skinnode.solve.linalg.vectors import Index, padded
+
+# Scalars of a solve, in Work.s
+LIMIT, RADIUS, LAM, NORM, LENGTH, NEWTON_LENGTH, ERROR, ANGLE, SCALARS = range(9)
+# Flags of a solve, in Work.flag
+FACTORED, SINGULAR, SIGN, REDUCED, STALLED, FLAGS = range(6)
+
+
+class Work(NamedTuple):
+    """Everything that solving m equations in n unknowns writes to."""
+
+    x: Annotated[Float, "n"]
+    trial: Annotated[Float, "n"]
+    step: Annotated[Float, "n"]
+    newton: Annotated[Float, "n"]
+    gradient: Annotated[Float, "n"]
+    scale: Annotated[Float, "n"]
+    """D."""
+    diagonal: Annotated[Float, "n"]
+    """Diagonal of R."""
+    beta: Annotated[Float, "n"]
+    """β of the reflectors of Q."""
+    v: Annotated[Float, "n"]
+    bd: Annotated[Float, "n"]
+    """Diagonal of the bidiagonal form of J D⁻¹; ``bu`` is above it."""
+    bu: Annotated[Float, "n"]
+    across: Annotated[Float, "n"]
+    down: Annotated[Float, "n"]
+    """β of its reflectors."""
+    inverse: Annotated[Float, "n"]
+    """1 / diagonal of the damped form; ``ru`` is above it."""
+    ru: Annotated[Float, "n"]
+    r: Annotated[Float, "m"]
+    r_trial: Annotated[Float, "m"]
+    js: Annotated[Float, "m"]
+    """J·step."""
+    e: Annotated[Float, "m"]
+    """Scratch."""
+    jt: Annotated[Float, "n m"]
+    """Jᵀ at x."""
+    lu: Annotated[Float, "n+3 lanes_n"]
+    """LU factors of Jᵀ if the system is square; rows are whole lanes."""
+    qr: Annotated[Float, "m n"]
+    """QR factors of J if it is tall."""
+    right: Annotated[Float, "n+3 lanes_m"]
+    """Reflectors of the bidiagonal form from the right."""
+    left: Annotated[Float, "n lanes_n+3"]
+    """Reflectors of the bidiagonal form from the left."""
+    wide: Annotated[Float, "lanes_m"]
+    """Scratch as long as a row of ``right``."""
+    pivot: Annotated[Index, "n"]
+    s: Annotated[Float, "scalars"]
+    flag: Annotated[Index, "flags"]
+
+
+def workspace(n: int, m: int) -> Work:
+    """A zeroed workspace for m equations in n unknowns."""
+    v, e = np.zeros((15, n)), np.zeros((4, m))
+    return Work(
+        x=v[0], trial=v[1], step=v[2], newton=v[3], gradient=v[4], scale=v[5], diagonal=v[6], beta=v[7],
+        v=v[8], bd=v[9], bu=v[10], across=v[11], down=v[12], inverse=v[13], ru=v[14],
+        r=e[0], r_trial=e[1], js=e[2], e=e[3],
+        jt=np.zeros((n, m)), lu=padded(n + 3, n), qr=np.zeros((m, n)),
+        right=padded(n + 3, m), left=padded(n, n + 3), wide=padded(1, m)[0],
+        pivot=np.zeros(n, np.int64), s=np.zeros(SCALARS), flag=np.zeros(FLAGS, np.int64),
+    )  # fmt: skip
+
+
+@njit_part
+def weighted_norm(scale: Float, v: Float) -> float:
+    """‖D v‖₂"""
+    total = 0.0
+    for j in range(v.size):
+        weighted = scale[j] * v[j]
+        total += weighted * weighted
+    return math.sqrt(total)
+
+
+@njit_part
+def times_jacobian(jt: Float, v: Float, out: Float) -> None:
+    """J v into ``out`` (m,)."""
+    for k in range(out.size):
+        out[k] = 0.0
+    for j in range(v.size):
+        row, factor = jt[j], v[j]
+        for k in range(out.size):
+            out[k] += factor * row[k]

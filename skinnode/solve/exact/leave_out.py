@@ -1,17 +1,18 @@
-"""Two switches of the exact tracker that leave unknowns out, and what the deviation of those is.
+"""Two options of the exact tracker that leave unknowns out, and the standard deviation of what is left out.
 
 ``normal_only``: x and y of every electrode stay at rest. ``active_only``: the electrodes that no contact
-moves stay at rest. A wire starts with none that moves; when χ² says that this does not explain the frame,
-the electrode that explains most of the residual joins with its neighbours, until χ² is content, or more than
-half have joined and the rest follow. All are at rest again when that explains the frame. The deviation of a
-coordinate so left out is the move at which χ² would have noticed its electrode, were it the only one, in
-first order at rest: √(quantile − degrees of freedom) σ / ‖its column of J outside the range of the unknowns
-and of the electrode's other columns‖.
+moves stay at rest. A wire starts with all electrodes at rest. If χ² refuses that, the electrode that explains
+most of the residual joins the unknowns with its neighbours, until χ² accepts, or more than half have joined
+and the rest follow. All are at rest again when that explains the frame. The standard deviation of a
+coordinate left out is the move at which χ² would have noticed its electrode, were it the only one, in first
+order at rest: √(quantile − degrees of freedom) σ / ‖its column of J outside the range of the unknowns and of
+the electrode's other columns‖.
 
-Both are claims about the skin, and the deviations of the unknowns are those given the claim. Of active_only
-χ² sees to it. Of normal_only it sees less: a smooth shear looks like a slope of z. On staggered h = 0.5,
-noise 1e-5, a Hertzian press with a shear of 0.3 of its depth is refused where it is strong; where not, z is
-off by up to 16 of its small deviations, 0.2 % of h. To allow for it would cost more than to solve for it.
+Both are claims about the skin, and the standard deviations of the unknowns hold if the claim does. χ² checks
+the claim of active_only. It checks that of normal_only less well: a smooth shear looks like a slope of z. On
+staggered h = 0.5, noise 1e-5, a Hertzian press with a shear of 0.3 of its depth is refused if it is strong;
+if not, z is off by up to 16 of its small standard deviations, 0.2 % of h. To allow for it would cost more
+than to solve for it.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ Z_WIDEN: Final = 3.719
 """Normal deviate of the quantile, 1 − 1e-4, of χ² at which electrodes join: a long press at 100 frames/s
 gains one by chance in 100 s."""
 TINY: Final = 1e-200
-"""Far below any square of a slope, and nothing overflows that is divided by it."""
+"""Least square of a slope: far below any real one, and a quotient by it does not overflow."""
 
 
 class LeftOut:
-    """What is no unknown on the wires of a stream, and how far it may move unnoticed."""
+    """The electrodes without unknowns on the wires of a stream, and how far they may move unnoticed."""
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -73,7 +74,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Put wires to rest where that explains the frame; what χ² may miss of all that is no unknown."""
+        """Put wires to rest if that explains the frame; write standard deviations of what is not unknown."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -92,8 +93,10 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Let electrodes join on the wires that had a turn and are not explained; (U,) which those were. For
-        those reached after the time was over ``turns`` (U,) becomes False."""
+        """Let electrodes join the unknowns of wires that had a turn and are not explained; return those (U,).
+
+        Sets ``turns`` (U,) to False for wires reached after the deadline.
+        """
         unexplained = turns & ~self._explained()
         for u in [u for u in frame.order.tolist() if unexplained[u]]:
             turns[u] = not frame.expired
@@ -110,7 +113,7 @@ class LeftOut:
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
-        """How far each coordinate that is no unknown moves before χ² notices, pitches a unit of σ."""
+        """Write how far each coordinate that is not unknown moves before χ² notices, pitches a unit of σ."""
         solver, (_, lower) = self._stream.solver, self._layout.shape
         self._unnoticed_weight[u] = weight
         unnoticed = self._unnoticed[u].reshape(-1, 3)
@@ -133,7 +136,7 @@ class LeftOut:
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """(U,) wires at a root or minimum whose χ² noise can cause, and those with no electrode to add."""
+        """Return the wires (U,) whose root or minimum noise explains, and those with no electrode to add."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
@@ -142,7 +145,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Let electrodes of wire u join until they explain the frame; undone where not even all do."""
+        """Let electrodes of wire u join until they explain the frame; undo it if not even all do."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:
@@ -152,7 +155,7 @@ class LeftOut:
             electrodes = np.arange(most)
             near = not stream.problem.out_of_reach(solver.x)[u]
             if near and solver.measure[u, wires.CHI2] < np.inf:  # a minimum, if not low enough
-                joined = np.union1d(solver.electrodes(u), self._suspects(u))
+                joined = np.union1d(solver.electrodes(u), self._most_explaining(u))
                 electrodes = electrodes if 2 * len(joined) > most else joined
             self._set_electrodes(u, electrodes)
             solver.x[u] = stream.arrays.x[u]
@@ -166,8 +169,8 @@ class LeftOut:
             left_out = self._unnoticed[u] > 0
             solver.std[u, left_out] = frame.sigma * self._unnoticed[u, left_out]
 
-    def _suspects(self, u: int) -> Index:
-        """The electrode at rest that explains most of the residual of wire u, and its neighbours."""
+    def _most_explaining(self, u: int) -> Index:
+        """Return the electrode at rest that explains most of the residual of wire u, and its neighbours."""
         solver, arrays = self._stream.solver, self._stream.arrays
         each, (_, lower), most = solver.each, self._layout.shape, self._layout.unknowns // 3
         slopes = (self._slopes[u] * arrays.used[u]).reshape(most, 3, lower)[:, 3 - each :]
@@ -182,11 +185,11 @@ class LeftOut:
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
-    """(U,) wires with an equation that counts for over ``STALE`` times as much, or as little, as before."""
+    """Return the wires (U,) with a weight that changed by more than the factor ``STALE``."""
     return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
 
 
 def _outside(rows: Float, others: Float) -> Float:
-    """``rows`` (n, K) less what the rows ``others`` (m, K) span."""
+    """Return ``rows`` (n, K) less their projection on the rows ``others`` (m, K)."""
     q = np.linalg.qr(others.T)[0]
     return np.asarray(rows - (rows @ q) @ q.T)

@@ -1,4 +1,4 @@
-"""A second try for the wires of a frame that no solve brought to a root that counts.
+"""A second try for the wires of a frame that no solve brought to an acceptable root.
 
 bridge     R interpolated from the last trusted frame to the new one, solved substep by substep
 restart    the same from the rest position
@@ -24,12 +24,11 @@ BRIDGES: Final = (3, 5, 10)
 a 50 % press between two frames, 5 all but one of 24 through 70 %. Steps halved and doubled, and held to the
 trusted branch, do worse: the straight line crosses singular points that the press does not."""
 BRIDGE_TOLERANCE: Final = 1e-6
-"""Of the substeps of a bridge, the paper's intermediate tolerance."""
+"""Tolerance of the substeps of a bridge: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20
-"""Most steps of a substep."""
+"""Maximum steps of a substep."""
 RECOVERY_STEPS: Final = 300
-"""Most steps all bridges of a frame may take together, about 15 ms: a broken frame must
-not stop the stream."""
+"""Maximum steps of all bridges of a frame together, about 15 ms: a broken frame must not stop the stream."""
 # Levenberg-Marquardt is the sturdiest across a gap, whatever operator the stream has.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
@@ -38,9 +37,11 @@ _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE
 def recover_lost(
     stream: StreamState, frame: Frame, turns: NDArray[np.bool_], exhausted: NDArray[np.bool_]
 ) -> None:
-    """Recover the wires that are not at a root, into ``good`` and ``status`` of the stream's arrays; give up
-    those that fail, and the ``exhausted`` (U,), of which nothing is left to try. Who would need time that
-    is over has had no turn: False in ``turns`` (U,)."""
+    """Recover the wires that are not at a root; write ``good`` and ``status`` of the stream's arrays.
+
+    Gives up wires that fail, and the ``exhausted`` (U,), for which nothing is left to try. A wire reached
+    after the deadline has had no turn: ``turns`` (U,) becomes False.
+    """
     solver, arrays = stream.solver, stream.arrays
     good, status = arrays.good, arrays.status
     good[:], status[:] = stream.roots(), solver.report[:, wires.STATUS]
@@ -60,7 +61,7 @@ def recover_lost(
 
 
 def recover(stream: StreamState, u: int, frame: Frame) -> bool:
-    """Bridge wire u from its last trusted position, then from rest; whether that brought it to a root."""
+    """Bridge wire u from its last trusted position, then from rest; return whether it reached a root."""
     solver, arrays, problem = stream.solver, stream.arrays, stream.problem
     starts = [(arrays.x[u].copy(), arrays.a_solved[u].copy())]
     rest = problem.rest[u], problem.a_rest[u]
@@ -78,11 +79,13 @@ def recover(stream: StreamState, u: int, frame: Frame) -> bool:
     return False
 
 
-def _bridge(stream: StreamState, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int) -> bool:
+def _bridge(  # noqa: PLR0913 - both ends of the bridge
+    stream: StreamState, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int
+) -> bool:
     """Solve wire u along the straight line of its resistances from ``a_from`` (K,) to those of the frame.
 
     Only the last point counts: the line is no deformation of rubber, so the points between may lie on any
-    branch. The outcome is the solver's report of the wire. False where the deadline cut it short.
+    branch. The outcome is the solver's report of the wire. Returns False if the deadline cut it short.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

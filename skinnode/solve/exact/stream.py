@@ -1,4 +1,4 @@
-"""What all of the exact tracker works on: solver and arrays of the stream of a patch, and what is a root.
+"""The state that all of the exact tracker works on: solver, arrays and rest position of one patch.
 
 A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and
 no electrode moves farther than its clearance from the lower layer. A system with more equations than unknowns
@@ -26,32 +26,40 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from 1e-5."""
+"""Tolerance of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from
+1e-5."""
 FRAME_STEPS: Final = 12
-"""Most steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
+"""Maximum steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Of every solve that may be the last of its frame."""
+"""Tasks of every solve that may be the last of its frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """On what terms the frame in the arrays is solved."""
+    """Noise, order and deadline of the frame at hand."""
 
     sigma: float
-    """The least deviation of its resistances."""
+    """Least standard deviation of its resistances, relative."""
     order: Index
-    """(U,) the wires as they have their turn."""
+    """(U,) the wires in the order in which they have their turn."""
     until: float
-    """When its time is over, s; inf for never."""
+    """Deadline, s of ``perf_counter``; inf for none."""
 
     @property
     def expired(self) -> bool:
+        """Whether the deadline is over."""
         return self.until < math.inf and perf_counter() >= self.until
 
 
 class StreamState:
-    """A patch and where its stream is: the solver and the arrays that tracker, recovery and leaving out read
-    and write in place. One owner."""
+    """The solver and the arrays of one stream, which the tracker and its parts write to in place. One owner.
+
+    Args:
+        problem: the patch in the units of the solver.
+        operator: number of the operator.
+        normal_only: only z is unknown.
+        first: HOLD or PREDICT, what to do with a wire that can be predicted.
+    """
 
     def __init__(self, problem: PatchProblem, operator: int, normal_only: bool, first: int) -> None:
         self.problem = problem
@@ -63,7 +71,7 @@ class StreamState:
         self.options = solve_options(operator, TASKS, TOLERANCE, TOLERANCE, FRAME_STEPS)
 
     def reset(self) -> None:
-        """Back to the rest position."""
+        """Go back to the rest position."""
         solver, arrays = self.solver, self.arrays
         arrays.x[:], arrays.a_solved[:] = self.problem.rest, self.problem.a_rest
         solver.inverse[:] = self._rest_inverse
@@ -107,13 +115,13 @@ class StreamState:
         )
 
     def only(self, u: int) -> NDArray[np.uint8]:
-        """(U,) what to do: solve wire u, leave the others."""
+        """Return what to do (U,): solve wire u, leave the others."""
         todo = np.full(len(self.solver.x), wires.LEAVE, np.uint8)
         todo[u] = wires.SOLVE
         return todo
 
     def roots(self) -> NDArray[np.bool_]:
-        """(U,) wires that the solver brought to a root on the branch of the rest position, within reach."""
+        """Return the wires (U,) at a root on the branch of the rest position, within reach."""
         solver = self.solver
         report, out_of_reach = solver.report, self.problem.out_of_reach(solver.x)
         return on_rest_branch(
@@ -121,15 +129,15 @@ class StreamState:
         )
 
     def solvable(self) -> NDArray[np.bool_]:
-        """(U,) wires with enough usable resistances in the frame for their unknowns."""
+        """Return the wires (U,) with enough usable resistances in the frame for their unknowns."""
         count = np.count_nonzero(self.arrays.used, axis=1)
         return np.asarray((count > 0) & (count >= self.unknowns))
 
     def relative_residual(self, x: Float, a: Float) -> Float:
-        """(K,) a F − 1 of a wire at ``x`` (3N,), pitches."""
+        """Return a F − 1 (K,) of a wire at ``x`` (3N,), pitches."""
         gaps = x.reshape(-1, 1, 3, 1) - self.problem.lower.transpose(1, 0, 2)[None]
         return np.asarray(relative_residual(a, (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))))
 
     def a_at(self, x: Float) -> Float:
-        """(K,) the a of a wire whose root is ``x`` (3N,), pitches."""
+        """Return the a (K,) of a wire whose root is ``x`` (3N,), pitches."""
         return np.asarray(1.0 / (1.0 + self.relative_residual(x, np.ones(self.problem.layout.shape[1]))))

@@ -1,13 +1,13 @@
-"""The path of the paper run for ever: a live stream of frames, each solved from the one before.
+"""The exact tracker: a live stream of frames, each solved from the frame before, as the paper follows a path.
 
-rest       a wire whose resistances have not changed beyond their noise keeps its position (see ``follow``)
-predict    x + (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which its covariance needed anyway
+hold       a wire whose resistances have not changed beyond their noise keeps its position (see ``hold``)
+predict    x + (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which the covariance needed anyway
 follow     simplified Newton steps with the same J⁻¹, while it is still nearly that of the position
 correct    the operator, where it is not, to a tolerance far below any noise
 widen      an electrode left out that is seen to move joins the unknowns (see ``leave_out``)
 recover    a wire that fails is bridged, or given up (see ``recover``)
 
-Which roots count is told in ``stream``.
+Which roots are acceptable is decided in :mod:`skinnode.solve.roots`.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""An evaluation of F and J and the step from there take no longer. As many wires as fit for sure into what is
-left of a deadline are solved in one call: ten calls in place of one cost as much as the ten wires."""
+"""Maximum time of an evaluation of F and J with the step from there, s. As many wires as certainly fit into
+the time left are solved in one call: ten calls instead of one cost as much as the ten wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Most evaluations a wire may take for a frame."""
+"""Maximum evaluations of a wire for a frame."""
 
 
 class ExactTracker:
@@ -51,18 +51,18 @@ class ExactTracker:
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
         relative_noise: standard deviation of R relative to R, a number or (U, K).
         baseline_ohm: (U, K) resistances measured at rest; the resistivity and the gain then cancel.
-        stiffness_n_per_m: k of the paper's law F = k Δs; forces are given where it is.
-        hold: leave a wire alone whose resistances have not changed beyond their noise.
+        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; fields have forces if it is given.
+        hold: keep the position of a wire whose resistances have not changed beyond their noise.
         deadline_us: an update returns after this time and at most one more solve of a wire. A wire that had
-            no turn is DEADLINE with an infinite deviation; it is first in the next frame.
+            no turn is DEADLINE with an infinite standard deviation; it is first in the next frame.
         normal_only: only z is unknown.
         active_only: only the electrodes that contacts move are unknown.
-        codes: what the codes given to :meth:`update_codes` mean.
+        codes: meaning of the codes that :meth:`update_codes` takes.
 
     Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - keyword arguments of the public interface
         self,
         layout: PatchLayout,
         *,
@@ -100,11 +100,11 @@ class ExactTracker:
         )
         self._left_out = LeftOut(self._stream, active_only)
         self.arrays = self._stream.arrays
-        """Of the stream and the frame at hand."""
+        """The stream and the frame at hand."""
         if codes is not None:
             self.arrays.set_codes(codes)
         self.invalid_codes = 0
-        """Of the last scan of codes, how many were no measurement."""
+        """Number of codes in the last scan that were no measurement."""
         self.reset()
         self.update(problem.a_rest / problem.gain)  # compiles what has not been, before a stream
         self.reset()
@@ -118,22 +118,22 @@ class ExactTracker:
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
     ) -> FieldFrame:
-        """The displacement field of one frame.
+        """Return the displacement field of one frame.
 
         Args:
-            frame_ohm: (U, K) resistances; whatever is not positive and finite is not used.
+            frame_ohm: (U, K) resistances, ohm; a value that is not positive and finite is not used.
             valid: (U, K) bool, False where a chunk or wire is missing; default all.
-            relative_noise: as in the constructor, of this frame only; what is not positive and finite makes
-                its resistance unused.
+            relative_noise: as in the constructor, for this frame only; a resistance whose noise is not
+                positive and finite is not used.
 
         Never raises for numbers. A wire with fewer usable resistances than unknowns is ILL_CONDITIONED, or
         NON_FINITE where resistances not marked as missing were unusable. Such a wire, and one that no solve
-        brings to a root, holds its last trusted position with an infinite deviation; its residual is taken
-        there, and inf where the deadline left no time to. Raises ValueError for wrong shapes.
+        brings to a root, holds its last trusted position with an infinite standard deviation; its residual is
+        taken there, and is inf if the deadline left no time. Raises ValueError for wrong shapes.
         """
         start = perf_counter()
         arrays = self.arrays
-        # copies, for the kernel has the addresses of these
+        # copied, because the kernel has the addresses of these arrays
         arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         arrays.noise[:] = (
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
@@ -142,15 +142,17 @@ class ExactTracker:
         return self._advance(stage.SCALE, start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
-        """The field of a scan of (U, K) codes, as :meth:`update` makes it of the resistances and the noise
-        that they stand for. Afterwards :attr:`arrays` has those, and :attr:`invalid_codes` counts what was
-        none. Raises ValueError for another shape, or numbers that are no uint32."""
+        """Return the field of a scan of codes (U, K), as :meth:`update` does for resistances.
+
+        Afterwards :attr:`arrays` has the resistances, and :attr:`invalid_codes` is the number of codes that
+        were no measurement. Raises ValueError if ``codes`` has another shape or is not uint32.
+        """
         start = perf_counter()
         self.arrays.codes[:] = checked_codes(codes, self.layout)
         return self._advance(stage.DECODE | stage.SCALE, start)
 
     def _advance(self, stages: int, start: float) -> FieldFrame:
-        """The field of the frame that :attr:`arrays` has, after the ``stages`` that come before its solve."""
+        """Return the field of the frame in :attr:`arrays`; run ``stages`` before its solve."""
         solver, arrays = self._stream.solver, self.arrays
         solver.turn += 1
         sigma, until, units = self._sigma, start + self._seconds, math.inf
@@ -192,7 +194,7 @@ class ExactTracker:
         )
 
     def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:
-        """As :meth:`PatchSolver.advance` does them for a frame: σ, and what came of it."""
+        """Run ``stages`` of the frame as :meth:`PatchSolver.advance` does; return σ and what was found."""
         sigma, invalid, found = self._stream.solver.advance(
             stages, self.arrays, self._stream.options, sigma, units
         )
@@ -201,8 +203,10 @@ class ExactTracker:
         return sigma, found
 
     def _rescue(self, frame: Frame) -> Float:
-        """Try what is left to try on wires that were not brought to a root: their status and whether they are
-        good, and (U,) residuals."""
+        """Try what is left to try on wires that are not at a root; return the residuals (U,).
+
+        Writes ``good`` and ``status`` of :attr:`arrays`.
+        """
         solver, arrays = self._stream.solver, self.arrays
         turns = solver.report[:, wires.TURN] == 1
         exhausted = np.zeros_like(turns)  # whatever could be tried has been
@@ -213,14 +217,14 @@ class ExactTracker:
         for u in np.flatnonzero(~arrays.good).tolist():
             known = arrays.status[u] != DEADLINE and not frame.expired
             residual[u] = self._held_residual(u) if known else math.inf
-        # who waits comes first, in the order of waiting
+        # wires that wait come first, in the order of waiting
         self._waiting = not turns.all()
         order = arrays.order
         order[:] = order[np.argsort(turns[order], kind="stable")] if self._waiting else self._in_order
         return residual
 
     def _complete(self) -> None:
-        """The ``a`` of equations that solved wires did not have: what they would have been."""
+        """Write the a that missing equations of solved wires would have had."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -228,7 +232,7 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Go on from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
+        """Continue from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
         if self._active_only:  # with every electrode an unknown again, as the displacement has them all
@@ -239,14 +243,13 @@ class ExactTracker:
             arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
-        """Solve these wires (U,) from rest in the next frame, whatever they came to in this one."""
+        """Solve these wires (U,) from rest in the next frame, whatever the outcome of this one."""
         problem, arrays = self._stream.problem, self.arrays
         arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
         arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
-        """Solve the wires to be solved for the frame, in turn where there is a deadline: one at least, lest
-        the stream stand still."""
+        """Solve the wires that need it, at least one: with none the stream would never go on."""
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
@@ -255,7 +258,7 @@ class ExactTracker:
             self._solve_remaining(frame)
 
     def _solve_remaining(self, frame: Frame) -> None:
-        """The wires to be solved that had no turn, while there is time."""
+        """Solve the wires that had no turn, while there is time."""
         todo, report = self.arrays.todo, self._stream.solver.report
         while True:
             todo[report[:, wires.TURN] == 1] = wires.LEAVE
@@ -265,7 +268,7 @@ class ExactTracker:
             self._stream.solve(todo, frame, units=units)
 
     def _held_residual(self, u: int) -> float:
-        """RMS of F/b − 1 of wire u at its held position over the usable resistances; inf if there is none."""
+        """Return the RMS of F/b − 1 of wire u at its held position; inf if no resistance is usable."""
         arrays = self.arrays
         used = arrays.used[u] > 0
         if not used.any():

@@ -14,10 +14,10 @@ from skinnode.model.layout import Float
 
 
 @njit_part
-def bidiagonalise(
+def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of the decomposition
     a: Float, left: Float, diagonal: Float, upper: Float, across: Float, down: Float, w: Float
 ) -> None:
-    """A = P Bᵀ Qᵀ for A (n, m), n ≤ m, with orthogonal P and Q and B upper bidiagonal (n, n).
+    """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with orthogonal P and Q and B upper bidiagonal (n, n).
 
     ``a`` (n + 3, whole lanes of m) is A with zeros around it: four rows at a time and whole vectors then need
     no special cases. B is left in ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the
@@ -87,7 +87,7 @@ def bidiagonalise(
 
 @njit_part
 def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
-    """(I − β v vᵀ) b in place of ``b`` with reflector ``k`` of :func:`bidiagonalise`."""
+    """Replace ``b`` by (I − β v vᵀ) b with reflector ``k`` of :func:`bidiagonalise`."""
     row, end, along = rows[k], b.size, splat(0.0)
     first = k - k % LANES
     for j in range(first, end, LANES):
@@ -98,11 +98,13 @@ def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
 
 
 @njit_part
-def damped_solve(
+def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     diagonal: Float, upper: Float, b: Float, lam: float, inverse: Float, ru: Float, x: Float
 ) -> None:
-    """Least squares of [B; √lam I] x = [``b``; 0], B as of :func:`bidiagonalise`, by Givens rotations (Eldén,
-    Algorithms for the regularization of ill-conditioned least squares problems, 1977).
+    """Solve [B; √lam I] x = [``b``; 0] in the least squares sense, B from :func:`bidiagonalise`.
+
+    By Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
+    1977).
 
     R of BᵀB + lam = RᵀR is bidiagonal too: 1 / its diagonal is left in ``inverse`` (n,), what is above it in
     ``ru`` (n,). Squares of lam and B must not underflow together.
@@ -123,7 +125,7 @@ def damped_solve(
 
 @njit_part
 def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
-    """R⁻¹ x in place of ``x`` (n,); R has 1 / ``inverse`` on and ``upper`` above the diagonal."""
+    """Replace ``x`` (n,) by R⁻¹ x; R has 1 / ``inverse`` on and ``upper`` above the diagonal."""
     last = 0.0
     for i in range(x.size - 1, -1, -1):
         last = (x[i] - upper[i] * last) * inverse[i]
@@ -132,7 +134,7 @@ def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
 
 @njit_part
 def bidiagonal_solve_transposed(inverse: Float, upper: Float, x: Float) -> None:
-    """R⁻ᵀ x in place of ``x`` (n,) for the same R."""
+    """Replace ``x`` (n,) by R⁻ᵀ x for the same R."""
     carried = 0.0
     for i in range(x.size):
         value = (x[i] - carried) * inverse[i]

@@ -1,13 +1,13 @@
 """Dense kernels for some hundred unknowns: Cholesky, triangular solves, products.
 
-LAPACK would do, but the last bits of OpenBLAS depend on its number of threads, and the same frames have to
-give the same field whatever that is. Here each element of a result is one sum in the order of its index, so
-that neither threads nor a split of the columns change it.
+LAPACK is not used because the last bits of OpenBLAS depend on its number of threads, and the same frames must
+give the same field. Here each element of a result is one sum in the order of its index, so neither the number
+of threads nor a split of the columns changes it.
 
-All of it is one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, which
-costs 8 loads for 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix multiplication,
-2008). Arrays are C-ordered float64; of buffers bigger than the problem the leading n rows and columns are
-used. Nothing is allocated.
+Everything is one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, which
+costs 8 loads for every 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix
+multiplication, 2008). Arrays are C-ordered float64; of buffers bigger than the problem the leading n rows and
+columns are used. Nothing is allocated.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TILE: Final = 2 * LANES
 
 
 @njit_part
-def _tile(
+def _tile(  # noqa: PLR0913 - the bounds of a tile
     c: Float, r: int, rows: int, a: Float, b: Float, low: int, high: int, col: int, count: int, subtract: bool
 ) -> None:
     """``c``[r:r+rows, tile] = Σ_k ``a``[r:r+rows, k] ``b``[k, tile], low ≤ k < high, or is reduced by it.
@@ -89,8 +89,10 @@ def _tile(
 
 
 @njit_part
-def _forward(l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int) -> None:
-    """Rows r to r + rows of L⁻¹ B in place of a tile of ``b``, whose rows low to r have theirs."""
+def _forward(  # noqa: PLR0913 - the bounds of a tile
+    l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
+) -> None:
+    """Replace rows r to r + rows of a tile of ``b`` by those of L⁻¹ B; rows low to r are done."""
     _tile(b, r, rows, l, b, low, r, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -109,9 +111,9 @@ def _forward(l: Float, b: Float, r: int, rows: int, low: int, col: int, count: i
 
 @njit
 def cholesky(a: Float, n: int) -> int:
-    """Cholesky factor of the symmetric ``a`` (n, n) in place: L on and below the diagonal, Lᵀ above it.
+    """Replace the symmetric ``a`` (n, n) by its Cholesky factor: L on and below the diagonal, Lᵀ above it.
 
-    Only what is on and above the diagonal is read. 1, or 0 where ``a`` is not positive definite.
+    Reads only the diagonal and what is above it. Returns 1, or 0 if ``a`` is not positive definite.
     """
     first: Any = np.int64(0)  # a literal 0 would have what it is given to compiled once more
     for r in range(0, n, ROWS):
@@ -143,7 +145,7 @@ def cholesky(a: Float, n: int) -> int:
 
 @njit
 def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
-    """L⁻¹ B in place of the leading (n, cols) of ``b``; of ``l`` the lower triangle is read."""
+    """Replace the leading (n, cols) of ``b`` by L⁻¹ B; reads only the lower triangle of ``l``."""
     first: Any = np.int64(0)
     for col in range(0, cols, TILE):
         for r in range(0, n, ROWS):
@@ -151,8 +153,10 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 
 
 @njit_part
-def _backward(l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int) -> None:
-    """Rows r to r + rows of L⁻ᵀ B in place of a tile of ``b``, whose rows r + rows to n have theirs."""
+def _backward(  # noqa: PLR0913 - the bounds of a tile
+    l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
+) -> None:
+    """Replace rows r to r + rows of a tile of ``b`` by those of L⁻ᵀ B; rows r + rows to n are done."""
     _tile(b, r, rows, l, b, r + rows, n, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -171,7 +175,7 @@ def _backward(l: Float, b: Float, r: int, rows: int, n: int, col: int, count: in
 
 @njit
 def solve_lower_transposed(l: Float, b: Float, n: int, cols: int) -> None:
-    """L⁻ᵀ B in place of the leading (n, cols) of ``b``; of ``l`` the upper triangle is read, which has Lᵀ."""
+    """Replace the leading (n, cols) of ``b`` by L⁻ᵀ B; reads Lᵀ in the upper triangle of ``l``."""
     for col in range(0, cols, TILE):
         for r in range((n - 1) // ROWS * ROWS, -1, -ROWS):
             _backward(l, b, r, min(ROWS, n - r), n, col, min(TILE, cols - col))
@@ -179,7 +183,7 @@ def solve_lower_transposed(l: Float, b: Float, n: int, cols: int) -> None:
 
 @njit
 def solve_lower_vector(l: Float, v: Float, n: int) -> None:
-    """L⁻¹ v in place of the leading n of ``v``."""
+    """Replace the leading n of ``v`` by L⁻¹ v."""
     for i in range(n):
         row = l[i]
         even, odd = splat(0.0), splat(0.0)
@@ -192,7 +196,7 @@ def solve_lower_vector(l: Float, v: Float, n: int) -> None:
 
 @njit
 def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
-    """L⁻ᵀ v in place of the leading n of ``v``."""
+    """Replace the leading n of ``v`` by L⁻ᵀ v."""
     for i in range(n - 1, -1, -1):
         row = l[i]
         value = v[i] / row[i]
@@ -203,7 +207,7 @@ def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
 
 @njit
 def multiply(a: Float, b: Float, c: Float) -> None:
-    """``c`` (m, n) = ``a`` (m, k) · ``b`` (k, n)."""
+    """Write ``a`` (m, k) · ``b`` (k, n) into ``c`` (m, n)."""
     (rows, inner), cols = a.shape, b.shape[1]
     first: Any = np.int64(0)
     for col in range(0, cols, TILE):
@@ -213,7 +217,7 @@ def multiply(a: Float, b: Float, c: Float) -> None:
 
 @njit
 def multiply_vector(a: Float, v: Float, out: Float) -> None:
-    """``out`` (m,) = ``a`` (m, n) · ``v`` (n,)."""
+    """Write ``a`` (m, n) · ``v`` (n,) into ``out`` (m,)."""
     n = v.size
     for i in range(out.size):
         row = a[i]
@@ -227,9 +231,9 @@ def multiply_vector(a: Float, v: Float, out: Float) -> None:
 
 @njit
 def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
-    """``c`` (m, n) = ``a`` (m, k) · ``b``ᵀ with ``b`` (n, k); ``work`` (k, n) is scratch.
+    """Write ``a`` (m, k) · ``b``ᵀ into ``c`` (m, n), ``b`` (n, k); ``work`` (k, n) is scratch.
 
-    Where Bᵀ is at hand, :func:`multiply` does the same.
+    If Bᵀ is at hand, :func:`multiply` does the same.
     """
     for j in range(b.shape[0]):
         row = b[j]
@@ -240,9 +244,9 @@ def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
 
 @njit
 def inverse_diagonal(l: Float, work: Float, out: Float, n: int) -> None:
-    """Diagonal of (L Lᵀ)⁻¹ into the leading n of ``out``: out_j = Σ_i (L⁻¹)_ij².
+    """Write the diagonal of (L Lᵀ)⁻¹ into the leading n of ``out``: out_j = Σ_i (L⁻¹)_ij².
 
-    L⁻¹ is left in the lower triangle of ``work`` (n, n).
+    Leaves L⁻¹ in the lower triangle of ``work`` (n, n).
     """
     for col in range(0, n, TILE):
         count = min(TILE, n - col)

@@ -17,8 +17,8 @@ from skinnode.solve.linalg.vectors import Index
 
 
 @njit_part
-def lu_factor(a: Float, pivot: Index) -> int:
-    """LU of A (n, n) in place with row exchanges in ``pivot`` (n,); sign of det A, 0 where it is singular.
+def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a time
+    """Factor A (n, n) in place, row exchanges in ``pivot`` (n,); return the sign of det A, 0 if singular.
 
     ``a`` (n + 3, whole lanes of n) is A with zeros around it: four rows share the loads of the pivot row, and
     whole vectors need no special cases at the ends.
@@ -95,7 +95,7 @@ def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
 
 @njit_part
 def lu_inverse_transposed(lu: Float, pivot: Index, inverse: Float) -> None:
-    """(Aᵀ)⁻¹ of the A of :func:`lu_factor` into ``inverse`` (n, n)."""
+    """Write (Aᵀ)⁻¹ for the A of :func:`lu_factor` into ``inverse`` (n, n)."""
     n = pivot.size
     for i in range(n):
         row = inverse[i]

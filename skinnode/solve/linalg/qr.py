@@ -14,8 +14,8 @@ from skinnode.solve.linalg.vectors import dot
 
 
 @njit_part
-def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:
-    """Householder QR of J = ``jt``ᵀ, (m, n) with m ≥ n. 1, or 0 where a diagonal element of R vanishes.
+def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:  # noqa: C901 - loops
+    """Factor J = ``jt``ᵀ (m, n), m ≥ n, by reflectors; return 0 if R has a zero on its diagonal, else 1.
 
     R is left above the diagonal of ``a`` (m, n) with its own diagonal in ``diagonal`` (n,); the reflectors
     I − β v vᵀ on and below it with β in ``beta`` (n,). ``w`` (n,) is scratch.
@@ -54,7 +54,7 @@ def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> in
 
 @njit_part
 def qr_project(a: Float, beta: Float, b: Float) -> None:
-    """Qᵀ b in place of ``b`` (m,)."""
+    """Replace ``b`` (m,) by Qᵀ b."""
     m, n = a.shape
     for k in range(n):
         total = 0.0
@@ -77,8 +77,8 @@ def r_solve(a: Float, diagonal: Float, b: Float) -> None:
 
 
 @njit_part
-def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float) -> None:
-    """J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m); ``v`` (m,) is scratch."""
+def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float) -> None:  # noqa: C901 - loops
+    """Write J⁺ = R⁻¹ Qᵀ into the first n rows of ``inverse`` (≥ n, m); ``v`` (m,) is scratch."""
     m, n = a.shape
     for j in range(n):
         row = inverse[j]

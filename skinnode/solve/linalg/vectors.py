@@ -13,7 +13,7 @@ Index = NDArray[np.int64]
 
 
 def padded(rows: int, size: int) -> Float:
-    """(rows, ≥ size) zeros, a row of whole vectors at whole cache lines."""
+    """Return zeros (rows, ≥ size) whose rows are whole vector registers, aligned to cache lines."""
     size = -(-size // LANES) * LANES
     room = np.zeros(rows * size + 8)
     first = (-room.ctypes.data // room.itemsize) % 8
@@ -22,7 +22,7 @@ def padded(rows: int, size: int) -> Float:
 
 @njit_part
 def dot(a: Float, b: Float) -> float:
-    """a·b in four partial sums: as exact as one, and four times less latency."""
+    """Return a·b, in four partial sums: as exact as one, with a quarter of the latency."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     whole = a.size - a.size % 4
     for i in range(0, whole, 4):
@@ -37,7 +37,7 @@ def dot(a: Float, b: Float) -> float:
 
 @njit_part
 def largest(a: Float) -> float:
-    """max |a_i|; NaN where there is one."""
+    """Return max |a_i|, or NaN if any element is NaN."""
     top = 0.0
     for value in a:
         size = abs(value)

@@ -75,7 +75,7 @@ def settled(w: Work, tol_f: float, tol_x: float) -> bool:
 
 @njit_part
 def correction(w: Work, r: Float, out: Float) -> float:
-    """−J⁺ r into ``out`` (n,) with the factors at hand; its largest element."""
+    """Write −J⁺ r into ``out`` (n,), by the factors at hand; return its largest element."""
     n = out.size
     if w.r.size == n:
         for j in range(n):
@@ -93,7 +93,7 @@ def correction(w: Work, r: Float, out: Float) -> float:
 
 @njit_part
 def rounding(w: Work, x: Float) -> float:
-    """What rounding x to the nearest double does to r, eps Σ_j |J_kj x_j|, into ``e``; max |x|."""
+    """Write into ``e`` what rounding of x does to r, eps Σ_j |J_kj x_j|; return max |x|."""
     top = 0.0
     for k in range(w.e.size):
         w.e[k] = 0.0
@@ -108,10 +108,10 @@ def rounding(w: Work, x: Float) -> float:
 
 @njit_part
 def estimate_error(w: Work, inverse: Float) -> float:
-    """J⁺ of the last factors into ``inverse`` (n, m); the error estimate of a converged solve.
+    """Write J⁺ of the last factors into ``inverse`` (n, m); return the error estimate of a converged solve.
 
-    That is the correction still to come and what rounding of x leaves open through the condition of J, as a
-    share of max(1, ‖x‖∞). Inf where J is singular.
+    The estimate is the correction still to come plus what rounding of x leaves open through the condition of
+    J, as a share of max(1, ‖x‖∞); inf if J is singular.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

@@ -64,7 +64,7 @@ from skinnode.solve.operators.work import (
 
 @njit_part
 def begin(w: Work) -> int:
-    """Start from x, r and J in the workspace. TRY, or INVALID_START where r is not finite or m < n."""
+    """Start from x, r and J in the workspace; return TRY, or INVALID_START if r is not finite or m < n."""
     s, flag = w.s, w.flag
     for k in range(flag.size):
         flag[k] = 0
@@ -121,7 +121,7 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit_part
 def shorten(operator: int, w: Work) -> int:
-    """The step within the trust region where Newton's leaves it: TRY, or a Status at a stationary point."""
+    """Set the step within the trust region if Newton's leaves it: TRY, or a Status at a stationary point."""
     if slope_of(w) <= EPS:
         return CONVERGED if w.flag[SINGULAR] == 0 and w.r.size > w.x.size else ILL_CONDITIONED
     if operator == LEVENBERG_MARQUARDT:
@@ -147,7 +147,7 @@ def _within_rounding(w: Work, norm: float) -> bool:
 
 @njit_part
 def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
-    """Take the trial point or not, by ``r_trial``: ACCEPTED (evaluate J at x next), REJECTED or a Status."""
+    """Take the trial point or not: return ACCEPTED (evaluate J at x next), REJECTED or a Status."""
     s = w.s
     norm = math.sqrt(dot(w.r_trial, w.r_trial))
     exhausted = _within_rounding(w, norm)
@@ -173,15 +173,15 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """:func:`begin` for callers in Python."""
+    """Do :func:`begin` for callers in Python."""
     return begin(w)
 
 
 @njit
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
-    """:func:`assess` the trial of the last call, then :func:`propose`, for callers in Python.
+    """Do :func:`assess` for the trial of the last call, then :func:`propose`, for callers in Python.
 
-    ``went`` is what the last call returned, ``REJECTED`` at first. Returns TRY (evaluate r at ``trial`` into
+    ``went`` is the result of the last call, ``REJECTED`` at first. Returns TRY (evaluate r at ``trial`` into
     ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
     """
     if went == TRY:
@@ -194,5 +194,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """:func:`estimate_error` for callers in Python."""
+    """Do :func:`estimate_error` for callers in Python."""
     return estimate_error(w, inverse)

@@ -1,4 +1,4 @@
-"""What a solve of any system returns. Statuses are those of the model."""
+"""The result of solving any system. Statuses are those of the model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Solution", "SolveStats", "Status"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """How ``solve_system`` ended; the best iterate found, whatever the status."""
+    """How ``solve_system`` ended, with the best iterate found, whatever the status."""
 
     x: Float
     """(n,) the best iterate."""
@@ -24,5 +24,5 @@ class Solution:
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
     """Estimate of max |x − x*|: the Newton correction still to come plus what rounding of F leaves open
-    through the condition of J. Inf where no root or minimum was found."""
+    through the condition of J. Inf if no root or minimum was found."""
     stats: SolveStats

@@ -1,4 +1,4 @@
-"""Any square or tall system F(x) = 0 by the operators of the skin."""
+"""Solve any square or tall system F(x) = 0 by the operators of the skin."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from skinnode.solve.operators.work import workspace
 
 
 def operator_code(name: str) -> int:
-    """Number of an operator in the compiled code. ValueError for a name that is none."""
+    """Return the number of an operator in compiled code. Raises ValueError for an unknown name."""
     if not isinstance(name, str) or name not in op.OPERATORS:
         raise ValueError(f"operator: got {name!r}, must be one of {', '.join(op.OPERATORS)}")
     return op.OPERATORS[name]
 
 
 def require_tolerances(tol_f: float, tol_x: float, max_steps: int) -> None:
-    """ValueError unless both tolerances are positive and at least one step is allowed."""
+    """Raise ValueError unless both tolerances are positive and at least one step is allowed."""
     for name, value in (("tol_f", tol_f), ("tol_x", tol_x)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}: got {value}, must be positive and finite")
@@ -36,7 +36,7 @@ def require_tolerances(tol_f: float, tol_x: float, max_steps: int) -> None:
         raise ValueError(f"max_steps: got {max_steps}, must be an integer of at least 1")
 
 
-def solve_system(
+def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
     residual: Callable[[Float], ArrayLike],
     jacobian: Callable[[Float], ArrayLike],
     x0: ArrayLike,
@@ -56,9 +56,13 @@ def solve_system(
         tol_x: largest remaining correction, relative to max(1, max|x|).
         max_steps: trial steps, rejected ones included.
 
-    Never raises for what the functions return, only for shapes: fewer equations than unknowns, or a residual
-    or Jacobian that is not finite at ``x0``, end as ``INVALID_START``. See ``operators`` for what CONVERGED
-    promises. Raises ValueError for arguments of the wrong shape or range.
+    Returns:
+        The best iterate with its status. Fewer equations than unknowns, or a residual or Jacobian that is not
+        finite at ``x0``, end as ``INVALID_START``. See :mod:`skinnode.solve.operators.loop` for what
+        CONVERGED promises.
+
+    Raises:
+        ValueError: if an argument or a returned array has the wrong shape or range. Numbers never raise.
     """
     code = operator_code(operator)
     require_tolerances(tol_f, tol_x, max_steps)

@@ -38,7 +38,7 @@ from skinnode.solve.operators.work import (
 
 @njit_part
 def slope_of(w: Work) -> float:
-    """Gradient Jᵀr into the workspace; its largest cosine |J_j·r| / (D_j ‖r‖)."""
+    """Write the gradient Jᵀr into the workspace; return its largest cosine |J_j·r| / (D_j ‖r‖)."""
     top = 0.0
     for j in range(w.x.size):
         w.gradient[j] = dot(w.jt[j], w.r)

@@ -70,7 +70,7 @@ class Work(NamedTuple):
 
 
 def workspace(n: int, m: int) -> Work:
-    """A zeroed workspace for m equations in n unknowns."""
+    """Return a zeroed workspace for m equations in n unknowns."""
     v, e = np.zeros((15, n)), np.zeros((4, m))
     return Work(
         x=v[0], trial=v[1], step=v[2], newton=v[3], gradient=v[4], scale=v[5], diagonal=v[6], beta=v[7],
@@ -84,7 +84,7 @@ def workspace(n: int, m: int) -> Work:
 
 @njit_part
 def weighted_norm(scale: Float, v: Float) -> float:
-    """‖D v‖₂"""
+    """Return ‖D v‖₂."""
     total = 0.0
     for j in range(v.size):
         weighted = scale[j] * v[j]
@@ -94,7 +94,7 @@ def weighted_norm(scale: Float, v: Float) -> float:
 
 @njit_part
 def times_jacobian(jt: Float, v: Float, out: Float) -> None:
-    """J v into ``out`` (m,)."""
+    """Write J v into ``out`` (m,)."""
     for k in range(out.size):
         out[k] = 0.0
     for j in range(v.size):

@@ -63,7 +63,7 @@ def _data_rounding(inverse: Float, weight: Float) -> float:
 
 
 @njit_part
-def _evaluate(
+def _evaluate(  # noqa: PLR0913 - arrays of one wire
     x: Float, point: Float, still: Float, lower: Float, a: Float, weight: Float, r: Float, raw: Float
 ) -> None:
     """Evaluate r = w (a F − 1) and the Jacobian of F at the unknowns ``x``, put into ``point``.
@@ -93,8 +93,7 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 @njit_part
 def coordinate(electrodes: Index, j: int, each: int) -> int:
-    """Return where unknown ``j`` is in a wire's 3N coordinates, with three or one (z) unknowns an
-    electrode."""
+    """Return the coordinate (of 3N) that is unknown ``j``, with three or one (z) unknowns an electrode."""
     if each == 3:
         return int(3 * electrodes[j // 3] + j % 3)
     return int(3 * electrodes[j] + 2)
@@ -109,7 +108,7 @@ def _optimality(jt: Float, r: Float) -> float:
 
 
 @njit_part
-def correct(
+def correct(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, steps: int,
 ) -> tuple[int, int, int, int, bool]:  # fmt: skip
     """Iterate from the x of the workspace until wire ``u`` converges or fails.
@@ -153,7 +152,7 @@ def correct(
 
 
 @njit_part
-def report_correction(
+def report_correction(  # noqa: PLR0913 - one wire of a call; its results in one piece
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
     status: int, skipped: bool,
 ) -> int:  # fmt: skip

@@ -47,7 +47,7 @@ def standard_deviations(inverse: Float, variance: Float, std: Float) -> None:
 
 
 @njit_part
-def follow(
+def follow(  # noqa: PLR0913 - arrays of one wire
     x: Float, lower: Float, a: Float, inverse: Float, moved: float, tol_f: float, tol_x: float,
     rho: Float, step: Float,
 ) -> tuple[int, int, float]:  # fmt: skip

@@ -42,7 +42,7 @@ chi2_quantile_part = njit_part(chi2_quantile)
 
 
 @njit_part
-def within_noise(
+def within_noise(  # noqa: PLR0913 - arrays of one wire
     a: Float, weight: Float, sigma: float, tol: float, a_solved: Float, noise: Float, inverse: Float,
     unknowns: int, rho: Float, variance: Float, before: Float, std: Float,
 ) -> float:  # fmt: skip

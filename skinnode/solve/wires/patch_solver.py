@@ -56,7 +56,7 @@ _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
 @njit
-def solve_patch(
+def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight times as slowly
     stages: int,
     frame_table: Index,
     solver_table: Index,
@@ -154,8 +154,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Solve the rest position itself, for its inverse; return the sign of det J (U,) there, 0 for
-        none."""
+        """Solve the rest position, for its inverse; return the sign of det J (U,) there, 0 for none."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
@@ -163,7 +162,7 @@ class PatchSolver:
         self.x[:] = self.problem.rest
         return self.report[:, wires.BRANCH].copy()
 
-    def solve(
+    def solve(  # noqa: PLR0913 - what changes from call to call
         self,
         todo: NDArray[np.uint8],
         a: Float,

@@ -39,13 +39,16 @@ class PatchProblem:
     a_rest: Float
     """(U, K) a at rest, 1 / F."""
     share_at_rest: Float
-    """(U, N, K) what each electrode at rest contributes to F."""
+    """(U, N, K) contribution of each electrode at rest to F."""
     clearance: Float
     """(U, N) distance of each electrode at rest from the nearest lower one, pitches."""
 
     @classmethod
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
-        """``baseline_ohm`` (U, K) are measured rest resistances. ValueError unless they are positive."""
+        """Scale a patch; ``baseline_ohm`` (U, K) are measured rest resistances, ohm.
+
+        Raises ValueError unless the rest resistances are positive.
+        """
         pitch = layout.pitch_m
         rest, lower, potential, share, clearance = _at_rest(layout)
         gain = np.full(layout.shape, 1.0 / (layout.resistivity_ohm_per_m * pitch))
@@ -63,14 +66,14 @@ class PatchProblem:
         return TRUST_SHARE * float(self.clearance.min())
 
     def displacement_m(self, x: Float) -> Float:
-        """(U, N, 3) metres from ``x`` (U, 3N) pitches."""
+        """Return the displacement (U, N, 3), m, of ``x`` (U, 3N), pitches."""
         return np.asarray((x - self.rest) * self.layout.pitch_m).reshape(self.layout.upper_m.shape)
 
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
-        """(U,) wires with an electrode farther from rest than it was from the nearest lower electrode.
+        """Return the wires (U,) with an electrode farther from rest than its clearance at rest.
 
         F is the same for electrodes mirrored at the lower layer and for two that changed places; both roots
-        lie that far away, and no rubber pressed on from outside moves by more than its own thickness.
+        lie that far away, and rubber pressed from outside does not move by more than its own thickness.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):
@@ -79,8 +82,7 @@ class PatchProblem:
 
 @functools.lru_cache(maxsize=64)  # 2 ms a layout, as long as ten paths of a wire
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
-    """rest, lower, F at rest, shares of F and clearance of a :class:`PatchProblem`; none of them is written
-    to."""
+    """Return rest, lower, F at rest, shares of F and clearance of a :class:`PatchProblem`, all read-only."""
     pitch = layout.pitch_m
     rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
     gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)

@@ -1,5 +1,4 @@
-"""Which of the roots just found may be wrong, compiled: for the tracker, which decides what to do about
-them."""
+"""Check which of the roots just found may be wrong, compiled."""
 
 from __future__ import annotations
 

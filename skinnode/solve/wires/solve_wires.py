@@ -48,7 +48,7 @@ def _drop_unusable(a: Float, weight: Float) -> tuple[int, int]:
 
 
 @njit_part
-def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, tol_f: float) -> bool:
+def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, tol_f: float) -> bool:  # noqa: PLR0913 - one wire of a call
     """Hold wire ``u`` if its residual is within noise; write its RESIDUAL and standard deviations."""
     w: Any = solver.work
     held = within_noise(
@@ -81,11 +81,13 @@ def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
 
 
 @njit_part
-def _follow(
+def _follow(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, moved: float
 ) -> tuple[int, int, bool]:
-    """Follow wire ``u`` after a prediction by ``moved``; evaluations, steps, and whether its inverse still
-    holds."""
+    """Follow wire ``u`` after a prediction by ``moved``.
+
+    Returns evaluations of F, steps, and whether the inverse still holds.
+    """
     w: Any = solver.work
     evaluations, steps, first = follow(
         w.x, solver.lower, a, solver.inverse[u], moved, options.tol_f, options.tol_x, w.e, w.newton
@@ -99,7 +101,7 @@ def _follow(
 
 
 @njit_part
-def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, count: int) -> None:
+def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, count: int) -> None:  # noqa: PLR0913 - one wire of a call
     """Write x, measures and standard deviations of wire ``u``, which was followed to a root."""
     w: Any = solver.work
     x_u, measure, a_solved, noise = solver.x[u], solver.measure[u], solver.a_solved[u], solver.noise[u]
@@ -116,7 +118,7 @@ def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigm
 
 
 @njit_part
-def _solve_wire(
+def _solve_wire(  # noqa: C901, PLR0913 - one wire of a call, from start to report
     u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
 ) -> float:
     """Solve wire ``u``; return what that cost, in evaluations of F and J with their step."""
@@ -176,7 +178,7 @@ def _solve_wire(
 
 
 @njit_body
-def solve_wires(
+def solve_wires(  # noqa: PLR0913 - what changes from call to call
     solver: SolverArrays,
     options: SolveOptions,
     todo: NDArray[np.uint8],

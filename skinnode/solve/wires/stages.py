@@ -1,7 +1,7 @@
-"""What is done to a frame before and after its solve, compiled: about thirty NumPy calls on 300 numbers each
-took longer than the solve of a patch at rest.
+"""The work on a frame before and after its solve, compiled.
 
-``start``, ``choose`` come before the solve, ``accept_roots`` and ``store`` after it.
+``start`` and ``choose`` come before the solve, ``accept_roots`` and ``store`` after it. About thirty NumPy
+calls on 300 numbers each took longer than the solve of a patch at rest.
 """
 
 from __future__ import annotations

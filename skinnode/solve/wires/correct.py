@@ -152,7 +152,7 @@ def correct(  # noqa: PLR0913 - one wire of a call
 
 
 @njit_part
-def report_correction(  # noqa: PLR0913 - one wire of a call; its results in one piece
+def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results in one piece
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
     status: int, skipped: bool,
 ) -> int:  # fmt: skip

@@ -1,12 +1,12 @@
 """The trust region ‖D s‖ ≤ radius: its size, and whether a step is taken.
 
-A step is taken only if it makes r smaller. Radius factors 1/4, 3/4 and 0.0001: Moré, The Levenberg-Marquardt
-algorithm, 1978.
+A step is taken only if it makes r smaller. Source: Moré, The Levenberg-Marquardt algorithm, 1978.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from skinnode.compiled.jit import njit_part
 from skinnode.solve.linalg.vectors import dot
@@ -34,6 +34,12 @@ from skinnode.solve.operators.work import (
     Work,
     weighted_norm,
 )
+
+
+SHRINK_BELOW: Final = 0.25
+ENLARGE_ABOVE: Final = 0.75
+REJECT_BELOW: Final = 1e-4
+"""Ratios of actual to predicted decrease at which the radius changes and a step is rejected (Moré 1978)."""
 
 
 @njit_part
@@ -88,7 +94,7 @@ def _stalled(w: Work) -> int:
 def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> None:
     """Update the radius and lam from the ratio of actual to predicted decrease (Moré 1978, section 4)."""
     s = w.s
-    if ratio < 0.25:
+    if ratio < SHRINK_BELOW:
         shrink = 0.1
         if gain >= 0.0:
             shrink = 0.5
@@ -98,7 +104,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
         reach = 10.0 * s[LENGTH]
         s[RADIUS] = shrink * (reach if reach < s[RADIUS] else s[RADIUS])
         s[LAM] /= shrink
-    elif s[LAM] == 0.0 or ratio >= 0.75:
+    elif s[LAM] == 0.0 or ratio >= ENLARGE_ABOVE:
         reach = 2.0 * s[LENGTH]
         if s[LAM] > 0.0 or reach > s[RADIUS]:
             s[RADIUS] = reach
@@ -123,7 +129,7 @@ def assess_decrease(w: Work, norm: float) -> int:
         return _stalled(w)
     ratio = gain / predicted if predicted > 0.0 else -1.0
     _resize(w, norm, gain, slope, ratio)
-    if not ratio >= 1e-4:
+    if not ratio >= REJECT_BELOW:
         if s[RADIUS] <= EPS * weighted_norm(w.scale, w.x) or s[RADIUS] < 1e-300:
             return RADIUS_TOO_SMALL
         return REJECTED

@@ -35,7 +35,6 @@ from skinnode.solve.operators.work import (
     weighted_norm,
 )
 
-
 SHRINK_BELOW: Final = 0.25
 ENLARGE_ABOVE: Final = 0.75
 REJECT_BELOW: Final = 1e-4

@@ -73,22 +73,26 @@ class _Field:
     def check(self, table: str, array: Any, lengths: dict[str, int]) -> None:
         """Raise TypeError unless a kernel can use ``array``; ``lengths`` are those of the axes so far."""
         assert self.axes is not None
-        wanted = f"must be a contiguous, writable {self.dtype} array with axes ({', '.join(self.axes)})"
         if not isinstance(array, np.ndarray):
-            raise TypeError(f"{table}.{self.name}: got {type(array).__name__}, {wanted}")
+            raise TypeError(f"{table}.{self.name}: got {type(array).__name__}, {self._wanted()}")
         flags = array.flags
-        layout = "" if flags.c_contiguous else "not contiguous, "
-        layout += "" if flags.writeable or self.readonly else "read-only, "
-        if array.dtype.name != self.dtype or array.ndim != len(self.axes) or layout:
+        usable = flags.c_contiguous and (flags.writeable or self.readonly)
+        if array.dtype != self.dtype or array.ndim != len(self.axes) or not usable:
+            layout = "" if flags.c_contiguous else "not contiguous, "
+            layout += "" if flags.writeable or self.readonly else "read-only, "
             raise TypeError(
-                f"{table}.{self.name}: got {array.dtype} of shape {array.shape}, {layout}{wanted}"
+                f"{table}.{self.name}: got {array.dtype} of shape {array.shape}, {layout}{self._wanted()}"
             )
         for axis, length in zip(self.axes, array.shape, strict=True):
             due = int(axis) if axis.isdigit() else lengths.setdefault(axis, length)
             if length != due:
                 raise TypeError(
-                    f"{table}.{self.name}: got shape {array.shape}, {wanted} where {axis} is {due}"
+                    f"{table}.{self.name}: got shape {array.shape}, {self._wanted()} where {axis} is {due}"
                 )
+
+    def _wanted(self) -> str:
+        """What a message says the array must be; made only for a message."""
+        return f"must be a contiguous, writable {self.dtype} array with axes ({', '.join(self.axes or ())})"
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Final
 import markdown_text as md
 
 import skinnode.solve
+from skinnode.solve.paths.corrector import Accuracy
 
 _NOT_TUNED: Final = {
     *("DECODE", "TAKE", "CHOOSE", "SOLVE", "REACH", "FINISH", "ALL_GOOD", "INCOMPLETE"),
@@ -23,9 +24,9 @@ _NOT_TUNED: Final = {
 
 
 def constants() -> str:
-    """Make one row for each numeric constant that has a docstring."""
+    """Make one row for each numeric constant, or accuracy, that has a docstring."""
     rows = [
-        (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), f"{value:g}", text)
+        (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), value, text)
         for module in _modules()
         for name, value, text in _documented(module)
     ]
@@ -38,7 +39,7 @@ def _modules() -> Iterator[ModuleType]:
             yield importlib.import_module(found.name)
 
 
-def _documented(module: ModuleType) -> Iterator[tuple[str, float, str]]:
+def _documented(module: ModuleType) -> Iterator[tuple[str, str, str]]:
     assert module.__file__ is not None
     with open(module.__file__, encoding="utf-8") as source:
         body = ast.parse(source.read()).body
@@ -51,8 +52,13 @@ def _documented(module: ModuleType) -> Iterator[tuple[str, float, str]]:
         ):
             name, value = line.target.id, getattr(module, line.target.id)
             tuned = name.isupper() and not name.startswith("_") and name not in _NOT_TUNED
-            if tuned and type(value) in (int, float):
-                yield name, value, md.prose(str(below.value.value))
+            if tuned and type(value) in (int, float, Accuracy):
+                shown = f"{value:g}" if isinstance(value, (int, float)) else _accuracy(value)
+                yield name, shown, md.prose(str(below.value.value))
+
+
+def _accuracy(value: Accuracy) -> str:
+    return f"{value.tolerance:g}, {value.max_steps} steps"
 
 
 TABLES: Final[dict[str, Callable[[], str]]] = {"solver-constants": constants}

@@ -25,6 +25,7 @@ from skinnode.solve.wires import arrays as wires
 GUIDED_STEPS: Final = 100
 """Maximum steps from a guided start: it is next to its root, 1 to 20 steps, or next to none."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
+"""Accuracy of a root that is only compared with another: below √eps two roots differ by far more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

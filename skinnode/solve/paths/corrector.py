@@ -86,6 +86,10 @@ class Corrector:
         position, steps, evaluations, optimality = zip(*self._rows, strict=True)
         return PathLog(np.array(position), np.array(steps), np.array(evaluations), np.array(optimality))
 
+    def sample_a(self, sample: int) -> Float:
+        """Return R · gain (U, K) of a sample, not to be written."""
+        return np.asarray(self._knots[sample + 1])
+
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
         """Log the ``evaluations`` (U,) that a start at the last sample took on these wires (U,)."""
         nothing = np.full(len(evaluations), math.nan)
@@ -133,11 +137,17 @@ class Corrector:
             ),
         )
         asked = todo != wires.LEAVE
+        steps, evaluations = solver.report[:, wires.STEPS], solver.report[:, wires.EVALUATIONS]
+        optimality = solver.measure[:, wires.OPTIMALITY]
+        if asked.all():
+            every = np.full(len(todo), position) if isinstance(position, float) else position
+            self._rows.append((every, steps.copy(), evaluations.copy(), optimality.copy()))
+            return
         self._rows.append(
             (
                 np.where(asked, position, math.nan),
-                np.where(asked, solver.report[:, wires.STEPS], 0),
-                np.where(asked, solver.report[:, wires.EVALUATIONS], 0),
-                np.where(asked, solver.measure[:, wires.OPTIMALITY], math.nan),
+                np.where(asked, steps, 0),
+                np.where(asked, evaluations, 0),
+                np.where(asked, optimality, math.nan),
             )
         )

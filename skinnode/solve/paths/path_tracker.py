@@ -112,7 +112,7 @@ class PathTracker:
     @property
     def last_a(self) -> Float:
         """(U, K) R · gain of the last sample."""
-        return self.corrector.a_at(self.corrector.last)
+        return self.corrector.sample_a(self.samples - 1)
 
     def restart(self) -> None:
         """Go back to the rest position."""
@@ -128,7 +128,7 @@ class PathTracker:
     def extrapolate(self, sample: int) -> None:
         """Move every wire towards a sample on the secant, by the trust radius at most."""
         (x_before, a_before), (x, a) = self._points
-        a_next = self.corrector.a_at(float(sample))
+        a_next = self.corrector.sample_a(sample)
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
 
     def solve(self, sample: int, accuracy: Accuracy) -> Index:
@@ -138,7 +138,7 @@ class PathTracker:
             (U,) steps; 0 if the first-order optimality was below the tolerance already.
         """
         self.corrector.correct(self._everywhere, float(sample), accuracy, tasks=wires.SKIP)
-        self._points = [self._points[1], (self.solver.x.copy(), self.corrector.a_at(float(sample)))]
+        self._points = [self._points[1], (self.solver.x.copy(), self.corrector.sample_a(sample))]
         known = self.solver.report[:, wires.BRANCH]
         self._crossed |= roots.crossed_fold(known, self._branch)
         self._branch = np.where(known != 0, known, self._branch)

@@ -44,15 +44,15 @@ class Rule:
 
 
 _HOLES: Final = ("scans with holes", "whole scans are missing")
-_LATE: Final = (*_HOLES, "scans end when the next has begun")
+_LATE: Final = (*_HOLES, "scans end after the next has begun")
 _OF_SYNC: Final = ("SYNCs are missing", "SYNC is irregular")
-_ERRORS: Final = ("emergency messages while it was watched", "the node reports an error")
+_ERRORS: Final = ("emergency messages during the examination", "the node reports an error")
 _CONFIGURED_BY_OTHERS: Final = (
     "the (chunk|summary) PDO .* is not where it belongs",
-    "chunks are not sent on event",
+    "chunks are not sent at events",
     "another inhibit time than the host sets",
-    "another heartbeat than wanted",
-    "no heartbeat: nobody sees it go",
+    "another heartbeat period than configured",
+    "no heartbeat: a loss of the node goes unnoticed",
     "the patch scans by its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
@@ -71,8 +71,8 @@ RULES: Final = (
         "two nodes have its node-ID",
         (
             "two different chunks with one number",
-            "frames that are no chunks of this patch",
-            "another patch than the hand file says",
+            "frames that are not chunks of this patch",
+            "the serial number differs from the hand file",
             *_LATE,
             *_ERRORS,
         ),
@@ -85,7 +85,7 @@ RULES: Final = (
             *_CONFIGURED_BY_OTHERS,
             "the node is .* while others run",
             "the node is .* and does not answer",
-            "it did not tell all about itself",
+            "not all its objects could be read",
             *_ERRORS,
         ),
         _RESTARTED,
@@ -93,32 +93,32 @@ RULES: Final = (
     Rule("(upper|lower) wires (open|shorted|out of range)", (*_ERRORS, "noise on .* wire"), _WIRE),
     Rule("the controller is", ("error frames on the bus", "no node of the hand answers", *_LATE), _ANYTHING),
     Rule(
-        "the interface has another bit rate",
+        "the bit rate of the interface differs",
         ("error frames on the bus", "no node of the hand answers", "the controller is", *_LATE),
         _ANYTHING,
     ),
     Rule(
-        "the interface failed while it was watched",
-        (*_LATE, *_OF_SYNC, "the node is .* and does not answer", "it did not tell all about itself"),
+        "the interface failed during the examination",
+        (*_LATE, *_OF_SYNC, "the node is .* and does not answer", "not all its objects could be read"),
         _ANYTHING,
     ),
     Rule(
         "two producers of SYNC",
         (
             "two masters with one heartbeat",
-            "somebody commands the nodes",
-            "SYNC has another period",
-            "another heartbeat than wanted",
+            "another device sends NMT commands",
+            "the SYNC period differs",
+            "another heartbeat period than configured",
             *_LATE,
             *_OF_SYNC,
             *_ERRORS,
         ),
         _OVERRUN,
     ),
-    Rule("two masters with one heartbeat", ("somebody commands the nodes", *_OF_SYNC), _ANYTHING),
+    Rule("two masters with one heartbeat", ("another device sends NMT commands", *_OF_SYNC), _ANYTHING),
     Rule(
-        "the bus is loaded above what plans allow",
-        (*_LATE, *_OF_SYNC, "this machine dropped frames", "it did not tell all about itself", *_ERRORS),
+        "the bus load exceeds the planning limit",
+        (*_LATE, *_OF_SYNC, "this machine dropped frames", "not all its objects could be read", *_ERRORS),
         _OVERRUN,
     ),
     Rule("this machine dropped frames", (*_HOLES, *_OF_SYNC), _ANYTHING),
@@ -128,15 +128,15 @@ RULES: Final = (
         (*_LATE, *_ERRORS),
         _OVERRUN,
     ),
-    Rule("SYNC has another period", (*_LATE, *_ERRORS), _OVERRUN),
+    Rule("the SYNC period differs", (*_LATE, *_ERRORS), _OVERRUN),
     Rule(
         ".*crossings? have no baseline|.*crossing has no baseline", (".*crossings? out of range",), _ANYTHING
     ),
-    Rule("its electrodes are elsewhere", ("codes of another width", "the EDS of the hand file"), _ANYTHING),
+    Rule("its layout differs", ("another code width than configured", "the EDS of the hand file"), _ANYTHING),
     Rule("SYNCs are missing", ("whole scans are missing", "SYNC is irregular"), _ANYTHING),
     Rule(
         "the node reports an error",
-        ("emergency messages while it was watched", "the node is .* while others run"),
+        ("emergency messages during the examination", "the node is .* while others run"),
         _ANYTHING,
     ),
 )

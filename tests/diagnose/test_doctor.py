@@ -154,7 +154,7 @@ def test_a_second_master(hand_file: HandFile, on: On) -> None:
         over.set()
         thread.join()
     assert found["can0: two producers of SYNC"][0] == "certain"
-    assert "can0: somebody commands the nodes" in found
+    assert "can0: another device sends NMT commands" in found
 
 
 def test_another_layout_serial_and_eds(hand_file: HandFile, on: On, tmp_path: Path) -> None:
@@ -168,9 +168,9 @@ def test_another_layout_serial_and_eds(hand_file: HandFile, on: On, tmp_path: Pa
     status, found = examine(wrong)
     assert status == 1
     assert found.keys() == {
-        "thumb: another patch than the hand file says",
-        "thumb: the EDS of the hand file is of another patch",
-        "thumb: its electrodes are elsewhere than the hand file says",
+        "thumb: the serial number differs from the hand file",
+        "thumb: the EDS of the hand file describes another patch",
+        "thumb: its layout differs from the hand file",
     }
 
 
@@ -221,7 +221,7 @@ def test_a_node_that_no_host_has_configured_is_no_fault(hand_file: HandFile, on:
     assert examine(file) == (0, {})
     done = run(["doctor", file, "--json", "--active"])
     what = {finding["what"] for finding in done.json["findings"]}
-    assert not what & {"a scan takes longer than a SYNC period", "scans end when the next has begun"}
+    assert not what & {"a scan takes longer than a SYNC period", "scans end after the next has begun"}
     assert not any("overrun" in finding["evidence"] for finding in done.json["findings"])
 
 

@@ -66,9 +66,9 @@ def scene() -> BusFacts:
 def test_an_overload_and_five_faults_are_in_order() -> None:
     groups = grouped([scene()])
     named = {f"{group.cause.where}: {group.cause.what}": group for group in groups}
-    assert next(iter(named)) == "can0: the bus is loaded above what plans allow"
+    assert next(iter(named)) == "can0: the bus load exceeds the planning limit"
     assert {name for name, group in named.items() if group.rank == 0} == {
-        "can0: the bus is loaded above what plans allow",
+        "can0: the bus load exceeds the planning limit",
         "palm: the node is not there",
         "thumb: the node restarts by itself",
         "index: upper wires open: 2",
@@ -76,18 +76,18 @@ def test_an_overload_and_five_faults_are_in_order() -> None:
     }
     assert [group.rank for group in groups] == sorted(group.rank for group in groups)
     assert groups[-1].cause.sure is Sure.POSSIBLE
-    overload = named["can0: the bus is loaded above what plans allow"]
+    overload = named["can0: the bus load exceeds the planning limit"]
     below = {(finding.where, finding.what) for finding in overload.consequences}
     assert ("ring", "scans with holes") in below
-    assert ("ring", "scans end when the next has begun") in below
-    assert ("ring", "emergency messages while it was watched") in below
+    assert ("ring", "scans end after the next has begun") in below
+    assert ("ring", "emergency messages during the examination") in below
     assert not any(where == "thumb" for where, _ in below)  # that it restarts is nearer
     restarts = named["thumb: the node restarts by itself"]
     assert {finding.what for finding in restarts.consequences} >= {"scans with holes"}
     wire = named["index: upper wires open: 2"]
-    assert {finding.what for finding in wire.consequences} == {"emergency messages while it was watched"}
+    assert {finding.what for finding in wire.consequences} == {"emergency messages during the examination"}
     places = {finding.what: where for finding, where in merged(overload.consequences)}
-    assert places["emergency messages while it was watched"] == ("middle", "ring")
+    assert places["emergency messages during the examination"] == ("middle", "ring")
 
 
 def test_nothing_is_lost_by_grouping() -> None:
@@ -104,7 +104,7 @@ def test_an_emergency_that_names_something_else_stands_alone() -> None:
     other = Emergency(0, 0x4200, 0x09, bytes(5))
     facts = bus_of(patch("ring", 5, emergencies=(OVERRUN, other)), load=0.93)
     causes = {group.cause.what for group in grouped([facts])}
-    assert "emergency messages while it was watched" in causes
+    assert "emergency messages during the examination" in causes
 
 
 def test_the_command_prints_causes_first(hand_file: Callable[..., Path], on: Callable[[Any], Any]) -> None:
@@ -139,5 +139,5 @@ def test_a_host_of_the_hand_is_neither_somebody_nor_unknown(
     done = run(["doctor", file, "--json"])
     told = {row["what"] for row in done.json["findings"]}
     assert "the node is not there" in told
-    assert "frames that nothing in the hand explains" not in told
-    assert "somebody commands the nodes" not in told
+    assert "frames of unknown origin" not in told
+    assert "another device sends NMT commands" not in told

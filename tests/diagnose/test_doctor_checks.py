@@ -41,11 +41,11 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
     [
         ({"failure": "can0: does not open"}, "the interface does not work", Sure.CERTAIN),
         ({"link_state": "BUS-OFF"}, "the controller is BUS-OFF", Sure.CERTAIN),
-        ({"link_bitrate_bps": 500_000}, "another bit rate", Sure.CERTAIN),
+        ({"link_bitrate_bps": 500_000}, "the bit rate of the interface differs", Sure.CERTAIN),
         ({"error_frames": 3}, "error frames", Sure.CERTAIN),
-        ({"load": 0.85}, "loaded above", Sure.CERTAIN),
+        ({"load": 0.85}, "exceeds the planning limit", Sure.CERTAIN),
         ({"outages": 1}, "the interface failed", Sure.CERTAIN),
-        ({"foreign": {0x3F0: 100}}, "nothing in the hand explains", Sure.POSSIBLE),
+        ({"foreign": {0x3F0: 100}}, "of unknown origin", Sure.POSSIBLE),
         ({"unconfigured": (LssAddress(0, 1, 2, 7),)}, "without a node-ID", Sure.CERTAIN),
         ({"strangers": (node(9),)}, "node 9 is not in the hand", Sure.CERTAIN),
         (
@@ -61,8 +61,8 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
             "two masters with one heartbeat",
             Sure.LIKELY,
         ),
-        ({"nmt_commands": 2}, "somebody commands the nodes", Sure.POSSIBLE),
-        ({"sync_s": 0.1 * np.arange(50)}, "another period", Sure.CERTAIN),
+        ({"nmt_commands": 2}, "another device sends NMT commands", Sure.POSSIBLE),
+        ({"sync_s": 0.1 * np.arange(50)}, "period differs", Sure.CERTAIN),
         ({"sync_s": np.delete(0.08 * np.arange(60), [20, 21])}, "SYNCs are missing", Sure.CERTAIN),
         (
             {"sync_s": 0.08 * np.arange(60) + 0.012 * (-1.0) ** np.arange(60) * (np.arange(60) % 3 == 0)},
@@ -100,7 +100,10 @@ def test_one_master_is_as_it_should_be(changes: dict[str, Any]) -> None:
         ({"found": node(product_code=1)}, "another device has its node-ID"),
         ({"found": node(boot_ups=3)}, "restarts by itself"),
         ({"boot_ups": 2}, "restarts by itself"),
-        ({"wanted": PatchConfig(name="thumb", node_id=5, serial=8)}, "another patch than the hand file says"),
+        (
+            {"wanted": PatchConfig(name="thumb", node_id=5, serial=8)},
+            "the serial number differs from the hand file",
+        ),
         ({"emergencies": (Emergency(0, 0x5000, 0x81, b"\0\1\1\0\0"),)}, "emergency messages"),
     ],
 )
@@ -206,7 +209,7 @@ def test_faults_are_found_while_somebody_touches_the_skin(
     n_open[seed, 5] = 4
     facts = scans_of(loose, told_noise=3e-6, n_open=n_open)
     assert {f.what for f in run_checks(bus_of(replace(WELL, scans=facts)))} == {
-        "1 crossing now and then open"
+        "1 crossing intermittently open"
     }
 
 
@@ -240,7 +243,7 @@ def test_frozen_values_and_a_frozen_node() -> None:
     flickers[30, 2, 5] += STEP
     assert not_judged(bus_of(replace(WELL, scans=scans_of(flickers, told_noise=3e-6)))) == []
     finding = skin(quiet_ratio(), device_us=np.full(50, 4711))
-    assert "the same scan again" in finding.what
+    assert "repeats the same scan" in finding.what
     assert finding.sure is Sure.CERTAIN
 
 
@@ -250,7 +253,7 @@ def test_drift_of_the_baseline() -> None:
     assert "+1.20 %" in finding.evidence.replace("%", " %")
     part = quiet_ratio()
     part[:, 0, :4] *= 0.97
-    assert skin(part).what == "a part of the skin is not at its baseline"
+    assert skin(part).what == "part of the skin is not at its baseline"
     assert skin(part).sure is Sure.POSSIBLE
 
 
@@ -266,18 +269,18 @@ def test_crossings_open_always_and_now_and_then() -> None:
     ]
     n_open[1], n_open[3, 5] = 0, 4
     finding = skin(ratio, n_open=n_open)
-    assert (finding.what, finding.sure) == ("1 crossing now and then open", Sure.LIKELY)
+    assert (finding.what, finding.sure) == ("1 crossing intermittently open", Sure.LIKELY)
 
 
 @pytest.mark.parametrize(
     ("counts", "what"),
     [
         ({"scans_torn": 2, "chunks_lost": 5}, "scans with holes"),
-        ({"scans_corrupt": 2}, "codes are not those that the node packed"),
-        ({"bad_form": 3}, "frames that are no chunks of this patch"),
+        ({"scans_corrupt": 2}, "codes differ from those that the node packed"),
+        ({"bad_form": 3}, "frames that are not chunks of this patch"),
         ({"scans_missed": 3}, "whole scans are missing"),
         ({"conflicts": 4}, "two different chunks with one number"),
-        ({"bad_length": 1}, "frames that are no chunks"),
+        ({"bad_length": 1}, "frames that are not chunks"),
     ],
 )
 def test_losses(counts: dict[str, int], what: str) -> None:
@@ -285,7 +288,7 @@ def test_losses(counts: dict[str, int], what: str) -> None:
 
 
 def test_scans_that_run_into_the_next() -> None:
-    assert "end when the next has begun" in skin(quiet_ratio(), latency_s=np.full(50, 0.079)).what
+    assert "end after the next has begun" in skin(quiet_ratio(), latency_s=np.full(50, 0.079)).what
 
 
 def test_few_scans_are_not_judged() -> None:

@@ -15,7 +15,7 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum share of SYNC counters that do not follow the one before. Two producers break half of them; lost
+"""Maximum share of SYNC counters that do not follow their predecessor. Two producers break half of them; lost
 SYNCs break few."""
 
 _BEATS: Final = 4
@@ -41,14 +41,14 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             f"the controller is {bus.link_state}",
             Sure.CERTAIN,
-            "the kernel says so (ip -details link show)",
+            "reported by the kernel (ip -details link show)",
             "check bit rate, cable and the two terminations of 120 ohm; then take the interface down and up",
         )
     if bus.link_bitrate_bps not in (None, bus.bitrate_bps):
         yield found(
-            "the interface has another bit rate than the hand file",
+            "the bit rate of the interface differs from the hand file",
             Sure.CERTAIN,
-            f"{bus.link_bitrate_bps} bit/s, the hand file says {bus.bitrate_bps}",
+            f"{bus.link_bitrate_bps} bit/s, hand file: {bus.bitrate_bps}",
             "set both to the same bit rate",
         )
     if bus.error_frames:
@@ -56,29 +56,29 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "error frames on the bus",
             Sure.CERTAIN,
             f"{bus.error_frames} in {bus.seconds:.1f} s",
-            "termination, bit rate of each node, length of stubs, a node that is not powered",
+            "check termination, bit rate of each node, length of stubs, power of each node",
         )
     if bus.load > MAX_BUS_LOAD:
         yield found(
-            "the bus is loaded above what plans allow",
+            "the bus load exceeds the planning limit",
             Sure.CERTAIN,
             f"{bus.load:.0%} in the busiest second, {MAX_BUS_LOAD:.0%} allowed",
-            "a longer sync.period_ms, send mode changed, or fewer patches on this bus",
+            "set a longer sync.period_ms, send mode changed, or fewer patches on this bus",
         )
     if bus.outages:
         yield found(
-            "the interface failed while it was watched",
+            "the interface failed during the examination",
             Sure.CERTAIN,
             counted(bus.outages, "time"),
-            "cable and power of the adapter; kernel log (dmesg)",
+            "check cable and power of the adapter, and the kernel log (dmesg)",
         )
     if bus.foreign:
         shown = ", ".join(f"0x{cob_id:03X}: {count}" for cob_id, count in Counter(bus.foreign).most_common(6))
         yield found(
-            "frames that nothing in the hand explains",
+            "frames of unknown origin",
             Sure.POSSIBLE,
             f"{shown} in {bus.seconds:.1f} s",
-            "fine if the bus is shared with drives or another master; else find who sends them",
+            "normal if drives or another master share the bus; otherwise find their sender",
         )
     for address in bus.unconfigured:
         yield found(
@@ -95,7 +95,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
 
-    stop_one = "one hand, one host: stop the other, or let the host be a guest (buses.role)"
+    stop_one = "one hand, one host: stop the other, or give this host the role guest (buses.role)"
     counters = [counter for counter in bus.sync_counters if counter]
     steps = list(pairwise(counters))
     astray = sum(after not in (before + 1, 1) for before, after in steps)
@@ -103,7 +103,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
         yield found(
             "two producers of SYNC",
             Sure.CERTAIN,
-            f"{astray} of {len(steps)} SYNC counters do not follow the one before",
+            f"{astray} of {len(steps)} SYNC counters do not follow their predecessor",
             stop_one,
         )
     if bus.master_beats_s is not None and len(bus.master_beats_s) >= _BEATS and bus.heartbeat_ms:
@@ -112,14 +112,14 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
             yield found(
                 "two masters with one heartbeat",
                 Sure.LIKELY,
-                f"node-ID {bus.master_node_id} beats every {period_s * 1e3:.0f} ms, "
-                f"the hand file says {bus.heartbeat_ms}",
+                f"node-ID {bus.master_node_id} has a heartbeat every {period_s * 1e3:.0f} ms, "
+                f"hand file: {bus.heartbeat_ms}",
                 stop_one,
             )
     if bus.nmt_commands and bus.role == "master" and not any(patch.boot_ups for patch in bus.patches):
         yield found(
-            "somebody commands the nodes",
+            "another device sends NMT commands",
             Sure.POSSIBLE,
             f"{counted(bus.nmt_commands, 'NMT command')} in {bus.seconds:.1f} s",
-            f"fine while a host starts; else a second master: {stop_one}",
+            f"normal while a host starts; otherwise there is a second master: {stop_one}",
         )

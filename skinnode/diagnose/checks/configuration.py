@@ -28,10 +28,10 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
         yield Finding(
             "configuration",
             patch.name,
-            "the EDS of the hand file is of another patch",
+            "the EDS of the hand file describes another patch",
             Sure.CERTAIN,
             patch.eds_problem,
-            "skinnode eds writes the right one",
+            "write the right one with skinnode eds",
         )
     if wanted is None:
         return
@@ -39,7 +39,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
         yield Finding(
             "configuration",
             patch.name,
-            "its electrodes are elsewhere than the hand file says",
+            "its layout differs from the hand file",
             Sure.CERTAIN,
             f"layout hash 0x{own.layout_hash:08X} ({own.layout}, {own.upper_wires} × {own.lower_wires} "
             f"wires), wanted 0x{patch.layout_hash:08X}",
@@ -49,9 +49,9 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
         yield Finding(
             "configuration",
             patch.name,
-            "codes of another width",
+            "another code width than configured",
             Sure.CERTAIN,
-            f"{own.code_bits} bits, the hand file says {wanted.code_bits}",
+            f"{own.code_bits} bits, hand file: {wanted.code_bits}",
             "correct code_bits in the hand file",
         )
 
@@ -66,7 +66,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("configuration", patch.name, what, sure, evidence, advice)
 
-    again = "skinnode host sets it at bring-up: who else writes to the node?"
+    again = "skinnode host sets it at bring-up: find what else writes to the node"
     pdos = {(pdo.direction, pdo.number): pdo for pdo in info.pdos}
     chunk, summary = pdos.get(("TPDO", 1)), pdos.get(("TPDO", 2))
     running = patch.found.state == "operational"
@@ -82,7 +82,7 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     if chunk is not None and bus.period_s is not None and chunk.inhibit_100us is not None:
         yield from _check_inhibit(bus.period_s, patch, chunk, running, found)
     if chunk is not None and chunk.kind < 254:
-        yield found("chunks are not sent on event", Sure.CERTAIN, f"transmission type {chunk.kind}", again)
+        yield found("chunks are not sent at events", Sure.CERTAIN, f"transmission type {chunk.kind}", again)
     if running and info.patch.period_ms:
         yield found(
             "the patch scans by its own timer, not at SYNC",
@@ -91,10 +91,10 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             f"write 0: skinnode od {patch.node_id} 2021:1 --write 0; patches then scan at the same instant",
         )
     if running and info.heartbeat_ms == 0:
-        yield found("no heartbeat: nobody sees it go", Sure.CERTAIN, "0x1017 is 0", again)
+        yield found("no heartbeat: a loss of the node goes unnoticed", Sure.CERTAIN, "0x1017 is 0", again)
     elif running and bus.heartbeat_ms is not None and info.heartbeat_ms not in (None, bus.heartbeat_ms):
-        evidence = f"every {info.heartbeat_ms} ms, the hand file says {bus.heartbeat_ms}"
-        yield found("another heartbeat than wanted", Sure.POSSIBLE, evidence, again)
+        evidence = f"every {info.heartbeat_ms} ms, hand file: {bus.heartbeat_ms}"
+        yield found("another heartbeat period than configured", Sure.POSSIBLE, evidence, again)
 
 
 def _check_inhibit(
@@ -114,12 +114,12 @@ def _check_inhibit(
             Sure.CERTAIN,
             f"{chunks} chunks {inhibit_s * 1e3:g} ms apart are {chunks * inhibit_s * 1e3:.0f} ms, "
             f"the period is {period_s * 1e3:g} ms",
-            "a shorter inhibit time (0x1800:3) or a longer sync.period_ms",
+            "set a shorter inhibit time (0x1800:3) or a longer sync.period_ms",
         )
     elif running and patch.inhibit_100us is not None and chunk.inhibit_100us != patch.inhibit_100us:
         yield found(
             "another inhibit time than the host sets",
             Sure.POSSIBLE,
             f"{chunk.inhibit_100us} × 100 µs, the host sets {patch.inhibit_100us}",
-            "fine if another master configures the patches",
+            "normal if another master configures the patches",
         )

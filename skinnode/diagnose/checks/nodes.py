@@ -23,7 +23,7 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
             "no node of the hand answers",
             Sure.CERTAIN,
             f"{len(bus.patches)} asked, {counted(bus.frames, 'frame')} heard in {bus.seconds:.1f} s",
-            "supply of the patches, cable, termination, bit rate, channel",
+            "check supply of the patches, cable, termination, bit rate, channel",
         )
         return
     for patch in bus.patches:
@@ -59,7 +59,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the node is not there",
             Sure.CERTAIN,
             f"node {patch.node_id} neither answers SDO nor sends heartbeats; other nodes on {bus.name} do",
-            "its supply and connector; skinnode scan shows whether it has another node-ID",
+            "check its supply and connector; skinnode scan shows whether it has another node-ID",
         )
         return
     if node.duplicate:
@@ -70,8 +70,9 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "unplug one and give it another node-ID: skinnode lss set --serial …",
         )
     if not node.answers:
+        standard = " as CiA 301 requires" if node.wrong_answer else ""
         yield found(
-            f"the node is {node.state} and does not answer{' as CiA 301 says' if node.wrong_answer else ''}",
+            f"the node is {node.state} and does not answer{standard}",
             Sure.CERTAIN,
             "its heartbeat is heard" + (f"; it {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
             f"skinnode nmt {patch.node_id} reset-communication",
@@ -87,10 +88,10 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         return
     if wanted is not None and wanted.serial not in (None, node.serial):
         yield found(
-            "another patch than the hand file says",
+            "the serial number differs from the hand file",
             Sure.CERTAIN,
-            f"serial {known(node.serial)}, the hand file says {wanted.serial}",
-            "two patches exchanged? Put them back, or correct the hand file and its calibration",
+            f"serial {known(node.serial)}, hand file: {wanted.serial}",
+            "if two patches were exchanged, put them back, or correct the hand file and its calibration",
         )
     yield from _check_state(bus, patch, node)
 
@@ -101,22 +102,20 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
 
     info = patch.info
     if patch.failure:
-        yield found(
-            "it did not tell all about itself", Sure.CERTAIN, patch.failure, "skinnode info shows more"
-        )
+        yield found("not all its objects could be read", Sure.CERTAIN, patch.failure, "see skinnode info")
     if patch.boot_ups or node.boot_ups:
         yield found(
             "the node restarts by itself",
             Sure.CERTAIN,
             f"{counted(max(patch.boot_ups, node.boot_ups), 'boot-up message')} in {bus.seconds:.1f} s",
-            "supply voltage under load, connector, watchdog of the board",
+            "check supply voltage under load, connector, watchdog of the board",
         )
     if bus.running and node.state != "operational":
         yield found(
             f"the node is {node.state} while others run",
             Sure.LIKELY,
             f"NMT state by {node.state_known_by}",
-            "see its errors below; a host that runs takes it up again when they are gone",
+            "see its errors below; a running host starts it again when they are gone",
         )
     if info is not None and info.error_register:
         yield found(
@@ -133,5 +132,5 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
         )
         shown = "; ".join(f"{count} × {text}" for text, count in kinds.most_common(3))
         yield found(
-            "emergency messages while it was watched", Sure.CERTAIN, shown, "fix the faults they name"
+            "emergency messages during the examination", Sure.CERTAIN, shown, "fix the faults they name"
         )

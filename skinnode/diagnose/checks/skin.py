@@ -44,13 +44,13 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
         if own is not None:
             upper, lower = {*own.open_upper, *own.shorted_upper}, {*own.open_lower, *own.shorted_lower}
             for what, wires, advice in (
-                ("upper wires open", own.open_upper, "connector and solder joint of these wires"),
-                ("lower wires open", own.open_lower, "connector and solder joint of these wires"),
-                ("upper wires shorted", own.shorted_upper, "a short to a lower wire, or moisture"),
-                ("lower wires shorted", own.shorted_lower, "a short to an upper wire, or moisture"),
+                ("upper wires open", own.open_upper, "check connector and solder joint of these wires"),
+                ("lower wires open", own.open_lower, "check connector and solder joint of these wires"),
+                ("upper wires shorted", own.shorted_upper, "look for a short to a lower wire, or moisture"),
+                ("lower wires shorted", own.shorted_lower, "look for a short to an upper wire, or moisture"),
             ):
                 if wires:
-                    by = "the node says so (0x2030, 0x2031)"
+                    by = "reported by the node (0x2030, 0x2031)"
                     yield Finding("wires", patch.name, f"{what}: {_listed(wires)}", Sure.CERTAIN, by, advice)
         if patch.scans is not None and patch.scans.scans:
             yield from _check_crossings(patch, patch.scans, upper, lower)
@@ -65,9 +65,13 @@ def _check_crossings(
     rest[sorted(upper), :] = False
     rest[:, sorted(lower)] = False
     for what, counts, advice in (
-        ("open", scans.n_open, "a broken electrode or wire; values there are left out"),
-        ("shorted", scans.n_short, "the rubber is squeezed through, or moisture"),
-        ("out of range", scans.n_over, "no baseline, an old one, or pressed beyond the range: tare at rest"),
+        ("open", scans.n_open, "look for a broken electrode or wire; its values are left out"),
+        ("shorted", scans.n_short, "the rubber is pressed through, or there is moisture"),
+        (
+            "out of range",
+            scans.n_over,
+            "tare at rest if the baseline is missing or old; a press may exceed the range",
+        ),
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
         for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
@@ -78,7 +82,7 @@ def _check_crossings(
                     f"{side} wires {what}: {_listed(tuple(int(i) for i in np.flatnonzero(wires)))}",
                     Sure.CERTAIN,
                     f"every crossing, {_in_all(scans)}",
-                    "connector and solder joint of these wires" if what == "open" else advice,
+                    "check connector and solder joint of these wires" if what == "open" else advice,
                 )
         always &= ~(always.all(axis=1, keepdims=True) | always.all(axis=0, keepdims=True))
         if always.any():
@@ -94,10 +98,10 @@ def _check_crossings(
             yield Finding(
                 "wires",
                 patch.name,
-                f"{_crossings(sometimes)} now and then {what}",
+                f"{_crossings(sometimes)} intermittently {what}",
                 Sure.LIKELY if what == "open" else Sure.POSSIBLE,
                 f"in up to {int(counts[sometimes].max())} of {scans.scans} scans: {_places(sometimes)}",
-                "a loose contact: move the cable and watch" if what == "open" else advice,
+                "look for a loose contact: move the cable and watch" if what == "open" else advice,
             )
 
 
@@ -115,7 +119,7 @@ def check_noise(bus: BusFacts) -> Iterator[Finding]:
                 Sure.POSSIBLE,
                 f"{_places(analysis.steps)}; at {row}/{column} by {analysis.step_by[row, column]:.2%} of R0, "
                 f"scan {int(analysis.step_at[row, column]) + 1}",
-                "a loose contact, unless somebody touched the skin there just then",
+                "look for a loose contact, unless the skin was touched there",
             )
 
 
@@ -142,7 +146,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
             f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
             if all_alike
             else f"all crossings together, {analysis.supply:.0f} times the stated noise, {over}",
-            "supply and shield of the patch; is relative_noise in the hand file the converter's?",
+            "check supply and shield of the patch, and relative_noise in the hand file",
         )
         return
     names = [
@@ -153,13 +157,13 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
     ]
     if names:
         shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
-        yield found(f"noise on {shown}", Sure.LIKELY, figures, "a bad contact of that wire")
+        yield found(f"noise on {shown}", Sure.LIKELY, figures, "check the contact of that wire")
     elif noisy.any() and not analysis.is_touched:
         yield found(
             f"noise at {_crossings(noisy)}",
             Sure.POSSIBLE,
             f"{_places(noisy)}; {figures}",
-            "a bad contact at the electrodes, or a light touch",
+            "check the contact at the electrodes, unless the skin is touched lightly",
         )
 
 
@@ -175,10 +179,10 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
         yield Finding(
             "wires",
             patch.name,
-            "the node sends the same scan again and again",
+            "the node repeats the same scan",
             Sure.CERTAIN,
-            f"its clock stands still over {len(device)} scans",
-            "reset the node; its sampling has stopped",
+            f"its clock did not change over {len(device)} scans",
+            "its sampling has stopped: reset the node",
         )
     known, still = _still(scans)
     if _shows(scans) and known.any() and still.sum() > _MANY * known.sum():
@@ -189,7 +193,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             Sure.LIKELY,
             f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
             f"though the stated noise is {scans.told_noise:.0e} and a code is {scans.step:.0e}",
-            "the converter has stopped: power the patch off and on",
+            "the converter has stopped: switch the patch off and on",
         )
 
 
@@ -221,7 +225,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 f"{counted(own.baseline_missing, 'crossing has', 'crossings have')} no baseline",
                 Sure.CERTAIN,
                 "R0 is 0 (0x2301)",
-                f"leave the skin alone: skinnode tare {patch.node_id}",
+                f"with nothing touching the skin: skinnode tare {patch.node_id}",
             )
     for patch, scans, analysis in _judged(bus):
         at_rest = np.isfinite(analysis.level) & ~analysis.touched & ~analysis.steps
@@ -239,16 +243,16 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 "the baseline is no longer that of the skin at rest",
                 Sure.LIKELY,
                 figures,
-                "temperature or age: skinnode tare with nothing touching the skin",
+                "temperature or age changed it: skinnode tare with nothing touching the skin",
             )
         elif share > 0.02 and not analysis.is_touched:
             yield Finding(
                 "baseline",
                 patch.name,
-                "a part of the skin is not at its baseline",
+                "part of the skin is not at its baseline",
                 Sure.POSSIBLE,
                 figures,
-                "something presses there; if nothing does, skinnode tare",
+                "if nothing presses there, skinnode tare",
             )
 
 

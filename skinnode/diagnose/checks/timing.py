@@ -34,7 +34,7 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
                 Sure.CERTAIN,
                 f"none in {bus.seconds:.1f} s, and "
                 + ("nodes are operational" if bus.running else "the host is a guest here"),
-                "is the host, or the robot's master, running? Patches scan at SYNC alone",
+                "start the host, or the robot's master: patches scan only at SYNC",
             )
     yield from _check_sync(bus)
     for patch in bus.patches:
@@ -45,10 +45,10 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
         if len(latency_s) and float(np.median(latency_s)) > _LATE * period_s:
             yield found(
                 patch.name,
-                "scans end when the next has begun",
+                "scans end after the next has begun",
                 Sure.CERTAIN,
                 f"median {np.median(latency_s) * 1e3:.1f} ms after SYNC, period {period_s * 1e3:g} ms",
-                "a shorter inhibit time, a longer period, less load on the bus",
+                "set a shorter inhibit time or a longer period, or reduce the load on the bus",
             )
 
 
@@ -64,10 +64,10 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
         if bus.period_s is not None and abs(period_s / bus.period_s - 1) > _PERIOD_ERROR:
             yield found(
                 bus.name,
-                "SYNC has another period than the hand file",
+                "the SYNC period differs from the hand file",
                 Sure.CERTAIN,
-                f"{period_s * 1e3:.2f} ms, the hand file says {bus.period_s * 1e3:g} ms",
-                "two masters, or another hand file in use",
+                f"{period_s * 1e3:.2f} ms, hand file: {bus.period_s * 1e3:g} ms",
+                "look for a second master, or another hand file in use",
             )
         missing = int(np.sum(np.rint(intervals / period_s) - 1))
         if missing > 0:
@@ -76,7 +76,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 "SYNCs are missing",
                 Sure.CERTAIN,
                 f"{missing} of {len(intervals) + missing}",
-                "the machine that sends SYNC is overloaded, or the bus loses frames",
+                "check the load of the machine that sends SYNC, and the bus",
             )
         regular = intervals[intervals < 1.5 * period_s]
         jitter_s = float(np.percentile(np.abs(regular - period_s), 99)) if len(regular) else 0.0
@@ -86,7 +86,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 "SYNC is irregular",
                 Sure.LIKELY,
                 f"99 % within {jitter_s * 1e3:.1f} ms of a period of {period_s * 1e3:.1f} ms",
-                "load of the machine that sends it; a real-time priority for the host",
+                "reduce the load of the machine that sends it; give the host a real-time priority",
             )
 
 
@@ -102,7 +102,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
             "this machine dropped frames",
             Sure.CERTAIN,
             f"{bus.dropped} of {bus.frames + bus.dropped}, by the kernel or the receive queue",
-            "raise net.core.rmem_max, less load; what is said of scans below may come from this",
+            "raise net.core.rmem_max, reduce the load; the findings on scans below may follow from this",
         )
     for patch in bus.patches:
         if patch.scans is None:
@@ -115,7 +115,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 Sure.LIKELY if bus.dropped else Sure.CERTAIN,
                 f"{stats.scans_torn} of {scans} torn, {counted(stats.chunks_lost, 'chunk')} and "
                 f"{counted(stats.summaries_lost, 'summary', 'summaries')} lost",
-                "bus errors, load, or a node that is interrupted; compare with the other patches",
+                "check bus errors and load; compare with the other patches",
             )
         if stats.scans_missed:
             yield found(
@@ -123,7 +123,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 "whole scans are missing",
                 Sure.CERTAIN,
                 f"{stats.scans_missed} of {scans + stats.scans_missed}",
-                "the node skips scans (EMCY 0x8110) when they take longer than the period",
+                "the node skips scans (EMCY 0x8110) that take longer than the period",
             )
         if stats.conflicts:
             yield found(
@@ -131,12 +131,12 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 "two different chunks with one number",
                 Sure.LIKELY,
                 counted(stats.conflicts, "time"),
-                "two nodes with one node-ID: skinnode scan",
+                "look for two nodes with one node-ID: skinnode scan",
             )
         if stats.scans_corrupt:
             yield found(
                 patch.name,
-                "codes are not those that the node packed",
+                "codes differ from those that the node packed",
                 Sure.CERTAIN,
                 f"the check of {stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed",
                 "check gateways on the path, memory and software of the node; CAN itself detects bus errors",
@@ -145,9 +145,9 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
         if wrong:
             yield found(
                 patch.name,
-                "frames that are no chunks of this patch",
+                "frames that are not chunks of this patch",
                 Sure.CERTAIN,
                 f"{stats.bad_length} of wrong length, {stats.bad_index} of wrong index, "
                 f"{stats.bad_counter} of wrong counter, {stats.bad_form} summaries without a check",
-                "another node uses its COB-IDs, or its mapping was changed",
+                "look for a node that uses its COB-IDs, and check its PDO mapping",
             )

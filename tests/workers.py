@@ -27,6 +27,12 @@ WORKERS = 5
 REAL_TIME = "real_time"
 """Marker and group of the tests that count frames in real time and would disturb each other."""
 
+RANKS = {REAL_TIME: 0, None: 2}
+"""Order of the groups: real time takes longest, and its worker has priority."""
+
+NICE = 3
+"""Niceness of all workers but the first, so that they keep real-time tests from running less often."""
+
 WHOLE, GROUPS = "skinnode_whole", "skinnode_groups"
 """Keys under which a worker learns whether the whole suite runs, and where to write the groups."""
 
@@ -49,12 +55,16 @@ def group_of(item: pytest.Item) -> str | None:
 
 
 class Scheduler(LoadScopeScheduling):
-    """Deal groups first, the largest before the others, then single tests.
+    """Deal groups, then single tests, in the order of collection: the first worker gets the first group.
 
     xdist's own ``--dist loadgroup`` tells groups by a suffix of the node ID, which pytest 9.2 does not let it
     add."""
 
     _groups: dict[str, str] | None = None
+
+    def __init__(self, config: pytest.Config, log: Any) -> None:
+        super().__init__(config, log)
+        config.option.loadscopereorder = False
 
     def _split_scope(self, nodeid: str) -> str:
         if self._groups is None:  # all workers have collected, and wrote the same
@@ -67,6 +77,8 @@ FOLDER = pytest.StashKey[Path]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config, "workerinput") and config.workerinput["workerid"] != "gw0":
+        os.nice(NICE)
     for name in ("COLUMNS", "LINES"):  # workers get a width of 80, and what is printed would be wrapped
         os.environ.pop(name, None)
     if not is_whole(config):
@@ -105,5 +117,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("long")])
         items[:] = [item for item in items if not item.get_closest_marker("long")]
     if hasattr(config, "workerinput"):
+        ranks = {item: RANKS.get(group_of(item), 1) for item in items}
+        items.sort(key=ranks.__getitem__)
         groups = {item.nodeid: group for item in items if (group := group_of(item)) is not None}
         Path(config.workerinput[GROUPS]).write_text(json.dumps(groups))

@@ -212,6 +212,7 @@ def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
     assert "160 ms, the period is 25 ms" in found["thumb: a scan takes longer than a SYNC period"][1]
 
 
+@pytest.mark.real_time
 def test_a_node_that_no_host_has_configured_is_no_fault(hand_file: HandFile, on: On) -> None:
     """Its default inhibit time suits the default period; bring-up writes one that suits the hand's period."""
     file = hand_file()

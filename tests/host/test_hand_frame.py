@@ -125,6 +125,7 @@ def take(frames: HandSubscription, count: int) -> list[HandFrame]:
     return list(itertools.islice(frames, count))
 
 
+@pytest.mark.real_time
 def test_of_a_running_hand(hand: HandConfig, fleet: Fleet) -> None:
     with Host.from_config(hand) as host:
         frames = take(host.hands(timeout_s=10), 10)
@@ -135,6 +136,7 @@ def test_of_a_running_hand(hand: HandConfig, fleet: Fleet) -> None:
         assert {one.stamp.t_sync_ns for one in frame.fields.values() if one.stamp} == {frame.t_sync_ns}
 
 
+@pytest.mark.real_time
 def test_one_after_the_other_as_async_for(hand: HandConfig, fleet: Fleet) -> None:
     async def gather(host: Host) -> list[HandFrame]:
         frames = []

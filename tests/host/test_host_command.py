@@ -203,6 +203,7 @@ def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfi
         assert f"fault: {patch}: lost at the end" in host.lines
 
 
+@pytest.mark.real_time
 def test_summaries_that_are_lost_are_said_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -354,6 +355,7 @@ def held_up_until(source: Busy, said: Callable[[], bool]) -> bool:
     return False
 
 
+@pytest.mark.real_time
 def test_an_overrun_that_was_taken_back_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer that is too slow for its nodes is no fault of the skin."""
     table = TABLE.format(interface="virtual", channel=uuid.uuid4().hex, layout=LAYOUT)

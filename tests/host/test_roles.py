@@ -59,6 +59,7 @@ def of_nodes(port: CanPort) -> set[int]:
     return {base + node_id for base in (0x080, 0x180, 0x280, 0x580, 0x700) for node_id in (5, 6)}
 
 
+@pytest.mark.real_time
 def test_a_guest_that_may_send_nothing_sends_nothing_and_hears_all(
     crossing_hand: HandConfig, rack_of: Callable[[HandConfig], Rack], tmp_path: Path,
     listener_of: Callable[[HandConfig], CanPort],

@@ -136,6 +136,7 @@ def test_callbacks_are_called_until_they_are_closed(hand: HandConfig, fleet: Fle
     assert {one.stamp.patch for one in of_one if one.stamp} == {"p1"}
 
 
+@pytest.mark.real_time
 def test_a_callback_that_raises_or_blocks_loses_its_own_data_only(
     hand: HandConfig, fleet: Fleet, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -47,6 +47,7 @@ def waiting(hand: HandConfig, **tables: Any) -> HandConfig:
     return parse_hand({**table, "bring_up": {"missing": "wait"}, **tables})
 
 
+@pytest.mark.real_time
 def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
     crossing_hand: HandConfig, rack_of: Callable[[HandConfig], Rack]
 ) -> None:

@@ -81,6 +81,7 @@ def test_shear_is_an_arrow_the_way_it_goes() -> None:
         in_app(source, play)
 
 
+@pytest.mark.real_time
 def test_a_dead_node_is_named_and_its_last_map_is_not_taken_for_now() -> None:
     hand = a_hand()
     with Fleet(hand) as fleet, Host.from_config(hand) as host, HostSource(host) as source:

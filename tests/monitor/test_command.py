@@ -48,6 +48,7 @@ def test_json_of_a_hand_that_is_not_there_is_a_fault(
     assert done.stderr.splitlines() == ["fault: p0: never seen", "fault: p1: never seen"]
 
 
+@pytest.mark.real_time
 def test_json_of_a_recording(tmp_path: Path) -> None:
     hand, path = a_hand(2, sync={"period_ms": 200}), tmp_path / "run.log"
     with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):

@@ -292,6 +292,7 @@ for line in sys.stdin:
 """
 
 
+@pytest.mark.real_time
 def test_killed_at_any_moment(path: Path) -> None:
     """50 processes that do nothing but save are killed. What is left is one of their configurations."""
     names: dict[str, Any] = {}

@@ -53,12 +53,12 @@ def _documented(module: ModuleType) -> Iterator[tuple[str, str, str]]:
             name, value = line.target.id, getattr(module, line.target.id)
             tuned = name.isupper() and not name.startswith("_") and name not in _NOT_TUNED
             if tuned and type(value) in (int, float, Accuracy):
-                shown = f"{value:g}" if isinstance(value, (int, float)) else _accuracy(value)
-                yield name, shown, md.prose(str(below.value.value))
-
-
-def _accuracy(value: Accuracy) -> str:
-    return f"{value.tolerance:g}, {value.max_steps} steps"
+                text = md.prose(str(below.value.value))
+                if isinstance(value, Accuracy):
+                    yield f"{name}.tolerance", f"{value.tolerance:g}", text
+                    yield f"{name}.max_steps", f"{value.max_steps}", text
+                else:
+                    yield name, f"{value:g}", text
 
 
 TABLES: Final[dict[str, Callable[[], str]]] = {"solver-constants": constants}

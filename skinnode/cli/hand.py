@@ -238,7 +238,7 @@ name = "hand"
 period_ms = {period_ms}                    # one SYNC is one scan of every patch: {rate} a second
 
 [stream]
-partial = "pass"                  # incomplete scans: "pass" them on with a mask, or "withhold"
+partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"
 """
 _NEW_BUS = """
 [[buses]]

@@ -154,7 +154,6 @@ class ExactTracker:
     def _advance(self, stages: int, start: float) -> FieldFrame:
         """Return the field of the frame in :attr:`arrays`; run ``stages`` before its solve."""
         solver, arrays = self._stream.solver, self.arrays
-        solver.turn += 1
         sigma, until, units = self._sigma, start + self._seconds, math.inf
         if self._leaves_out:
             sigma, _ = self._call_stages(stages, sigma, units)

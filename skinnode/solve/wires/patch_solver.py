@@ -121,7 +121,7 @@ class PatchSolver:
         self.tally = np.zeros(3, np.int64)
         """Evaluations of F, of J and steps of all calls since its owner set it to zero."""
         self.turn = np.zeros(1, np.int64)
-        """(1,) number of the frame, counted by the owner: says which wire gets a new inverse, if any is
+        """(1,) number of the frame, counted by SCALE: says which wire gets a new inverse, if any is
         reused."""
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviation of the coordinates that are not unknowns, pitches."""

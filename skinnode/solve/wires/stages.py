@@ -36,6 +36,7 @@ def start(solver: SolverArrays, frame: FrameArrays) -> None:
         report[u, wires.STATUS] = DEADLINE
         for i in range(wires.MEASURES):
             measure[u, i] = math.inf
+    solver.turn[0] += 1
     tally = solver.tally
     for i in range(tally.size):
         tally[i] = 0

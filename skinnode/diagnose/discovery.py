@@ -203,7 +203,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
     if not duplicate and identity[:2] == [od.VENDOR_ID, od.PRODUCT_CODE]:
         strangers = _number(connection, node_id, od.REJECTED_FRAMES, 7)
         if strangers:
-            duplicate = f"the node heard its own node-ID from somebody else {strangers} times (0x2040:7)"
+            duplicate = f"the node received its own node-ID from another node {strangers} times (0x2040:7)"
     heartbeat_s = connection.heartbeat_s(node_id)
     state = connection.state(node_id, heartbeat_s, guarding=not connection.guarded(node_id))
     return FoundNode(

@@ -64,7 +64,7 @@ class ScanFacts:
     """(T,)"""
     step: float
     """One code as a share of R0."""
-    told_noise: float
+    stated_noise: float
     """Relative noise of the converter in the hand file."""
     stats: AssemblerStats
 

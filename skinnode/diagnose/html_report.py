@@ -111,7 +111,7 @@ def _maps(scans: ScanFacts) -> str:
     title = "noise / stated noise, grey: none" + (
         ", including the effect of a touch" if analysis.is_touched else ""
     )
-    _map(figure, axes[0], analysis.noise / analysis.told, title, "viridis", 0.0, None)
+    _map(figure, axes[0], analysis.noise / analysis.stated, title, "viridis", 0.0, None)
     off = 100 * (analysis.level - 1.0)
     known = off[np.isfinite(off)]
     limit = max(0.05, float(np.abs(known).max())) if known.size else 1.0

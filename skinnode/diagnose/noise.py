@@ -55,7 +55,7 @@ class NoiseAnalysis:
 
     noise: Float
     """Noise relative to R0, with the rest that a touch leaves; NaN if unknown."""
-    told: Float
+    stated: Float
     """Noise that converter and codes explain."""
     level: Float
     """Median R/R0."""
@@ -88,23 +88,23 @@ def analyse_noise(scans: ScanFacts) -> NoiseAnalysis:
     known: Mask = np.asarray(np.isfinite(ratio).all(axis=0))
     safe = np.where(known, ratio, 1.0)
     level = np.median(safe, axis=0)
-    told = np.hypot(scans.told_noise * level, scans.step / np.sqrt(12.0))
-    moved = (safe - safe.mean(axis=0)) / told
-    rough, alone = _roughness(safe) / told, _unexplained(moved)
+    stated = np.hypot(scans.stated_noise * level, scans.step / np.sqrt(12.0))
+    moved = (safe - safe.mean(axis=0)) / stated
+    rough, alone = _roughness(safe) / stated, _unexplained(moved)
     noise = np.minimum(rough, alone)
     touched = known & (moved.std(axis=0) > np.maximum(_MOVED, _EXPLAINED * alone))
     at, by, still = _steps(safe)
     common = np.median(safe[:, known], axis=1) if known.any() else np.ones(len(safe))
-    supply = float(_roughness(common) / np.median(told))
+    supply = float(_roughness(common) / np.median(stated))
     uneven = (
-        float(np.median((_roughness(safe / common[:, None, None]) / told)[known])) if known.any() else 0.0
+        float(np.median((_roughness(safe / common[:, None, None]) / stated)[known])) if known.any() else 0.0
     )
     return NoiseAnalysis(
-        noise=np.where(known, noise * told, np.nan),
-        told=told,
+        noise=np.where(known, noise * stated, np.nan),
+        stated=stated,
         level=np.where(known, level, np.nan),
         touched=touched,
-        steps=known & ~touched & (by > _STEP * told) & still,
+        steps=known & ~touched & (by > _STEP * stated) & still,
         step_at=at,
         step_by=by,
         upper=_of_wires(moved, noise, known),

@@ -76,13 +76,13 @@ class ScanCapture:
         """Note a SYNC that was heard or sent."""
         self.syncs.append((t_ns, counter))
 
-    def facts(self, node_id: int, scale: CodeScale, told_noise: float) -> ScanFacts | None:
+    def facts(self, node_id: int, scale: CodeScale, stated_noise: float) -> ScanFacts | None:
         """Return the scans of a patch; None if there are none.
 
         Args:
             node_id: The node.
             scale: Scale of its codes.
-            told_noise: Relative noise of its converter in the hand file.
+            stated_noise: Relative noise of its converter in the hand file.
         """
         patch = self._patches[node_id]
         patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)
@@ -104,7 +104,7 @@ class ScanCapture:
             device_us=np.array(device, dtype=np.int64),
             complete=np.array([scan.complete for scan, _ in scans]),
             step=scale.step,
-            told_noise=told_noise,
+            stated_noise=stated_noise,
             stats=patch.assembler.stats,
         )
 

@@ -134,7 +134,7 @@ class Recorder:
         self._at = dict.fromkeys(self._channels, 0)
         self._bus_of = {patch.name: patch.bus for patch in hand.patches}
         self._solvers: dict[str, ScanSolver] = {}
-        self._lost = self._lost_told = 0
+        self._lost = self._lost_reported = 0
         self._defects = Defects(str(path))
         self._flush_s = self._sync_s = time.monotonic()
         self._ended = False
@@ -246,8 +246,8 @@ class Recorder:
 
     def _flush(self, *, to_disk: bool) -> None:
         """Flush the journal before the log: it must not know less."""
-        if self._lost != self._lost_told:
-            lost, self._lost_told = self._lost - self._lost_told, self._lost
+        if self._lost != self._lost_reported:
+            lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", time.monotonic_ns(), "dropped", frames=lost)
         self._journal.flush()
         self._log.flush(to_disk=to_disk)

@@ -33,7 +33,7 @@ def scans_of(ratio: np.ndarray, **changes: Any) -> ScanFacts:
         "device_us": 80_000 * np.arange(count, dtype=np.int64),
         "complete": np.ones(count, dtype=np.bool_),
         "step": STEP,
-        "told_noise": NOISE,
+        "stated_noise": NOISE,
         "stats": NO_LOSS,
     }
     return ScanFacts(**(facts | changes))

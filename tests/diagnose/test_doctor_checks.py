@@ -175,7 +175,7 @@ def stroked(layout: PatchLayout, seed: int, period_s: float = 0.08, **simulation
 
 def told_of(ratio: np.ndarray) -> set[str]:
     """Findings, where the hand file tells the converter's own noise."""
-    return {f.what for f in run_checks(bus_of(replace(WELL, scans=scans_of(ratio, told_noise=3e-6))))}
+    return {f.what for f in run_checks(bus_of(replace(WELL, scans=scans_of(ratio, stated_noise=3e-6))))}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -185,7 +185,7 @@ def test_who_touches_the_skin_is_no_defect(layout: PatchLayout, cycle_s: float, 
     for seed, period_s in ((1, 0.08), (2, 0.08), (3, 0.08), (4, 0.025)):
         ratio = stroked(layout, seed, period_s, cycle_s=cycle_s, depth=depth)
         assert told_of(ratio) == set()
-    facts = bus_of(replace(WELL, scans=scans_of(ratio, told_noise=3e-6)))
+    facts = bus_of(replace(WELL, scans=scans_of(ratio, stated_noise=3e-6)))
     assert [line for line in not_judged(facts) if "leave it alone" in line]
 
 
@@ -207,7 +207,7 @@ def test_faults_are_found_while_somebody_touches_the_skin(
     loose[10:20:3, seed, 5] = np.nan
     n_open = np.zeros(layout.shape, dtype=np.int64)
     n_open[seed, 5] = 4
-    facts = scans_of(loose, told_noise=3e-6, n_open=n_open)
+    facts = scans_of(loose, stated_noise=3e-6, n_open=n_open)
     assert {f.what for f in run_checks(bus_of(replace(WELL, scans=facts)))} == {
         "1 crossing intermittently open"
     }
@@ -233,7 +233,7 @@ def test_frozen_values_and_a_frozen_node() -> None:
     frozen = np.broadcast_to(quiet_ratio()[:1], (50, 4, 12))
     assert skin(frozen).what == "the values are frozen"
     # Of a converter quieter than a code, values that stand still say nothing, and that is said.
-    quiet = bus_of(replace(WELL, scans=scans_of(frozen, told_noise=3e-6)))
+    quiet = bus_of(replace(WELL, scans=scans_of(frozen, stated_noise=3e-6)))
     assert run_checks(quiet) == []
     (line,) = not_judged(quiet)
     assert line.startswith("thumb: frozen or only quiet: no code changed in 50 scans")
@@ -241,7 +241,7 @@ def test_frozen_values_and_a_frozen_node() -> None:
     assert not_judged(bus_of(replace(WELL, scans=scans_of(frozen)))) == []  # that is a finding
     flickers = frozen.copy()
     flickers[30, 2, 5] += STEP
-    assert not_judged(bus_of(replace(WELL, scans=scans_of(flickers, told_noise=3e-6)))) == []
+    assert not_judged(bus_of(replace(WELL, scans=scans_of(flickers, stated_noise=3e-6)))) == []
     finding = skin(quiet_ratio(), device_us=np.full(50, 4711))
     assert "repeats the same scan" in finding.what
     assert finding.sure is Sure.CERTAIN

@@ -50,26 +50,26 @@ def _missing(eds: Eds) -> Iterator[str]:
 def _miscounted(eds: Eds) -> Iterator[str]:
     """Yield each PDO count of DeviceInfo that differs from the number of PDOs described."""
     for key, name, first in (("nrofrxpdo", "NrOfRXPDO", 0x1400), ("nroftxpdo", "NrOfTXPDO", 0x1800)):
-        told, count = eds.device.get(key) or "", len(eds.indices(first, first + 0x1FF))
+        stated, count = eds.device.get(key) or "", len(eds.indices(first, first + 0x1FF))
         try:
-            right = number(told or "0") == count
+            right = number(stated or "0") == count
         except ValueError:
             right = False
         if not right:
-            yield f"{name}={told}, but {count} are described"
+            yield f"{name}={stated}, but {count} are described"
 
 
 def _identity(dut: Dut) -> Iterator[str]:
     for subindex, key in _IDENTITY:
-        told = dut.eds.device.get(key, "")
-        if told and dut.eds.find(0x1018, subindex) is not None:
+        stated = dut.eds.device.get(key, "")
+        if stated and dut.eds.find(0x1018, subindex) is not None:
             value = dut.sdo.integer(0x1018, subindex)
             try:
-                same = number(told) == value
+                same = number(stated) == value
             except ValueError:
                 same = False
             if not same:
-                yield f"{key}={told}, the device says 0x{value:08X}"
+                yield f"{key}={stated}, the device says 0x{value:08X}"
 
 
 def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:

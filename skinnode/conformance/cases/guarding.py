@@ -14,11 +14,11 @@ _GUARD_MS, _FACTOR = 100, 3
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
     """Raise Failed unless a remote frame is answered with this state and, unless None, this toggle bit."""
     got = dut.guard(what)
-    told = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
+    toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:
-        raise Failed(f"{STATES[state]} and {told} to a remote frame, {what}", "nothing")
+        raise Failed(f"{STATES[state]} and {toggle_text} to a remote frame, {what}", "nothing")
     if got & 0x7F != state or (toggle is not None and got >> 7 != toggle):
-        raise Failed(f"{STATES[state]} and {told} to a remote frame, {what}", f"0x{got:02X}")
+        raise Failed(f"{STATES[state]} and {toggle_text} to a remote frame, {what}", f"0x{got:02X}")
 
 
 @case("GUARD-01", "0x100C and 0x100D are 0 by default: no life guarding", "7.5.2.11, 7.5.2.12")

@@ -57,8 +57,8 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
             continue
         value = dut.sdo.read(entry.index, entry.subindex)
         if value != default:
-            told = f"{entry}: {value.hex(' ').upper()}, EDS {default.hex(' ').upper()}"
-            (doubts if entry.index in (STORE, RESTORE) and entry.subindex else faults).append(told)
+            text = f"{entry}: {value.hex(' ').upper()}, EDS {default.hex(' ').upper()}"
+            (doubts if entry.index in (STORE, RESTORE) and entry.subindex else faults).append(text)
     _none("the defaults of the EDS", faults)
     if doubts:
         raise Warned(f"its store or restore capabilities differ from the EDS: {'; '.join(doubts)}")

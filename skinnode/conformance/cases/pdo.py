@@ -115,8 +115,8 @@ def event_driven(dut: Dut) -> None:
         gaps = gaps_ms(frames)
         # One interval is short if the frame before was delayed; their mean hardly changes.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
-            told = ", ".join(f"{gap:.1f}" for gap in gaps)
-            raise Failed(f"{pdo} no closer than its inhibit time of 40 ms", f"gaps of {told} ms")
+            shown = ", ".join(f"{gap:.1f}" for gap in gaps)
+            raise Failed(f"{pdo} no closer than its inhibit time of 40 ms", f"gaps of {shown} ms")
 
     each_tpdo(dut, trial)
 

@@ -78,7 +78,7 @@ def not_judged(facts: BusFacts) -> list[str]:
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(
                 f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the stated "
-                f"noise, {patch.scans.told_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch the "
+                f"noise, {patch.scans.stated_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch the "
                 "patch while the doctor listens; if this line comes again, the converter has stopped"
             )
     return lines

@@ -127,7 +127,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("wires", patch.name, what, sure, evidence, advice)
 
-    factor = analysis.noise / analysis.told
+    factor = analysis.noise / analysis.stated
     judged = np.isfinite(factor) & ~analysis.steps
     noisy = judged & (factor > NOISY)
     over = f"over {counted(scans.scans, 'scan')}"
@@ -192,7 +192,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             "the values are frozen",
             Sure.LIKELY,
             f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
-            f"though the stated noise is {scans.told_noise:.0e} and a code is {scans.step:.0e}",
+            f"though the stated noise is {scans.stated_noise:.0e} and a code is {scans.step:.0e}",
             "the converter has stopped: switch the patch off and on",
         )
 
@@ -205,7 +205,7 @@ def may_be_frozen(scans: ScanFacts) -> bool:
 
 def _shows(scans: ScanFacts) -> bool:
     """Return whether the stated noise soon changes every code."""
-    return scans.told_noise > scans.step
+    return scans.stated_noise > scans.step
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:

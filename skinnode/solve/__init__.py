@@ -1,7 +1,7 @@
-"""Resistances to displacement. No bus, no threads.
+"""Solvers that compute displacements from resistances, without buses or threads.
 
-``tracker`` answers a live stream by the method that suits the patch: ``exact`` inverts wire by wire,
-``posterior`` estimates the whole patch. ``root_gate`` puts the doubtful wires of the first to the second, by
-the rules and thresholds of ``roots``. ``paths`` follows a recorded press. All three use ``operators``,
-``linalg`` and ``wires``.
+``tracker`` solves a live stream with the method that suits the patch: ``exact`` inverts each wire
+separately, ``posterior`` estimates the whole patch. ``root_gate`` checks doubtful wires of the exact inverse
+with the posterior, by the rules and thresholds of ``roots``. ``paths`` follows a recorded press. All of these
+use ``operators``, ``linalg`` and ``wires``.
 """

@@ -1,7 +1,8 @@
-"""How well the resistances determine a patch at rest: the Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ of a wire.
+"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ of a wire: how well the resistances determine a patch at rest.
 
-J is the Jacobian of the relative residual a F − 1 at rest and σ the relative noise of each resistance. The
-standard deviations are in clearances: the least distance at rest between an upper and a lower electrode.
+J is the Jacobian of the relative residual a F − 1 at rest and σ the relative noise of each resistance.
+Standard deviations are in clearances; the clearance is the least distance at rest between an upper and a
+lower electrode.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool =
     return _std(layout, np.broadcast_to(relative_noise, layout.shape), normal_only)
 
 
-@functools.lru_cache(maxsize=64)  # 3 ms a layout, and every path needs it
+@functools.lru_cache(maxsize=64)  # 3 ms per layout, and every path needs it
 def _unit_std(layout: PatchLayout, normal_only: bool) -> Float:
     return _std(layout, np.ones(layout.shape), normal_only)
 

@@ -1,4 +1,4 @@
-"""Checks of a tracker's arguments: a wrong shape raises, a number never does."""
+"""Checks of a tracker's arguments: a wrong shape raises an exception, a resistance value never does."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""Largest relative noise of a resistance that is used; its square must not overflow."""
+"""Largest relative noise of a usable resistance; its square must not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,15 +19,15 @@ class CodeMap:
     """Meaning of a converter's codes: R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
 
     baseline_ohm: Float
-    """(U, K) ohm, R0; a code whose R0 is not positive and finite is no measurement."""
+    """(U, K) R0, ohm; a code is invalid if its R0 is not positive and finite."""
     lo: float
     """R / R0 of code 0."""
     step: float
-    """Change of R / R0 by a code."""
+    """Change of R / R0 per code."""
     steps: int
-    """Largest code that is a measurement."""
+    """Largest valid code."""
     rounding_ohm: Float
-    """(U, K) ohm, standard deviation of a code's rounding."""
+    """(U, K) standard deviation of rounding to a code, ohm."""
     relative_noise: float
     """Relative standard deviation of the signal before the converter."""
     gain: Float | None = None
@@ -35,13 +35,13 @@ class CodeMap:
 
 
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
-    """Return a noise as an array (U, K).
+    """Return the relative noise as an array (U, K).
 
     Raises:
-        ValueError: If it is neither a number nor of that shape.
+        ValueError: If the noise is neither a number nor of that shape.
     """
     if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
-        return np.asarray(relative_noise, np.float64)  # as from every frame of a host
+        return np.asarray(relative_noise, np.float64)  # fast path: a host passes this with every frame
     try:
         return np.asarray(np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape))
     except (TypeError, ValueError) as error:
@@ -50,10 +50,10 @@ def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
 
 
 def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
-    """Return a noise as an array (U, K).
+    """Return the relative noise as an array (U, K).
 
     Raises:
-        ValueError: If it is neither a number nor of that shape, or a value is not positive and finite.
+        ValueError: If the noise is neither a number nor of that shape, or a value is not positive and finite.
     """
     noise = broadcast_noise(relative_noise, layout)
     if not ((noise > 0) & (noise < np.inf)).all():
@@ -63,10 +63,10 @@ def checked_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
 
 
 def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
-    """Return a mask as an array (U, K).
+    """Return the mask as an array (U, K).
 
     Raises:
-        ValueError: If it is not bool or not of that shape.
+        ValueError: If the mask is not bool or not of that shape.
     """
     mask = np.asarray(valid)
     if mask.dtype != np.bool_ or mask.shape != layout.shape:
@@ -76,10 +76,10 @@ def checked_mask(valid: Any, layout: PatchLayout) -> NDArray[np.bool_]:
 
 
 def checked_codes(codes: Any, layout: PatchLayout) -> NDArray[np.uint32]:
-    """Return codes as they are.
+    """Return the codes unchanged.
 
     Raises:
-        ValueError: If they are not uint32 or not of shape (U, K).
+        ValueError: If the codes are not uint32 or not of shape (U, K).
     """
     if getattr(codes, "dtype", None) != np.uint32 or codes.shape != layout.shape:
         got = f"{codes.dtype} of shape {codes.shape}" if isinstance(codes, np.ndarray) else f"{codes!r:.40}"

@@ -1,6 +1,7 @@
-"""Options of the trackers, with their defaults and checks in one place.
+"""Options of the trackers, with their defaults and checks.
 
-A constructor takes an options object, keyword arguments of the same names, or both; keywords win.
+A constructor accepts an options object, keyword arguments of the same names, or both; keyword arguments take
+precedence.
 """
 
 from __future__ import annotations
@@ -21,26 +22,27 @@ DRIFTS: Final = ("none", "patch", "wire")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EstimateOptions:
-    """Options that every tracker of a patch has.
+    """Options common to all trackers.
 
     Args:
         relative_noise: A number or (U, K), standard deviation of R relative to R.
-        baseline_ohm: (U, K) resistances measured at rest, ohm; the resistivity and gain then cancel.
-        rubber: Material of the skin. Displacement does not depend on its modulus, forces are proportional to
-            it.
-        estimate_noise: Whether to set a factor on ``relative_noise`` from the data.
-        drift: ``patch``: all resistances may be off by one common gain, ``wire``: by one gain for each upper
-            wire, with a prior standard deviation of ``drift_std``; ``none``.
-        drift_std: Prior standard deviation of a gain error, as a share.
-        model_error: Share of the change of each resistance that the forward model may get wrong (thickness,
-            size of the electrodes, conductivity under strain): in common, and 0.7 of it each on its own.
-        normal_only: Whether only z is unknown, a third of the unknowns.
-        hold: Whether to leave alone what has not changed beyond its noise.
-        deadline_us: Time after which an update returns, and at most one step more, µs. What was not solved by
-            then is DEADLINE.
+        baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
+        rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
+            on it.
+        estimate_noise: Whether to estimate a factor on ``relative_noise`` from the data.
+        drift: Gain errors to estimate: ``patch`` for one common gain of all resistances, ``wire`` for one
+            gain per upper wire, or ``none``.
+        drift_std: Prior standard deviation of a gain error, as a fraction.
+        model_error: Standard error of the forward model, as a fraction of the change of each resistance
+            (from thickness, electrode size and conductivity under strain): once as a common error, and 0.7 of
+            it independently per resistance.
+        normal_only: Whether only z is unknown, which leaves a third of the unknowns.
+        hold: Whether to keep the last solution of wires that changed no more than their noise.
+        deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
+            then are DEADLINE.
 
     Raises:
-        ValueError: If an option is out of its range.
+        ValueError: If an option is out of range.
     """
 
     relative_noise: ArrayLike = 1e-5
@@ -65,20 +67,20 @@ class EstimateOptions:
 
     @property
     def deadline_s(self) -> float:
-        """``deadline_us`` in seconds, inf for none."""
+        """``deadline_us`` in seconds; inf without a deadline."""
         return math.inf if self.deadline_us is None else self.deadline_us * 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`; those of :class:`EstimateOptions`, and two of its own.
+    """Options of :class:`skinnode.Posterior`: :class:`EstimateOptions` and two more.
 
     Args:
-        scale_m: RMS normal displacement that the prior expects, metres; by default it is set from the data.
+        scale_m: RMS normal displacement that the prior expects, metres; by default set from the data.
         contacts: Whether to estimate forces and contacts.
 
     Raises:
-        ValueError: If an option is out of its range.
+        ValueError: If an option is out of range.
     """
 
     scale_m: float | None = None
@@ -92,21 +94,21 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`; those of :class:`EstimateOptions`, and some of its own.
+    """Options of :class:`skinnode.Tracker`: :class:`EstimateOptions` and some more.
 
-    ``auto`` takes the posterior if ``drift``, ``model_error`` or ``estimate_noise`` asks for what only it can
-    give.
+    The method ``auto`` chooses the posterior if ``drift``, ``model_error`` or ``estimate_noise`` is set,
+    since only the posterior supports them.
 
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
-        operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; only of the exact inverse.
-        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; only of the exact inverse, which gives no
-            forces without it. The posterior's forces come from ``rubber``.
-        active_only: Whether only the electrodes that contacts move are unknown; only of the exact inverse.
-        codes: Meaning of the codes given to :meth:`skinnode.Tracker.update_codes`.
+        operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
+        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; exact inverse only, which returns no forces
+            without it. The posterior's forces come from ``rubber``.
+        active_only: Whether only electrodes that contacts move are unknown; exact inverse only.
+        codes: Meaning of the codes passed to :meth:`skinnode.Tracker.update_codes`.
 
     Raises:
-        ValueError: If an option is out of its range.
+        ValueError: If an option is out of range.
     """
 
     method: str = "auto"
@@ -121,13 +123,13 @@ class TrackerOptions(EstimateOptions):
         super().__post_init__()
 
     def of_posterior(self) -> PosteriorOptions:
-        """Return the options of the posterior of the same patch."""
+        """Return the options for the posterior of the same patch."""
         names = [field.name for field in dataclasses.fields(EstimateOptions)]
         return PosteriorOptions(**{name: getattr(self, name) for name in names})
 
     @property
     def nuisances(self) -> list[str]:
-        """Names of the options asked for that only the posterior can give."""
+        """Names of the active options that only the posterior supports."""
         asked = {
             "drift": self.drift != "none",
             "model_error": self.model_error > 0,
@@ -172,11 +174,11 @@ _Options = TypeVar("_Options", PosteriorOptions, TrackerOptions)
 
 
 def merged(kind: type[_Options], options: _Options | None, arguments: Any) -> _Options:
-    """Return ``options``, or the defaults of ``kind``, with the keyword arguments in their place.
+    """Return ``options``, or the defaults of ``kind``, overridden by the keyword arguments.
 
     Raises:
-        TypeError: If there is no option of a name, or ``options`` is not of this kind.
-        ValueError: If an option is out of its range.
+        TypeError: If an argument names no option, or ``options`` is not of type ``kind``.
+        ValueError: If an option is out of range.
     """
     known = [field.name for field in dataclasses.fields(kind)]
     for name in arguments:
@@ -193,7 +195,7 @@ def require_positive(name: str, value: float) -> None:
     """Check that an option is positive and finite.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If the value is not positive and finite.
     """
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name}: got {value}, must be positive and finite")

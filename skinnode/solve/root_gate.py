@@ -1,9 +1,10 @@
-"""The gate of the exact inverse: which of its wires are doubtful, and what the posterior says of them.
+"""Gate of the exact inverse: finds its doubtful wires and checks them with the posterior.
 
-Doubtful are wires that came to no root, that jumped, and displacements too rough for a press. If a layout has
-folds within the reach of a press, every solved wire is doubtful: F = b then has roots nearby that the inverse
-alone cannot tell apart. The posterior, which knows the neighbouring wires, confirms a doubtful wire, replaces
-it, or leaves it without a root. The thresholds are in :mod:`skinnode.solve.roots`.
+A wire is doubtful if it has no root, if it jumped, or if its displacement is too rough for a press. If a
+layout has folds within the reach of a press, every solved wire is doubtful, because F = b then has roots
+nearby that the inverse alone cannot tell apart. The posterior uses the neighbouring wires and confirms a
+doubtful wire, replaces its root or leaves it without one. The thresholds are in
+:mod:`skinnode.solve.roots`.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Frames in which the posterior is not asked again after it missed a deadline: asking in vain with every
-frame takes 2 ms of the time of patches that wait for the same thread."""
+"""Number of frames without a posterior solve after the posterior missed a deadline; a futile solve in every
+frame costs 2 ms that other patches on the same thread are waiting for."""
 APART: Final = 3.0
-"""Factor on the gap between a root near a fold and the posterior that confirms it, added to its standard
-deviation: two roots may lie closer than the posterior can tell."""
+"""Factor on the distance between a root near a fold and the posterior that confirms it. The product is added
+to the standard deviation, because two roots may lie closer than the posterior can tell apart."""
 NEAR_FOLD: Final = 2.0
-"""Factor on the standard deviation of a wire near a fold that the posterior replaced, for the same reason."""
+"""Factor on the standard deviation of a root near a fold that the posterior replaced, for the same reason."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Checks every field of an exact tracker with the posterior of its patch. One owner.
+    """Checks every field of an exact tracker with the posterior of its patch. Not shared between owners.
 
     Args:
-        exact: The tracker whose fields are checked.
+        exact: Tracker whose fields are checked.
         posterior: Posterior of the same patch.
         options: Options of both.
     """
@@ -55,9 +56,9 @@ class RootGate:
         clearance_m = float(problem.clearance.min()) * layout.pitch_m
         self._last_m = np.zeros_like(layout.upper_m)
         self._lost, self._unsure, self._rough = np.zeros((3, layout.shape[0]), np.bool_)
-        self._pause = 0  # frames until the posterior is asked again
+        self._pause = 0  # frames until the next posterior solve
         self._confirmed: Float | None = None  # displacement at which a rough wire was last confirmed
-        self._apart = np.zeros((len(problem.rest), 1, 1))  # m, what its confirmation left open of a wire
+        self._apart = np.zeros((len(problem.rest), 1, 1))  # m, uncertainty left by the confirmation
         self._any_apart = False
         self._blind = roots.blind_wires(layout, options.normal_only)
         self._folded = roots.folded_wires(layout, options.normal_only)
@@ -80,7 +81,7 @@ class RootGate:
             pitch_m=layout.pitch_m,
             rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
         )
-        self._doubtful()  # compiles it
+        self._doubtful()  # compile now
 
     def reset(self) -> None:
         """Forget the stream."""
@@ -90,11 +91,11 @@ class RootGate:
         self._pause = 0
 
     def check(self, field: FieldFrame, start: float) -> FieldFrame:
-        """Return the field with its doubtful wires confirmed, replaced or without a root.
+        """Return the field with each doubtful wire confirmed, replaced or left without a root.
 
         Args:
             field: Field of the exact tracker.
-            start: Time of :func:`time.perf_counter` at which its update began.
+            start: Time of :func:`time.perf_counter` at which the update began.
         """
         doubtful: Mask | None = None
         if self._doubtful():
@@ -104,7 +105,7 @@ class RootGate:
                 field = self._give_up(field, doubtful)
             else:
                 if anew:
-                    self._posterior.reset()  # annealed from rest: tracking a wrong root would confirm it
+                    self._posterior.reset()  # anneal from rest; tracking a wrong root would confirm it
                 its = self._exact.arrays
                 self._posterior.stop_at(until)
                 noise = np.maximum(its.noise, roots.REFEREE_NOISE)
@@ -120,7 +121,7 @@ class RootGate:
         return field
 
     def _doubtful(self) -> bool:
-        """Whether any wire has no root (``_lost``), or one that may not be the right one (``_unsure``)."""
+        """Return whether any wire has no root (``_lost``) or a possibly wrong root (``_unsure``)."""
         found = check_roots(self._root_check.table)
         if found & SOME_ROUGH:
             if self._confirmed is not None:
@@ -129,7 +130,7 @@ class RootGate:
         return found & SOME_SUSPECT != 0 or bool(found & SOME_ROUGH and self._rough.any())
 
     def _keep_apart(self, field: FieldFrame, unasked: Mask) -> FieldFrame:
-        """Give a held wire the standard deviation that it had when the posterior confirmed it."""
+        """Restore the standard deviation that held wires had when the posterior confirmed them."""
         if field.held is None:
             return field
         self._apart[unasked & ~field.held] = 0.0
@@ -147,7 +148,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Leave the doubtful wires without a root, because there is no time to ask the posterior."""
+        """Leave the doubtful wires without a root because there is no time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0
@@ -161,7 +162,7 @@ class RootGate:
         )
 
     def _select(self, field: FieldFrame, doubtful: Mask, estimate: FieldFrame) -> FieldFrame:
-        """Confirm, replace or give up the doubtful wires by the posterior's estimate."""
+        """Confirm, replace or reject the doubtful roots by the posterior's estimate."""
         known = np.array(estimate.status) == Status.CONVERGED
         converged = np.array(field.status) == Status.CONVERGED
         spread = np.hypot(field.displacement_std_m, estimate.displacement_std_m)
@@ -188,7 +189,7 @@ class RootGate:
 
         self._apart[doubtful] = 0.0
         self._apart[agreed & self._folded] = apart[agreed & self._folded]
-        self._any_apart = True  # perhaps
+        self._any_apart = True  # provisional; checked with the next frame
 
         assert estimate.core_std_m is not None
         self._exact.adopt(replaced, moved)
@@ -217,7 +218,7 @@ class RootGate:
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Statuses with CONVERGED for wires ``replaced`` (U,), ILL_CONDITIONED for other ``changed`` roots."""
+    """Return statuses with CONVERGED for ``replaced`` (U,), ILL_CONDITIONED for other ``changed`` roots."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

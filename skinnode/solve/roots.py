@@ -1,36 +1,36 @@
-"""Which root of F = b is the skin's: every rule by which a root is accepted or refused, and every threshold.
+"""Rules and thresholds that decide which root of F = b is the true position of the skin.
 
-Zero residuals prove nothing, because F = b has several roots. The rules look at four things: the layout at
-rest (does it have folds, does it see its electrodes at all), one root (its branch, its distance from rest,
-its roughness), two roots of one wire (which is the likelier), and the posterior of the whole patch, which
-knows the neighbouring wires. The functions are pure; callers keep the state.
+Zero residuals prove nothing, because F = b has several roots. The rules consider four things: the layout at
+rest (does it have folds, do its resistances depend on the electrodes at all), one root (its branch, its
+distance from rest, its roughness), two roots of one wire (which is likelier), and the posterior of the whole
+patch, which uses the neighbouring wires. The functions are pure; callers keep the state.
 
 =================  =====  ================================================  ================================
 constant           value  meaning                                           measured on
 =================  =====  ================================================  ================================
 FOLDED             250    conditioning above which presses meet folds       6000 wires of three layouts
-BLIND              1e7    conditioning above which a root says nothing      symmetric; aligned, h ≥ 1.5
-NEARLY_BLIND       1e5    conditioning above which UNLIKELY_BLIND holds     aligned from h = 1
+BLIND              1e7    conditioning above which a root is meaningless    symmetric; aligned, h ≥ 1.5
+NEARLY_BLIND       1e5    conditioning above which UNLIKELY_BLIND applies   aligned from h = 1
 NONLINEAR          0.003  std, clearances, above which noise hides folds    not measured
-JUMP               0.2    move between frames, clearances, that is checked  folds passed from 0.24
+JUMP               0.2    move between frames, clearances, to be checked    folds passed from 0.24
 LARGE              0.03   displacement, clearances, that must be smooth     folds lie farther out
-ROUGH_IN_STREAM    1.2    roughness over size put to the posterior          presses 0.5 to 1.7, wrong 1 to 2
-ROUGH_AT_PATH_END  0.8    roughness over size that gets a second try        presses 0.67, wrong 0.7 to 2
-STILL_CONFIRMED    0.2    share of change within which a check holds        not measured
-SAME_ROOT          0.001  relative distance of one root found twice         not measured
-TWIN_REACH         2      relative distance of a twin at most               staggered, h = 0.3 to 1
+ROUGH_IN_STREAM    1.2    roughness / size, checked with the posterior      presses 0.5 to 1.7, wrong 1 to 2
+ROUGH_AT_PATH_END  0.8    roughness / size that triggers a second attempt   presses 0.67, wrong 0.7 to 2
+STILL_CONFIRMED    0.2    relative change up to which a check stays valid   not measured
+SAME_ROOT          0.001  relative distance up to which roots are equal     not measured
+TWIN_REACH         2      largest relative distance of a twin               staggered, h = 0.3 to 1
 TWIN_ROUGHNESS     1.05   ratio of roughness that decides between twins     82 + 60 + 40 presses, staggered
-UNLIKELY           4      energy by which other roots must lose             1530 pairs of roots
-UNLIKELY_BLIND     16     the same for nearly blind wires                   not measured
-REFEREE_NOISE      1e-5   least noise of a posterior that judges a root     not measured
-AGREE              6      standard deviations within which it agrees        not measured
+UNLIKELY           4      energy margin over other roots                    1530 pairs of roots
+UNLIKELY_BLIND     16     energy margin for nearly blind wires              not measured
+REFEREE_NOISE      1e-5   least noise of a posterior that checks roots      not measured
+AGREE              6      standard deviations up to which roots agree       not measured
 NEAR               0.25   first correction, clearances, when tracking       not measured
 FAR                0.1    move, clearances, before annealing is compared    folds passed from 0.3
-LIKELIER           4      energy by which annealing again must win          the wrong one met lost by 23
-SUSPICIOUS         3      prior deviations of a nuisance to be checked      not measured
-BELIEVABLE         5      prior deviations that refuse a frame              not measured
-IMPOSSIBLE_CHANCE  1e-9   chance of the χ² that refuses a wire              by definition
-Z_REFUSE           5.998  normal deviate of that chance, tall systems       by definition
+LIKELIER           4      energy margin of a second annealing               a wrong maximum lost by 23
+SUSPICIOUS         3      nuisance, prior std, that triggers a check        not measured
+BELIEVABLE         5      nuisance, prior std, that rejects a frame         not measured
+IMPOSSIBLE_CHANCE  1e-9   probability of the χ² that rejects a wire         by definition
+Z_REFUSE           5.998  normal quantile of the same, for tall systems     by definition
 =================  =====  ================================================  ================================
 """
 
@@ -51,84 +51,83 @@ Mask = NDArray[np.bool_]
 # -- the layout ---------------------------------------------------------------------------------------------
 
 FOLDED: Final = 250.0
-"""RMS of ∂x/∂(ln R) at rest over the clearance above which presses run into folds: 70 on staggered at h =
-0.5, where none of 6000 wires did, 1200 and more on staggered from h = 1 on and on aligned and symmetric,
+"""RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. It is 70 on staggered at h =
+0.5, where none of 6000 wires did, and at least 1200 on staggered from h = 1 and on aligned and symmetric,
 where one in 30 ends on a wrong root."""
 BLIND: Final = 1e7
-"""RMS of ∂x/∂(ln R) over the clearance above which a root says nothing: the wire's electrodes cross the layer
-within the seventh digit of R. Wires on a symmetry line of the layout are blind, because each of their roots
-has a mirror image; of the others only the wires of layers of 1.5 pitches and more above aligned lower
+"""RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
+while R changes in its seventh digit. Wires on a symmetry line of the layout are blind, because each of their
+roots has a mirror image. The only other blind wires are those 1.5 pitches or more above aligned lower
 wires."""
 NEARLY_BLIND: Final = 1e5
-"""RMS of ∂x/∂(ln R) over the clearance above which a root must be clearly likelier than any other: aligned
-from h = 1 on."""
+"""RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; exceeded on
+aligned from h = 1."""
 NONLINEAR: Final = 0.003
-"""Standard deviation of the exact inverse, clearances, above which F is not linear within its noise: a root
-is then as doubtful as near a fold."""
+"""Standard deviation of the exact inverse, in clearances, above which F is not linear within the noise; roots
+are then as doubtful as near a fold."""
 
 # -- one root -----------------------------------------------------------------------------------------------
 
 JUMP: Final = 0.2
-"""Move of an electrode between two frames, clearances, above which the next root need not be the right one:
-folds were passed from 0.24 on."""
+"""Move of an electrode between two frames, in clearances, above which the next root may be wrong; moves from
+0.24 on were seen to pass folds."""
 LARGE: Final = 0.03
-"""Displacement, clearances, above which its roughness is checked: folds lie at still larger ones."""
+"""Displacement, in clearances, above which the roughness is checked; folds lie at larger displacements."""
 ROUGH_IN_STREAM: Final = 1.2
-"""Roughness of a displacement over its size above which a live stream puts it to the posterior. Presses have
-0.5 to 1, up to 1.7 if they move one electrode; wrong roots have 1 to 2."""
+"""Ratio of roughness to size of a displacement above which a live stream checks it with the posterior.
+Presses have 0.5 to 1, or up to 1.7 if they move a single electrode; wrong roots have 1 to 2."""
 ROUGH_AT_PATH_END: Final = 0.8
-"""Roughness of a displacement over its size above which the end of a path gets a second try from the
-smoothest displacement. Presses have 0.67 on average, less than 0.9 in nine of ten and up to 1.9 if they move
-one electrode; wrong roots have 0.7 to 2."""
+"""Ratio of roughness to size of a displacement above which the end of a path is solved again from the
+smoothest displacement. Presses have 0.67 on average, nine of ten less than 0.9, and up to 1.9 if they move a
+single electrode; wrong roots have 0.7 to 2."""
 STILL_CONFIRMED: Final = 0.2
-"""Change of a displacement since it was confirmed, as a share of it, up to which a rough wire is not checked
-again."""
+"""Relative change of a displacement since its confirmation up to which a rough wire is not checked again."""
 
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Distance of two solutions, as a share of the displacement, up to which they are one root."""
+"""Distance of two solutions, relative to the displacement, up to which they are the same root."""
 TWIN_REACH: Final = 2.0
-"""Largest distance of a twin worth solving for, in largest displacements of its wire: twins farther away were
-at least 1.3 times as rough on staggered, h = 0.3 to 1."""
+"""Largest distance of a twin worth solving for, relative to the largest displacement of the wire. Twins
+farther away were at least 1.3 times as rough on staggered, h = 0.3 to 1."""
 TWIN_ROUGHNESS: Final = 1.05
-"""Ratio of roughness by which the smoother of two roots at a fold is taken for true. Over 82 random presses
-of 50 % on staggered, h = 1, the twins of wrong roots were at most 1.044 times as rough; 4 in 100 right roots
-have a twin as smooth, and lose their CONVERGED. Of 60 presses more of each depth and height (6710 wires, h =
-0.3 to 1) no wrong root ended CONVERGED, of 40 others (4510) one did."""
+"""Ratio of roughness above which the smoother of two roots at a fold is accepted. Over 82 random presses of
+50 % on staggered, h = 1, the twins of wrong roots were at most 1.044 times as rough. 4 of 100 right roots
+have a twin within the ratio and lose their CONVERGED. In 60 further presses of each depth and height (6710
+wires, h = 0.3 to 1) no wrong root ended CONVERGED; in 40 others (4510 wires) one did."""
 UNLIKELY: Final = 4.0
-"""Energy by which other roots must be less likely. Of 1530 pairs of roots of presses of 30 to 70 % on
-staggered, h = 1, and aligned, h = 0.5, the wrong one was the likelier in 19, by 1.4 at most, and in as many
-pairs more by 2.6. That the samples led to a root is no better proof: with 5 of them by 2.5 as well."""
+"""Energy by which other roots must be less likely. In 1530 pairs of roots of presses of 30 to 70 % on
+staggered, h = 1, and aligned, h = 0.5, the wrong root was likelier in 19 pairs, by at most 1.4; in a second
+set of the same size, by at most 2.6. A root at the end of a path is no safer: with paths of 5 samples, the
+wrong root was likelier by up to 2.5 as well."""
 UNLIKELY_BLIND: Final = 16.0
-"""Energy by which other roots must be less likely on nearly blind wires, which may have more roots than are
+"""Energy by which other roots must be less likely on nearly blind wires, which may have roots that were not
 found."""
 
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
 REFEREE_NOISE: Final = 1e-5
-"""Least relative noise of a posterior that judges a root: with less it is drawn to roots itself."""
+"""Smallest relative noise of a posterior that checks roots; with less it is drawn to roots itself."""
 AGREE: Final = 6.0
 """Standard deviations within which the posterior confirms a root."""
 NEAR: Final = 0.25
-"""Share of the clearance by which a first correction may move an electrode; beyond, the estimate is
-annealed."""
+"""Largest first correction of an electrode, in clearances; after a larger one the estimate is annealed."""
 FAR: Final = 0.1
-"""Share of the clearance by which an electrode may move before the estimate is compared with one annealed
-from rest: folds were passed by presses of 0.3 and more, frame by frame, and never noticed afterwards."""
+"""Move of an electrode, in clearances, after which the estimate is compared with one annealed from rest.
+Without the comparison, presses of 0.3 or more passed folds frame by frame and went unnoticed."""
 LIKELIER: Final = 4.0
-"""Energy by which an estimate annealed again must be the likelier. With less it is the same maximum, drawn
-nearer to the loads found; the wrong maximum that was met lost by 23."""
+"""Energy by which an estimate from a second annealing must be likelier. A smaller gain means the same
+maximum, moved closer to the loads found; the wrong maximum that occurred was worse by 23."""
 SUSPICIOUS: Final = 3.0
-"""Prior deviations of a nuisance above which the estimate is compared with the annealed one, and never held:
-a drift or a model error can take the place of a displacement, and a stream would stay there."""
+"""Value of a nuisance, in prior standard deviations, above which the estimate is compared with an annealed
+one and never held. A drift or model error can stand in for a displacement, and a stream would not recover."""
 BELIEVABLE: Final = 5.0
-"""Prior deviations of a nuisance above which the frame is INCONSISTENT: nothing was explained."""
+"""Value of a nuisance, in prior standard deviations, above which the frame is INCONSISTENT."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
-"""Chance a frame at which a wire that obeys the model is called INCONSISTENT: χ² test."""
+"""Probability per frame that the χ² test reports a wire that obeys the model as INCONSISTENT."""
 Z_REFUSE: Final = 5.998
-"""Normal deviate of 1 − 1e-9, the quantile of χ² above which a tall system is INCONSISTENT: once in four
-months at 100 frames/s, and below what a wrong root or a wrong value causes."""
+"""Normal quantile of 1 − 1e-9, at whose χ² a tall system becomes INCONSISTENT: by chance once in four months
+at 100 frames/s. Wrong roots and wrong values cause larger χ²."""
 
 
 def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
@@ -147,11 +146,12 @@ def nonlinear_in_noise(layout: PatchLayout, relative_noise: ArrayLike, normal_on
 
 
 def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reach: Mask) -> Mask:
-    """Return the wires (U,) whose solve came to a root on the branch of the rest position, within reach.
+    """Return the wires (U,) whose solve reached a root on the branch of the rest position, within reach.
 
-    The determinant of J keeps the sign that it has at rest. A system with more equations than unknowns has no
-    determinant, and 0 for a sign. No electrode moves farther than its clearance from the lower layer
-    (:meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
+    On this branch the determinant of J has the same sign as at rest. A system with more equations than
+    unknowns has no determinant; its sign is 0. Within reach, no electrode moves farther than its clearance
+    from the lower layer (
+    :meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
 
     Args:
         status: (U,) statuses of the solves.
@@ -163,7 +163,7 @@ def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reac
 
 
 def crossed_fold(branch: Index, before: Index) -> Mask:
-    """Return the wires (U,) whose det J changed its sign from ``before`` to ``branch`` (U,)."""
+    """Return the wires (U,) whose det J changed sign between ``before`` and ``branch`` (U,)."""
     return np.asarray(branch * before < 0)
 
 
@@ -172,40 +172,40 @@ def rough_at_path_end(roughness: Float, displacement: Float, step_limit: float) 
 
     Args:
         roughness: (U,) √(uᵀ C⁻¹ u).
-        displacement: (U, n) pitches.
-        step_limit: First trust radius of the patch, pitches: the size for which C was made.
+        displacement: (U, n) displacement, pitches.
+        step_limit: Initial trust radius of the patch, pitches; the displacement size that C assumes.
     """
     size = np.sqrt((displacement**2).sum(axis=1)) / step_limit
     return np.asarray(roughness > ROUGH_AT_PATH_END * size)
 
 
 def distance(x: Float, other: Float) -> Float:
-    """Return the largest difference of a coordinate of two positions (U, n), by wire: (U,)."""
+    """Return the largest coordinate difference (U,) of each wire between two positions (U, n)."""
     return np.asarray(np.abs(x - other).max(axis=1))
 
 
 def agrees(gap: Float, reach: Float) -> Mask:
-    """Return the wires (U,) none of whose coordinates differs from an estimate by more than ``reach``.
+    """Return the wires (U,) whose coordinates all differ from an estimate by at most ``reach``.
 
     Args:
-        gap: (U, ...) differences from the estimate, absolute.
-        reach: Same shape, :data:`AGREE` standard deviations.
+        gap: (U, ...) absolute differences from the estimate.
+        reach: Limits of the same shape, :data:`AGREE` standard deviations.
     """
     return np.asarray((gap <= reach).all(axis=tuple(range(1, gap.ndim))))
 
 
 def still_confirmed(displacement: Float, confirmed: Float) -> Mask:
-    """Return the wires (U,) that hardly changed (U, N, 3) since their displacement was confirmed."""
+    """Return the wires (U,) whose displacement (U, N, 3) hardly changed since it was confirmed."""
     change = np.abs(displacement - confirmed).max(axis=(1, 2))
     return ~np.asarray(change > STILL_CONFIRMED * np.abs(displacement).max(axis=(1, 2)))
 
 
 def beyond_prior(nuisances: Float, variance: Float, deviations: float) -> bool:
-    """Return whether a nuisance is so unlikely that it replaces something else.
+    """Return whether any nuisance is implausibly large.
 
     Args:
-        nuisances: (p,) estimates.
-        variance: (p,) prior variances.
-        deviations: Prior standard deviations that are still likely.
+        nuisances: (p,) estimates of the nuisances.
+        variance: (p,) prior variances of the nuisances.
+        deviations: Largest plausible value, in prior standard deviations.
     """
     return bool((np.abs(nuisances) > deviations * np.sqrt(variance)).any())

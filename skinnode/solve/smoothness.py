@@ -1,9 +1,9 @@
-"""Gaussian covariance of the displacement of one upper wire: how smooth rubber is.
+"""Gaussian covariance of the displacement of one upper wire, a model of the smoothness of rubber.
 
-C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, with d the distance of two electrodes at rest. This is weaker
-than the elasticity of a patch and needs no constant of the material. It gives a solve its start
-(:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root of the smaller roughness √(uᵀ C⁻¹ u)
-is the likelier one.
+C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance of two electrodes at rest. This is a
+weaker assumption than the elasticity of a patch and needs no material constant. It provides starts for
+solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the smaller roughness
+√(uᵀ C⁻¹ u) is likelier.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. With 1.0 the guided start finds 3204 of the 3209 wires that are on the
-branch of the rest position, in 82 random presses each of 70 % on staggered, h = 0.5, and 10, 30 and 50 % on
+"""Correlation length ℓ, pitches. At 1.0 the guided start finds 3204 of the 3209 wires that are on the branch
+of the rest position, in 82 random presses each of 70 % on staggered, h = 0.5, and of 10, 30 and 50 % on
 h = 1; 0.7 and 1.5 lose more."""
 ROUGH_SHARE: Final = 1e-3
-"""Share of C on its diagonal alone, so that C⁻¹ exists in floating point."""
+"""Relative increase of the diagonal of C, so that C⁻¹ exists in floating point."""
 
 
 class Smoothness:
@@ -31,7 +31,7 @@ class Smoothness:
         problem: The patch.
 
     Attributes:
-        covariance: (U, n, n) C, pitches², with n = 3N coordinates a wire.
+        covariance: (U, n, n) C, pitches², with n = 3N coordinates per wire.
         whitening: (U, N, N) inverse of the Cholesky factor of one coordinate's C, 1/pitch.
     """
 
@@ -54,7 +54,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """(U, n, n) C and its whitening for displacements of ``size``, pitches, which hardly matters."""
+    """Return C (U, n, n) and its whitening for displacements of ``size``, pitches, which hardly matters."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

@@ -1,9 +1,9 @@
-"""Starts of a solve at a sample of a path, or at a frame, to which no earlier solution leads.
+"""Starts for solving a sample or frame that cannot be reached from an earlier solution.
 
-guided_start   the smooth displacement that explains the resistances: the maximum a posteriori estimate,
-               followed from much noise to none (data-space Gauss-Newton, Tarantola 2005, section 3.4)
-near_twin      if J is close to singular, a second root lies close by, on the other side of the fold. To
-               second order along the direction v that J maps onto the least, σ α + ½ α² wᵀF″[v, v] = 0 has
+guided_start   finds the smooth displacement that explains the resistances, the maximum a posteriori estimate,
+               while the noise is lowered in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4)
+near_twin      if J is nearly singular, a second root lies nearby on the other side of the fold. To second
+               order, along the direction v of the smallest singular value σ, σ α + ½ α² wᵀF″[v, v] = 0 puts
                the twin at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer 1985, chapter I.3)
 """
 
@@ -22,12 +22,12 @@ from skinnode.solve.linalg.vectors import Index, dot, largest, padded
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
-"""Standard deviations of r that the guided start goes through, 0.1 to 3e-8, one step each. Whole decades lose
-one wire in a hundred more at h = 1 and 50 %."""
+"""Noise levels of r in the guided start, 0.1 to 3e-8, with one step per level. Steps of a whole decade lose
+one more wire in a hundred at h = 1 and 50 %."""
 POWER_STEPS: Final = 8
-"""Number of inverse iterations: singular values next to the least one are some 3 times larger."""
+"""Number of inverse iterations; the second-smallest singular value is about 3 times the smallest."""
 DIFFERENCE: Final = 1e-4
-"""Step of the second derivative, pitches: about eps^(1/3) and far below any clearance."""
+"""Step for the second derivative, pitches: about eps^(1/3), far below any clearance."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:
@@ -37,12 +37,12 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         problem: The patch.
         wire: Index of the upper wire.
         a: (K,) R · gain of the wire.
-        covariance: (n, n) prior covariance of the displacement, pitches². Any will do; the covariance of
-            elastic rubber would know the neighbouring wires as well.
+        covariance: (n, n) prior covariance of the displacement, pitches². Any covariance works; that of
+            elastic rubber would also use the neighbouring wires.
 
     Returns:
-        (n,) position, pitches, the rest position if the iteration runs into an electrode; and the number of
-        evaluations of F with J.
+        (n,) position, pitches, and the number of evaluations of F with J. The position is the rest position
+        if the iteration runs into an electrode.
     """
     n, equations = problem.rest.shape[1], a.size
     x = problem.rest[wire].copy()
@@ -68,10 +68,10 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
     inner: Float,
     pivot: Index,
 ) -> int:
-    """Take one Gauss-Newton step a noise level, C Jᵀ (J C Jᵀ + σ²)⁻¹ y with y = J (x − rest) − r, into ``x``.
+    """Take one Gauss-Newton step per noise level in place: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
 
-    All arguments after ``noises`` are scratch, ``inner`` with zeros as :func:`lu_factor` needs it. Returns
-    the number of evaluations.
+    Here y = J (x − rest) − r. All arguments after ``noises`` are scratch; ``inner`` is padded with zeros for
+    :func:`lu_factor`. Returns the number of evaluations.
     """
     n, equations = jt.shape
     for level in range(noises.size):
@@ -112,13 +112,13 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 
 
 def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
-    """Estimate the root on the other side of the nearest fold, at the cost of two Jacobians.
+    """Estimate the root on the other side of the nearest fold from two Jacobians.
 
     Args:
         problem: The patch.
         x: (n,) root of a wire, pitches.
         a: (K,) R · gain of the wire.
-        inverse: (n, K) ∂x/∂r there.
+        inverse: (n, K) ∂x/∂r at ``x``.
 
     Returns:
         (n,) position, pitches; not finite if there is no fold to second order.

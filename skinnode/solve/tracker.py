@@ -1,8 +1,8 @@
-"""The tracker of a live stream: one frame in, one field out, by the method that suits the patch.
+"""Tracker of a live stream: computes one field per frame with the method that suits the patch.
 
-``exact`` inverts each wire on its own, as the paper does; ``posterior`` estimates the whole patch with its
-elastic prior. ``auto`` takes the exact inverse if the converter's noise leaves it accurate. Wires on which
-the exact inverse is doubtful are put to the posterior (:mod:`skinnode.solve.root_gate`).
+``exact`` inverts each wire separately, as the paper does; ``posterior`` estimates the whole patch with an
+elastic prior. ``auto`` chooses the exact inverse if it is accurate enough at the converter's noise. Wires on
+which the exact inverse is doubtful are checked with the posterior (:mod:`skinnode.solve.root_gate`).
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.root_gate import RootGate
 
 EXACT_STD: Final = 0.0025
-"""Standard deviation of the exact inverse at rest, clearances, up to which ``auto`` takes it: 2.5 % of a
-press of a tenth of the layer. 16-bit codes leave 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
+"""Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses it: 2.5 % of a
+press of a tenth of the layer. With 16-bit codes it is 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
 
 
 class Tracker:
-    """Follows one patch, frame by frame.
+    """Tracks one patch through a stream of frames.
 
-    One owner; the compiled part holds no GIL. Compiles its kernels on construction.
+    Not shared between owners. Compiled code releases the GIL. The constructor compiles the kernels.
 
     Args:
         layout: The patch.
         options: Options of the tracker; default :class:`skinnode.solve.options.TrackerOptions()`.
-        **arguments: Options by name, in place of those in ``options``.
+        **arguments: Options by name, which override ``options``.
 
     Attributes:
         layout: The patch.
-        options: The options in force.
-        method: ``exact`` or ``posterior``, whichever answers.
-        reason: Why, in a few words.
+        options: Options in effect.
+        method: Method in use, ``exact`` or ``posterior``.
+        reason: Short reason for the choice of method.
 
     Raises:
-        ValueError: If an option has the wrong shape or is out of its range.
+        ValueError: If an option has the wrong shape or is out of range.
     """
 
     def __init__(
@@ -86,17 +86,17 @@ class Tracker:
     ) -> FieldFrame:
         """Solve the displacement field of one frame.
 
-        No value raises. A wire that could not be solved holds its last trusted position, with an infinite
-        standard deviation and a status.
+        No resistance value raises an exception. A wire that could not be solved keeps its last trusted
+        position, with an infinite standard deviation and a status other than CONVERGED.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; a value that is not positive and finite is not used.
+            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: A number or (U, K), noise of this frame only. A resistance whose noise is not
-                positive and finite is not used.
+            relative_noise: A number or (U, K), noise of this frame only. Resistances whose noise is not
+                positive and finite are ignored.
 
         Returns:
-            The field, with one status a wire.
+            The field, with one status per wire.
 
         Raises:
             ValueError: If a shape is wrong.
@@ -107,18 +107,17 @@ class Tracker:
         return self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
-        """Solve the field of a scan of codes, in a fraction of the time of decoding and :meth:`update`.
+        """Solve the field of a scan given as codes, much faster than decoding and :meth:`update`.
 
         Args:
-            codes: (U, K) uint32, with the meaning given as ``codes`` on construction.
+            codes: (U, K) uint32, with the meaning passed to the constructor as ``codes``.
 
         Returns:
-            The field of the resistances and the noise that the codes stand for, and the number of codes that
-            were no measurement.
+            The field, as from the decoded resistances and their noise, and the number of invalid codes.
 
         Raises:
-            ValueError: If the shape or type is wrong, the tracker has no meaning of codes, or its
-                :attr:`method` is ``posterior``.
+            ValueError: If the shape or type is wrong, the tracker was created without ``codes``,
+                or its :attr:`method` is ``posterior``.
         """
         if self._exact is None:
             raise ValueError("method: got 'posterior', must be exact to take codes")
@@ -130,20 +129,20 @@ class Tracker:
 
 
 def _choose(layout: PatchLayout, options: TrackerOptions) -> tuple[str, str]:
-    """The method and why."""
+    """Return the method and the reason for it."""
     nuisances, normal_only = options.nuisances, options.normal_only
     if options.method != "auto":
         if options.method == "exact" and nuisances:
             raise ValueError(f"method: got 'exact' with {nuisances[0]}, must be posterior or auto")
-        return options.method, "asked for"
+        return options.method, "requested"
     if nuisances:
-        return "posterior", f"{' and '.join(nuisances)} asked for"
+        return "posterior", f"{' and '.join(nuisances)} requested"
     unknowns = layout.unknowns // 3 if normal_only else layout.unknowns
     if layout.shape[1] < unknowns:
-        return "posterior", f"{layout.shape[1]} lower wires for {unknowns} unknowns an upper wire"
+        return "posterior", f"{layout.shape[1]} lower wires for {unknowns} unknowns per upper wire"
     share = patch_std(layout, options.relative_noise, normal_only)
     chosen = "exact" if share <= EXACT_STD else "posterior"
     return chosen, (
-        f"the noise leaves the exact inverse a deviation of {100 * share:.2g} % of the clearance between the "
-        f"layers at rest, where {100 * EXACT_STD:g} % is the limit"
+        f"with this noise, the exact inverse has a standard deviation of {100 * share:.2g} % of the "
+        f"clearance between the layers at rest; the limit is {100 * EXACT_STD:g} %"
     )

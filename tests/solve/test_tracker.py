@@ -68,21 +68,21 @@ FEW = {"upper_wires": 4, "upper_electrodes": 4, "lower_electrodes": 5}
 @pytest.mark.parametrize(
     ("name", "sizes", "options", "method", "reason"),
     [
-        ("staggered", {}, {}, "exact", r"deviation of 0\.0\d+ % .* 0\.25 % is the limit"),
+        ("staggered", {}, {}, "exact", r"deviation of 0\.0\d+ % .* the limit is 0\.25 %"),
         (
             "staggered",
             {},
             {"relative_noise": 1e-3},
             "posterior",
-            r"deviation of \d.* % .* 0\.25 % is the limit",
+            r"deviation of \d.* % .* the limit is 0\.25 %",
         ),
-        ("aligned", {}, {}, "posterior", r"deviation of \d.* % .* 0\.25 % is the limit"),
+        ("aligned", {}, {}, "posterior", r"deviation of \d.* % .* the limit is 0\.25 %"),
         ("aligned", {}, {"relative_noise": 1e-9}, "exact", r"deviation of 0\.0\d+ %"),
         ("aligned", {}, {"normal_only": True}, "exact", r"deviation of 0\.\d+ %"),
         ("staggered", {"lower_wires": 29}, {}, "posterior", "29 lower wires for 30 unknowns"),
         ("staggered", {"lower_wires": 29}, {"normal_only": True}, "exact", "deviation of"),
-        ("staggered", {}, {"drift": "wire"}, "posterior", "drift asked for"),
-        ("staggered", {}, {"model_error": 0.01}, "posterior", "model_error asked for"),
+        ("staggered", {}, {"drift": "wire"}, "posterior", "drift requested"),
+        ("staggered", {}, {"model_error": 0.01}, "posterior", "model_error requested"),
         (
             "staggered",
             {},
@@ -90,8 +90,8 @@ FEW = {"upper_wires": 4, "upper_electrodes": 4, "lower_electrodes": 5}
             "posterior",
             "drift and estimate_noise",
         ),
-        ("staggered", {}, {"method": "posterior"}, "posterior", "asked for"),
-        ("aligned", {}, {"method": "exact"}, "exact", "asked for"),
+        ("staggered", {}, {"method": "posterior"}, "posterior", "requested"),
+        ("aligned", {}, {"method": "exact"}, "exact", "requested"),
     ],
 )
 def test_auto_takes_what_the_noise_allows_and_says_why(name, sizes, options, method, reason):

@@ -1,6 +1,6 @@
-"""Offline path following, the method of Xu et al. 2018: the samples of a press lead to the root of the last.
+"""Offline path following, after Xu et al. 2018: solves the last sample of a press by way of those before.
 
-``path`` is the entry: it solves a recorded press. ``step_control`` chooses the points to solve,
-``path_tracker`` holds every wire's position, ``predictor`` and ``corrector`` move it. ``root_selection``
-decides at the end which roots are believed.
+The entry point is ``path``, which solves a recorded press. ``step_control`` chooses the points to solve,
+``path_tracker`` stores the position of every wire, and ``predictor`` and ``corrector`` move the wires.
+``root_selection`` decides at the end which roots to accept.
 """

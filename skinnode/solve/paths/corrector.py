@@ -1,8 +1,8 @@
-"""The corrector of a path tracker: solves wires at positions of a path, and logs what each call cost.
+"""Corrector of a path tracker: solves wires at positions on a path and logs the cost of each call.
 
-Positions count samples from 0; the rest is at −1. Between two samples ``a`` is interpolated on a straight
-line. (1/a and log a do neither better nor worse: 0.3 to 1 pitch high, to 70 %, the counts of lost wires
-differ by their scatter.)
+Positions count samples from 0; the rest position is −1. Between two samples ``a`` is interpolated linearly.
+(Interpolating 1/a or log a makes no difference: with layers 0.3 to 1 pitch apart and presses to 70 %, the
+numbers of lost wires differ only by their scatter.)
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 REST: Final = -1.0
-"""Position of the rest on a path; the samples are at 0, 1, 2, …"""
+"""Path position of the undeformed patch; the samples are at 0, 1, 2, …"""
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """When a correction ends.
+    """Stopping criteria of a correction.
 
     Args:
-        tolerance: Of r, and of x in pitches.
-        max_steps: Maximum steps of the operator.
+        tolerance: Tolerance of r, and of x in pitches.
+        max_steps: Maximum number of operator steps.
     """
 
     tolerance: float
@@ -39,12 +39,12 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLog:
-    """The cost of every call of a corrector, S rows in order; NaN and 0 if a wire was left alone."""
+    """Cost of each call of a corrector, in S rows; NaN or 0 for a wire that the call skipped."""
 
     position: Float
-    """(S, U) position solved."""
+    """(S, U) position solved for."""
     steps: Index
-    """(S, U) steps of the operator."""
+    """(S, U) operator steps."""
     evaluations: Index
     """(S, U) evaluations of F with J."""
     optimality: Float
@@ -52,16 +52,16 @@ class PathLog:
 
 
 class Corrector:
-    """Solves the wires of one patch at positions of its path. One owner.
+    """Solves the wires of one patch at positions on its path. Not shared between owners.
 
     Args:
         problem: The patch.
         a: (T, U, K) R · gain of the samples.
-        operator: Code of the operator.
+        operator: Operator code.
 
     Attributes:
-        solver: Holds the position ``x`` of every wire and the report of the last call.
-        samples: T.
+        solver: Solver with the position ``x`` of every wire and the report of the last call.
+        samples: Number of samples, T.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -78,7 +78,7 @@ class Corrector:
 
     @property
     def rows(self) -> int:
-        """Calls logged."""
+        """Number of logged calls."""
         return len(self._rows)
 
     def log(self) -> PathLog:
@@ -91,12 +91,12 @@ class Corrector:
         return np.asarray(self._knots[sample + 1])
 
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
-        """Log the ``evaluations`` (U,) that a start at the last sample took on these wires (U,)."""
+        """Log the ``evaluations`` (U,) spent on computing starts at the last sample for these wires (U,)."""
         nothing = np.full(len(evaluations), math.nan)
         self._rows.append((np.where(wires_, self.last, nothing), evaluations, evaluations, nothing))
 
     def a_at(self, position: Float | float) -> Float:
-        """Return R · gain (U, K) of every wire at its position (U,), or of all wires at one sample."""
+        """Return R · gain (U, K) of each wire at its own position (U,), or of all wires at one sample."""
         if isinstance(position, float):
             return np.asarray(self._knots[int(position) + 1].copy())
         before = np.clip(np.floor(position).astype(np.int64), -1, self.samples - 2)
@@ -114,14 +114,14 @@ class Corrector:
         tasks: int = 0,
         operator: int | None = None,
     ) -> None:
-        """Solve wires from where they are, into ``solver``, and log the cost.
+        """Solve wires from their current positions, leave the result in ``solver`` and log the cost.
 
         Args:
-            todo: (U,) LEAVE, SOLVE or PREDICT for each wire (:mod:`skinnode.solve.wires.arrays`).
-            position: (U,) position of each wire, or one sample for all.
-            accuracy: When a wire is done.
-            tasks: Tasks of the driver, or-ed together.
-            operator: Code of the operator; default the corrector's.
+            todo: (U,) LEAVE, SOLVE or PREDICT per wire (:mod:`skinnode.solve.wires.arrays`).
+            position: (U,) position of each wire, or one sample for all wires.
+            accuracy: Stopping criteria.
+            tasks: Driver tasks, combined with bitwise or.
+            operator: Operator code; default: the operator of the corrector.
         """
         solver = self.solver
         solver.solve(

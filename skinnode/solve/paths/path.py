@@ -1,8 +1,8 @@
-"""The paper's method: the samples taken during a press lead the solver to the last one.
+"""Path following as in the paper: solves the last sample of a press by way of the earlier samples.
 
-H(X, t) = F(X) − ρ / R(t); X(0) is the grid at rest, and each sample is solved from the solution of the one
-before (Lahaye; Xu et al. 2018, section 3.2). Step control (:mod:`skinnode.solve.paths.step_control`) chooses
-the samples, their tolerance and the points between them.
+H(X, t) = F(X) − ρ / R(t); X(0) is the grid at rest, and each sample is solved from the solution of the
+previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
+(:mod:`skinnode.solve.paths.step_control`) chooses the samples, their tolerance and points between samples.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.wires.problem import PatchProblem
 
 SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
-"""Accuracy of a root looked for on the posterior's word: the paper's final tolerance, and its maximum steps
-of an intermediate sample."""
+"""Accuracy of a solve started from the posterior: the paper's final tolerance, with its maximum number of
+steps for an intermediate sample."""
 STARTS: Final = 12
-"""Starts, drawn from the posterior, from which another root is looked for if a layout has folds; every call
-draws the same."""
+"""Number of random starts for the search for other roots if a layout has folds. The starts are drawn from the
+posterior with a fixed seed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathResult:
-    """End of a path, and cost of each point on it.
+    """Result at the end of a path, and the cost of each point on it.
 
-    Row s of the last four arrays is one call of the solver, in order; a wire that the call left alone has a
-    position and an optimality of NaN. After the first row at the last sample come second tries and checks.
+    Row s of the last four arrays describes solver call s. A wire that the call skipped has a position and an
+    optimality of NaN. Rows after the first one at the last sample are second attempts and checks.
     """
 
     upper_m: Float
     """(U, N, 3) electrodes at the last sample, metres."""
     displacement_m: Float
-    """(U, N, 3) from the rest position."""
+    """(U, N, 3) displacement from the rest position, metres."""
     status: tuple[Status, ...]
-    """One for each upper wire."""
+    """Status of each upper wire."""
     error_estimate_m: Float
-    """(U,) metres, largest error of a coordinate left by tolerance and rounding, given exact samples; inf if
+    """(U,) largest coordinate error due to tolerance and rounding if the samples are exact, metres; inf if
     unknown."""
     residual: Float
     """(U,) RMS of F/b − 1 at the end."""
     cycle: int | None
-    """Samples between two solves, if step control found or was given a cycle."""
+    """Samples from one solve to the next, if step control found a cycle or was given one."""
     searched: int
-    """Rows spent on the search for the cycle; the rows after them are the path."""
+    """Number of leading rows spent on the search for the cycle; the path itself follows."""
     position: Float
-    """(S, U) sample solved, from 0; 1.5 is halfway from sample 1 to sample 2, −1 the rest."""
+    """(S, U) sample solved, from 0; 1.5 is halfway between samples 1 and 2, and −1 is the rest position."""
     steps: NDArray[np.int64]
-    """(S, U) steps of the operator; 0 if the sample was skipped."""
+    """(S, U) operator steps; 0 if the sample was skipped."""
     evaluations: NDArray[np.int64]
     """(S, U) evaluations of F with J."""
     optimality: Float
@@ -83,20 +83,19 @@ def solve_path(
     schedule: Schedule | None = None,
     baseline_ohm: ArrayLike | None = None,
 ) -> PathResult:
-    """Follow a press through its resistances from the rest position to the last sample.
+    """Follow a press from the rest position to its last sample.
 
-    A wire can end on another branch of F = b than the skin: if its Jacobian changed the sign of its
-    determinant on the way, if its electrodes left their side of the lower layer, or if a second root as
-    smooth lies across a fold nearby. It is then ILL_CONDITIONED, not CONVERGED. The skin itself can pass a
-    fold; such a root is believed if the samples led across and the posterior of the patch comes to the same
-    root.
+    A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b that the skin is
+    not on: the determinant of its Jacobian changed sign on the way, its electrodes crossed to the other side
+    of the lower layer, or an equally smooth root lies across a nearby fold. The skin itself can pass a fold.
+    A root across a fold is accepted if the path led there and the posterior of the patch finds the same root.
 
     Args:
-        layout: The patch, with at least as many lower wires as unknowns a wire (K ≥ 3N).
-        samples_ohm: (T, U, K) resistances, ohm, in the order they were taken; the last is the frame wanted.
+        layout: The patch, with at least as many lower wires as unknowns per wire (K ≥ 3N).
+        samples_ohm: (T, U, K) resistances, ohm, in time order; the last sample is the frame to solve.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
         schedule: Step control: ``Uniform()`` by default, ``Periodic()`` or ``Adaptive()``.
-        baseline_ohm: (U, K) resistances measured at rest, ohm; the resistivity and gain then cancel.
+        baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
 
     Returns:
         Positions at the last sample, a status for each wire, and the cost.
@@ -111,14 +110,14 @@ def solve_path(
         raise ValueError(f"samples_ohm: got {samples[where]} at {list(where)}, must be positive")
     if layout.shape[1] < layout.unknowns:
         raise ValueError(
-            f"layout: got {layout.shape[1]} lower wires for {layout.unknowns} unknowns an upper wire, "
+            f"layout: got {layout.shape[1]} lower wires for {layout.unknowns} unknowns per upper wire, "
             "must be at least as many"
         )
     if schedule is not None and (isinstance(schedule, type) or not hasattr(schedule, "follow")):
         raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic(), Adaptive() or alike")
     problem = PatchProblem.of(layout, baseline_ohm)
     start = time.perf_counter()
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a diverged wire has a status
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # the status reports divergence
         tracker = PathTracker(problem, samples * problem.gain, code)
         (Uniform() if schedule is None else schedule).follow(tracker)
         estimate = None
@@ -148,7 +147,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Let the posterior of the patch select the roots of the last sample; its estimate, None if untrusted."""
+    """Select the roots of the last sample by the posterior; return its estimate, None if untrusted."""
     patch = Posterior(layout, relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False)
     field = patch.update(last_ohm)
     if not field.trusted:

@@ -1,8 +1,9 @@
-"""The path tracker: holds every wire's position along a press, and moves it by predictor and corrector.
+"""Path tracker: stores each wire's position along a press and moves it by predictor and corrector.
 
-Lahaye's tracker goes sample by sample (:meth:`PathTracker.solve`), the adaptive one wire by wire
-(:meth:`PathTracker.step`). Step control decides which (:mod:`skinnode.solve.paths.step_control`); what
-arrives at the last sample is checked by :mod:`skinnode.solve.paths.root_selection`.
+Lahaye's method solves all wires sample by sample (:meth:`PathTracker.solve`); adaptive step control advances
+each wire separately (:meth:`PathTracker.step`). The schedule chooses between them
+(:mod:`skinnode.solve.paths.step_control`). Roots at the last sample are checked by
+:mod:`skinnode.solve.paths.root_selection`.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from skinnode.solve.wires.problem import PatchProblem
 
 @dataclass(slots=True, eq=False)
 class PathEnd:
-    """What came of the last sample, wire by wire."""
+    """Outcome of each wire at the last sample."""
 
     status: Index
-    """(U,)"""
+    """(U,) status codes."""
     residual: Float
     """(U,) RMS of F/b − 1."""
     error_estimate: Float
-    """(U,) pitches."""
+    """(U,) largest coordinate error due to tolerance and rounding, pitches."""
     inverse: Float
     """(U, n, K) ∂x/∂r."""
     side: Index
@@ -54,29 +55,29 @@ class PathEnd:
         )  # fmt: skip
 
     def restore(self, wires_: Mask, earlier: PathEnd) -> None:
-        """Take the outcome of these wires (U,) from an earlier copy."""
+        """Restore the outcome of these wires (U,) from an earlier copy."""
         for name in ("status", "residual", "error_estimate", "inverse", "side"):
             getattr(self, name)[wires_] = getattr(earlier, name)[wires_]
 
     def doubt(self, wires_: Mask) -> None:
-        """Make these wires (U,) ILL_CONDITIONED if they are CONVERGED."""
+        """Change the status of these wires (U,) from CONVERGED to ILL_CONDITIONED."""
         self.status[wires_ & (self.status == op.CONVERGED)] = op.ILL_CONDITIONED
 
 
 class PathTracker:
-    """Follows the samples of one press. One owner.
+    """Follows the samples of one press. Not shared between owners.
 
     Args:
         problem: The patch.
         a: (T, U, K) R · gain of the samples.
-        operator: Code of the operator.
+        operator: Operator code.
 
     Attributes:
         end: Outcome at the last sample, after :meth:`finish`.
-        cycle: Samples between two solves, if step control found or was given a cycle.
-        searched: Leading rows of the log that looked for the cycle.
-        second_tries: Whether a wire may be moved from where its path led it; if not, it is only doubted.
-        stumbled: (U,) wires that had to take a step back.
+        cycle: Samples from one solve to the next, if step control found a cycle or was given one.
+        searched: Number of leading log rows spent on the search for the cycle.
+        second_tries: Whether a wire may be moved off the end of its path; if not, only its status changes.
+        stumbled: (U,) wires of which at least one step was undone.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -104,7 +105,7 @@ class PathTracker:
 
     @property
     def smoothness(self) -> Smoothness:
-        """Smoothness of the patch, made on first use: most paths need none."""
+        """Smoothness of the patch, built on first use because most paths do not need it."""
         if self._smoothness is None:
             self._smoothness = Smoothness(self.problem)
         return self._smoothness
@@ -115,7 +116,7 @@ class PathTracker:
         return self.corrector.sample_a(self.samples - 1)
 
     def restart(self) -> None:
-        """Go back to the rest position."""
+        """Return all wires to the rest position."""
         self.solver.x[:] = self.problem.rest
         self.solver.inverse[:], self.solver.a_solved[:] = self._rest
         self._branch = self._rest_branch.copy()
@@ -126,16 +127,16 @@ class PathTracker:
     # -- sample by sample, as the paper does -----------------------------------------------------------
 
     def extrapolate(self, sample: int) -> None:
-        """Move every wire towards a sample on the secant, by the trust radius at most."""
+        """Move every wire along the secant towards a sample, by at most the trust radius."""
         (x_before, a_before), (x, a) = self._points
         a_next = self.corrector.sample_a(sample)
         secant(x_before, a_before, x, a, a_next, self.problem.step_limit, self.solver.x)
 
     def solve(self, sample: int, accuracy: Accuracy) -> Index:
-        """Solve a sample from where the wires are.
+        """Solve a sample from the current positions of the wires.
 
         Returns:
-            (U,) steps; 0 if the first-order optimality was below the tolerance already.
+            (U,) steps; 0 if the first-order optimality was already below the tolerance.
         """
         self.corrector.correct(self._everywhere, float(sample), accuracy, tasks=wires.SKIP)
         self._points = [self._points[1], (self.solver.x.copy(), self.corrector.sample_a(sample))]
@@ -145,7 +146,7 @@ class PathTracker:
         return np.asarray(self.solver.report[:, wires.STEPS].copy())
 
     def finish(self, accuracy: Accuracy, todo: Mask | None = None) -> None:
-        """Solve the last sample to the final accuracy, on the wires in ``todo`` (U,) or all."""
+        """Solve the last sample to the final accuracy, on the wires in ``todo`` (U,); default all wires."""
         todo = np.ones(self.wires, bool) if todo is None else todo
         self.take(todo, accuracy)
         self._path_end = self.solver.x.copy()
@@ -163,7 +164,7 @@ class PathTracker:
         """Predict and correct the wires in ``todo`` (U,) to their ``position`` (U,).
 
         Returns:
-            (U,) wires that came to a root on the branch of the rest. The others stay where they were.
+            (U,) wires that reached a root on the branch of the rest position. The others do not move.
         """
         solver = self.solver
         before = solver.x.copy(), solver.inverse.copy(), solver.a_solved.copy()
@@ -185,9 +186,9 @@ class PathTracker:
         operator: int | None = None,
         also: Callable[[], Mask] | None = None,
     ) -> None:
-        """Solve the last sample on the wires in ``todo`` (U,), and keep the outcome in :attr:`end`.
+        """Solve the last sample on the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
 
-        A root across a fold is not CONVERGED, unless ``also`` returns True for its wire.
+        A root across a fold is ILL_CONDITIONED unless ``also`` returns True for its wire.
         """
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self.corrector.correct(call, self.corrector.last, accuracy, tasks=wires.COVARIANCE, operator=operator)
@@ -201,19 +202,19 @@ class PathTracker:
         end.inverse[todo] = solver.inverse[todo]
 
     def try_root(self, todo: Mask, accuracy: Accuracy) -> None:
-        """Solve the last sample on the wires in ``todo`` (U,) into the solver's report only."""
+        """Solve the last sample on the wires in ``todo`` (U,) without changing :attr:`end`."""
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self.corrector.correct(call, self.corrector.last, accuracy, operator=op.LEVENBERG_MARQUARDT)
 
     def on_branch(self) -> Mask:
-        """Return the wires (U,) whose last solve came to a root on the branch of the rest position."""
+        """Return the wires (U,) whose last solve reached a root on the branch of the rest position."""
         report = self.solver.report
         return roots.on_rest_branch(
             report[:, wires.STATUS], report[:, wires.BRANCH], self._rest_branch, self.out_of_reach()
         )
 
     def at_path_end(self) -> Mask:
-        """Return the wires (U,) that are where the samples led, and within reach."""
+        """Return the wires (U,) that are at the end of their path and within reach."""
         apart = roots.distance(self.solver.x, self._path_end)
         size = roots.distance(self._path_end, self.problem.rest)
         return np.asarray((apart <= roots.SAME_ROOT * size) & ~self.out_of_reach())

@@ -1,4 +1,4 @@
-"""Predictors of a path tracker: where the next point of a path lies, from the points solved."""
+"""Predictors of a path tracker: estimate the next point on a path from the points already solved."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from skinnode.compiled.jit import njit
 from skinnode.model.layout import Float
 
 SQUARE_FLOOR: Final = 1e-300
-"""Least square of a change that is divided by."""
+"""Smallest squared change used as a divisor."""
 
 
 def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
-    """Predict positions by Euler's step along ∂x/∂R.
+    """Predict positions by an Euler step along ∂x/∂R.
 
     Args:
         x: (U, n) last solution of each wire, pitches.
-        inverse: (U, n, K) ∂x/∂r there.
-        a_solved: (U, K) R · gain there.
+        inverse: (U, n, K) ∂x/∂r at ``x``.
+        a_solved: (U, K) R · gain at ``x``.
         a: (U, K) R · gain at the next point.
 
     Returns:
@@ -34,18 +34,18 @@ def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
 def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the limit and the output
     x_before: Float, a_before: Float, x: Float, a: Float, a_next: Float, reach: float, out: Float
 ) -> None:
-    """Predict positions on the secant through the last two points solved.
+    """Predict positions on the secant through the last two solved points.
 
-    The share of the last move is the share of the last change of ``a`` in the next one. A wire whose
-    prediction is not finite stays at ``x``.
+    The last move is scaled by the projection of the next relative change of ``a`` onto the last one. A wire
+    whose prediction is not finite stays at ``x``.
 
     Args:
-        x_before: (U, n) position at the point before the last, pitches.
-        a_before: (U, K) R · gain there.
+        x_before: (U, n) position at the second-to-last point, pitches.
+        a_before: (U, K) R · gain at ``x_before``.
         x: (U, n) position at the last point, pitches.
-        a: (U, K) R · gain there.
+        a: (U, K) R · gain at ``x``.
         a_next: (U, K) R · gain at the next point.
-        reach: Largest move of a coordinate, pitches.
+        reach: Largest allowed move of a coordinate, pitches.
         out: (U, n) predicted positions, pitches.
     """
     for u in range(x.shape[0]):

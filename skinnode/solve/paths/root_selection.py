@@ -1,7 +1,7 @@
-"""Root selection at the end of a path: second tries, and which of the roots found is believed.
+"""Root selection at the end of a path: second attempts, and the choice of the root to accept.
 
-The thresholds are in :mod:`skinnode.solve.roots`. All functions work on :attr:`PathTracker.end` and the
-solver's positions in place. A root that is refused becomes ILL_CONDITIONED.
+The thresholds are in :mod:`skinnode.solve.roots`. All functions change :attr:`PathTracker.end` and the
+solver's positions in place. A rejected root becomes ILL_CONDITIONED.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum steps from a guided start: it is next to its root, 1 to 20 steps, or next to none."""
+"""Maximum steps from a guided start: a start near a root takes 1 to 20 steps, other starts never arrive."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
 """Accuracy of a root that is only compared with another: below √eps two roots differ by far more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchEstimate:
-    """Estimate of the whole patch that roots are compared with."""
+    """Estimate of the whole patch, used to check roots."""
 
     x: Float
     """(U, n) positions, pitches."""
@@ -43,20 +43,20 @@ class PatchEstimate:
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return the wires (U,) without a root, with one too rough for a press, or that took a step back."""
+    """Return the wires (U,) that have no root, have a root too rough for a press, or had a step undone."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again from the smoothest displacement that explains it; keep the smoother root.
 
-    If that leads to a root across a fold, its twin on this side is solved for. A wire on which neither is a
-    root is not CONVERGED afterwards.
+    If that leads to a root across a fold, the twin of that root on the near side is solved for. A wire for
+    which neither solve finds a root is not CONVERGED afterwards.
 
     Args:
-        tracker: At the end of its path.
+        tracker: Tracker at the end of its path.
         todo: (U,) wires to solve again.
-        accuracy: Of the last sample.
+        accuracy: Accuracy at the last sample.
     """
     if not todo.any():
         return
@@ -84,7 +84,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Refuse a rough root that is not the smoothest to be found, and move no wire."""
+    """Reject each rough root for which :func:`guide` finds a smoother one; moves no wire."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()
@@ -100,8 +100,8 @@ def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
 def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accuracy: Accuracy) -> None:
     """Compare every root with an estimate of the whole patch.
 
-    A wire that the estimate does not confirm, or that has no root, is solved from the estimate. The new root
-    may lie across a fold, which the skin itself can pass, if the samples led to the same root.
+    A wire that has no root, or a root that the estimate does not confirm, is solved from the estimate. The
+    new root may lie across a fold, which the skin itself can pass, if the path led to the same root.
     """
     solver, end = tracker.solver, tracker.end
     todo = ~(estimate.agrees(solver.x) & end.converged)
@@ -127,16 +127,16 @@ def keep_likeliest(
     unlikely: Float,
     accuracy: Accuracy,
 ) -> None:
-    """Look for other roots, from their twins and from ``starts``, and keep the likeliest.
+    """Search for other roots from the twins and from ``starts``, and keep the likeliest root.
 
     A root is CONVERGED only if no other comes within ``unlikely`` of its energy.
 
     Args:
         tracker: At the end of its path.
         starts: (S, U, n) positions, pitches.
-        energy: −2 log of the density of a displacement field (U, n), pitches, to a constant.
-        unlikely: (U,) energy by which other roots must be less likely.
-        accuracy: Of the root that is kept.
+        energy: −2 log of the density of a displacement field (U, n), pitches, up to a constant.
+        unlikely: (U,) energy difference above which a less likely root is ruled out.
+        accuracy: Accuracy of the root that is kept.
     """
     solver, end, rest = tracker.solver, tracker.end, tracker.problem.rest
     found = solver.x.copy()
@@ -169,9 +169,9 @@ def keep_likeliest(
 
 
 def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
-    """Refuse a root that has a twin as smooth on the other side of a fold.
+    """Reject roots that have an equally smooth twin on the other side of a fold.
 
-    If there is an ``estimate`` of the patch, a twin that it does not confirm is ignored.
+    Given an ``estimate`` of the patch, a twin that the estimate does not confirm is ignored.
     """
     layout = tracker.problem.layout
     if layout.shape[1] != layout.unknowns:
@@ -193,7 +193,7 @@ def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
 
 
 def _twins(tracker: PathTracker) -> Float:
-    """(U, n) estimates of the roots across the nearest folds, NaN for wires that are not CONVERGED."""
+    """Return estimates (U, n) of the roots across the nearest folds; NaN for wires that are not CONVERGED."""
     x, end, last_a = tracker.solver.x, tracker.end, tracker.last_a
     twins = np.full_like(x, math.nan)
     for u in np.flatnonzero(end.converged).tolist():

@@ -1,6 +1,7 @@
-"""Step control: which points of a path to solve, and to what tolerance.
+"""Step control: chooses the points of a path to solve, and their tolerances.
 
-A schedule leads a :class:`skinnode.solve.paths.path_tracker.PathTracker` from the rest to the last sample.
+A schedule moves a :class:`skinnode.solve.paths.path_tracker.PathTracker` from the rest position to the last
+sample.
 """
 
 from __future__ import annotations
@@ -19,48 +20,48 @@ from skinnode.solve.paths.predictor import SQUARE_FLOOR
 from skinnode.solve.paths.root_selection import doubt_rough, doubtful, guide
 
 RELAXED_TOLERANCES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Intermediate tolerances of figure 10, from tight to loose."""
+"""Intermediate tolerances of the paper's figure 10, from tight to loose."""
 MISS: Final = 0.2
-"""Wanted distance between the corrected and the predicted point, in first trust radii."""
+"""Target distance between the corrected and the predicted point, in initial trust radii."""
 SHRINK: Final = 0.5
 GROW: Final = 4.0
-"""Largest growth of a step length at once (Allgower & Georg 1990, section 6.1: factor 2 to 4)."""
+"""Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1: factor 2 to 4)."""
 SHORTEST: Final = 1 / 64
-"""Shortest step as a share of the path: at a fold, halving would never end."""
+"""Shortest step as a fraction of the path; at a fold, halving would never end."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
-"""Accuracy of an intermediate point: below √eps a root is certain enough for its ∂X/∂R to be kept, and Newton
-takes 5 steps from a contraction of 1/2 to 1e-9."""
+"""Accuracy of an intermediate point: below √eps a root is accurate enough to keep its ∂X/∂R, and Newton takes
+5 steps from a contraction of 1/2 to 1e-9."""
 
 
 class Schedule(Protocol):
-    """Step control: any object that can lead a path tracker to the end of a path."""
+    """Protocol of step control: any object that can move a path tracker to the end of its path."""
 
     def follow(self, tracker: PathTracker) -> None:
-        """Lead ``tracker`` from the rest to its last sample, and finish it."""
+        """Move ``tracker`` from the rest position to its last sample, and finish it."""
         ...
 
 
 @dataclass(frozen=True)
 class Uniform:
-    """Solve ``steps`` of the samples, spread evenly; the last sample is always among them.
+    """Schedule that solves ``steps`` evenly spaced samples, always including the last.
 
-    The other defaults are the paper's protocol (section 4).
+    The other defaults follow the paper's protocol (section 4).
 
     Args:
-        steps: Number of samples to solve; default all, and all if there are fewer.
-        plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave a
-            wire where the last sample left it. Otherwise each sample starts on the secant through the two
-            solutions before, and a wire without a root, or with a rough one, has a second try from the
-            smoothest displacement that explains the last sample. On staggered, h = 1, with 10 samples of 21
-            presses of 50 %, the secant alone loses none of 197 wires instead of 7, in 2.9 evaluations a
-            sample instead of 4.
-        intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples but the last.
+        steps: Number of samples to solve; default all. All samples are solved if there are fewer.
+        plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
+            each wire where the last sample put it. Otherwise each sample starts on the secant through the
+            last two solutions, and a wire with no root or a rough root is solved again from the smoothest
+            displacement that explains the last sample. On staggered, h = 1, with 10 samples of 21 presses of
+            50 %, the secant alone loses no wire of 197 instead of 7, with 2.9 evaluations per sample
+            instead of 4.
+        intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
-        intermediate_steps: Maximum steps of the operator at all samples but the last.
-        final_steps: Maximum steps at the last sample.
+        intermediate_steps: Maximum operator steps at all samples except the last.
+        final_steps: Maximum operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite or a number is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite or a count is not an integer of at least 1.
     """
 
     steps: int | None = None
@@ -76,7 +77,7 @@ class Uniform:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Solve each chosen sample from the solution of the one before."""
+        """Solve each chosen sample from the solution of the previous one."""
         count = tracker.samples if self.steps is None else min(self.steps, tracker.samples)
         accuracy = Accuracy(self.intermediate_tolerance, self.intermediate_steps)
         for part in range(1, count):
@@ -89,30 +90,32 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Periodic:
-    """Solve one sample a cycle T (section 5.2).
+    """Schedule that solves one sample per cycle T (section 5.2).
 
-    Between two solves the tracked point stays within the relaxed tolerance, so that the samples between add
+    Between two solves the tracked point stays within the relaxed tolerance, so the samples in between add
     nothing.
 
-    The cycle is found on the samples themselves. They are followed from the rest at 1e-6, 1e-5, …; a sample
-    whose first-order optimality is below the tolerance is skipped. When the skips have a period, T is the
-    median number of samples from one solve to the next, on the wire that needs the most solves. Then the
-    path starts again with every T-th sample at that tolerance; the last sample is always among them. If no
-    tolerance shows a cycle of at least two samples that comes at least twice, every sample is solved at 1e-6.
+    The cycle is found on the samples themselves. The samples are followed from the rest position at 1e-6,
+    1e-5, …, skipping each sample whose first-order optimality is below the tolerance. When the solves have a
+    period, T is the median number of samples from one solve to the next, on the wire that needs the most
+    solves. The path then starts again and solves every T-th sample at that tolerance, and always the last
+    sample. If no tolerance shows a cycle of at least two samples that occurs at least twice, every sample is
+    solved at 1e-6.
 
-    The paper's tolerance is of MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times that of r = a F − 1 in
-    pitches here. F depends on the unit of length, which the paper does not print.
+    The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value here,
+    where r = a F − 1 in pitches. F depends on the unit of length, which the paper does not state.
 
     Args:
-        cycle: T, if an earlier press of that size and rate showed it; the search is skipped then.
-        plain: As in :class:`Uniform`. The search is always plain: Lahaye's start is what has the cycle.
-        intermediate_tolerance: Tolerance with ``cycle``; the paper's 1e-4.
+        cycle: T, if known from an earlier press of the same size and rate; skips the search.
+        plain: As in :class:`Uniform`. The search is always plain, since the cycle is a property of Lahaye's
+            start.
+        intermediate_tolerance: Tolerance if ``cycle`` is given; default the paper's 1e-4.
         final_tolerance: Tolerance at the last sample.
-        intermediate_steps: Maximum steps of the operator at all samples but the last.
-        final_steps: Maximum steps at the last sample.
+        intermediate_steps: Maximum operator steps at all samples except the last.
+        final_steps: Maximum operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite or a number is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite or a count is not an integer of at least 1.
     """
 
     cycle: int | None = None
@@ -128,7 +131,7 @@ class Periodic:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Find the cycle, go back to the rest, solve at the end of each cycle."""
+        """Find the cycle, return to the rest position, and solve at the end of each cycle."""
         tracker.cycle, tolerance = self.cycle, self.intermediate_tolerance
         if tracker.cycle is None:
             tracker.cycle, tolerance = self._search(tracker)
@@ -143,7 +146,7 @@ class Periodic:
         _finish(tracker, self)
 
     def _search(self, tracker: PathTracker) -> tuple[int | None, float]:
-        """The cycle and the tolerance that shows it."""
+        """Return the cycle, None if not found, and the tolerance that shows it."""
         for tolerance in RELAXED_TOLERANCES:
             tracker.restart()
             accuracy = Accuracy(tolerance, self.intermediate_steps)
@@ -173,27 +176,28 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Solve as few points as each wire needs, on the samples or between them, where R is interpolated.
+    """Schedule that solves as few points per wire as it can, interpolating R between samples.
 
-    Every wire has its own step length: Euler's step along ∂X/∂R from the factors of the last Jacobian, then
-    the operator. The next step is as long as keeps Newton's contraction: Euler's error grows with its square
-    (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance between the layers. A step
-    that does not come to a root on the branch of the rest is taken back and halved.
+    Each wire has its own step length and takes an Euler step along ∂X/∂R from the factors of the last
+    Jacobian, then operator steps. The next step length is chosen to keep Newton's contraction: Euler's error
+    grows with its square (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance
+    between the layers. A step that does not reach a root on the branch of the rest position is undone and
+    halved.
 
-    A straight line of R is no deformation of rubber, and can meet a fold that the press itself does not
-    meet. A wire that gets stuck there, or arrives at a root too rough to be a press, is solved by
+    A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
+    meet. A wire that gets stuck there, or arrives at a root too rough for a press, is solved by
     Levenberg-Marquardt, whatever the operator, from the smoothest displacement that explains the last sample
     (:func:`skinnode.solve.starts.guided_start`), and keeps the smoother of the two roots.
 
-    The first and the last sample are enough: the rest and the frame wanted.
+    Two samples are enough: the patch at rest and the frame to solve.
 
     Args:
-        points: Maximum points of the path that a wire may try.
+        points: Maximum number of path points that a wire may try.
         final_tolerance: Tolerance of r, and of x in pitches, at the last sample.
-        final_steps: Maximum steps of the operator at the last sample.
+        final_steps: Maximum operator steps at the last sample.
 
     Raises:
-        ValueError: If a tolerance is not positive and finite or a number is not an integer of at least 1.
+        ValueError: If a tolerance is not positive and finite or a count is not an integer of at least 1.
     """
 
     points: int = 50
@@ -205,7 +209,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Predict, correct, choose the next step length; then finish what arrived and guide the rest."""
+        """Predict, correct and choose step lengths; then finish wires that arrived and guide the others."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)
@@ -230,7 +234,7 @@ class Adaptive:
 
 
 def _finish(tracker: PathTracker, how: Uniform | Periodic) -> None:
-    """Solve the last sample, and check what does not seem to be the root."""
+    """Solve the last sample, and check doubtful roots."""
     accuracy = Accuracy(how.final_tolerance, how.final_steps)
     if not how.plain:
         tracker.extrapolate(tracker.samples - 1)
@@ -248,7 +252,7 @@ def _require_count(name: str, value: int) -> None:
 
 
 def _require(options: object, *names: str) -> None:
-    """ValueError unless the tolerances are positive and the numbers of steps at least 1."""
+    """Raise ValueError unless the tolerances are positive and the numbers of steps at least 1."""
     for name in names:
         value = getattr(options, name)
         if name.endswith("steps"):

@@ -1,8 +1,9 @@
-"""The whole patch as one Bayesian estimate, followed through a stream of frames.
+"""Bayesian estimate of a whole patch, tracked through a stream of frames.
 
-``posterior`` is the entry: a stream of frames in, fields out. Each frame becomes an ``observation``;
-``gating`` tests by χ² which wires moved; ``map_estimate`` finds the maximum a posteriori displacement by
-steps of ``measurement_update`` (the linear algebra of one step). The prior is ``prior`` (elasticity) with
-the loads of ``load_prior``; ``hyperparameters`` sets its scale and the noise by the evidence.
-``load_posterior`` gives the loads after a frame, and ``contacts`` what they form.
+The entry point is ``posterior``, which turns a stream of frames into fields. Each frame becomes an
+``observation``; ``gating`` tests by χ² which wires moved; ``map_estimate`` finds the maximum a posteriori
+displacement in steps of ``measurement_update`` (the linear algebra of one step). The prior combines
+elasticity (``prior``) with expected loads (``load_prior``); ``hyperparameters`` sets its scale and the noise
+from the evidence. ``load_posterior`` estimates the loads of a frame, and ``contacts`` groups them into
+contacts.
 """

@@ -1,11 +1,12 @@
-"""Contacts on the skin, from the posterior of the loads.
+"""Contacts on the skin, found from the posterior of the loads.
 
-The prior's loads q ~ N(0, s² D) move the electrodes by u = G q + slack. Given the displacement their mean is
-D Gᵀ C⁻¹ u; after the frame the variance of any sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the notation of
-:mod:`skinnode.solve.posterior.measurement_update`.
+The loads q ~ N(0, s² D) of the prior move the electrodes by u = G q + slack. Given the displacement, the mean
+of q is D Gᵀ C⁻¹ u. Given the frame, the variance of a sum wᵀ q is s² wᵀ D w − ‖L⁻¹ J G s² D w‖², in the
+notation of :mod:`skinnode.solve.posterior.measurement_update`.
 
-Single cells are noisy and their neighbours make up for it, so contacts are found in sums of 3 × 3 cells. The
-cells that press significantly, and not much less than the strongest, form contacts with their neighbours.
+Errors of single cells are large and cancel between neighbours, so contacts are found in sums of 3 × 3 cells.
+Cells whose sum is significant, and not much smaller than the largest sum, form contacts with their
+neighbours.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 from skinnode.solve.posterior.prior import ElasticPrior
 
 SIGNIFICANT: Final = 5.0
-"""Standard deviations by which a sum of cells must press to be part of a contact: with 200 sums a frame,
-noise does so once in some ten thousand frames."""
+"""Significance, in standard deviations, that a sum needs to be part of a contact: with 200 sums per frame,
+noise reaches it about once in ten thousand frames."""
 RELEVANT: Final = 0.25
-"""Share of the strongest sum that another sum must reach: the flanks of a contact ring at a tenth."""
+"""Fraction of the largest sum that another sum must exceed; ringing beside a contact reaches a tenth."""
 HERTZ_SPREAD: Final = 2.5
-"""a² over the mean of r² under Hertz's pressure √(1 − r²/a²)."""
+"""Ratio of a² to the mean of r² under Hertz's pressure √(1 − r²/a²)."""
 
 
 class ContactFinder:
@@ -61,7 +62,7 @@ class ContactFinder:
             loads: Posterior of the loads.
 
         Returns:
-            (U, N, 3) forces on the cells of the electrodes, N; and the contacts, strongest first.
+            (U, N, 3) forces on the electrodes' cells, N, and the contacts, largest normal force first.
         """
         q = loads.mean()
         force = np.einsum("qt,qti->qi", q[self._own] * self._prior.load_n, self._own_frame)
@@ -78,11 +79,11 @@ class ContactFinder:
         return force.reshape(self._electrodes), tuple(found)
 
     def warm_up(self, posterior: LoadPosterior) -> None:
-        """Compile the kernels that a contact needs."""
+        """Compile the kernels that contacts need."""
         self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), posterior)
 
     def _deviations(self, boxes: Index, posterior: LoadPosterior) -> Float:
-        """(B,) standard deviations of these sums; each is computed once for a set of factors."""
+        """Return the standard deviations (B,) of these sums, cached per set of factors."""
         if self._made_by != posterior.factors:
             self._made_by = posterior.factors
             self._box_std[:] = np.nan
@@ -93,7 +94,7 @@ class ContactFinder:
         return self._box_std[boxes]
 
     def _contact(self, region: Index, q: Float, posterior: LoadPosterior) -> Contact | None:
-        """The contact on the cells ``region``."""
+        """Return the contact on the cells ``region``, None if they do not press."""
         loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
         centroid, shear = np.empty((2, 3))
         force, spread = _sum_region(
@@ -101,9 +102,9 @@ class ContactFinder:
         )
         if not force > 0:
             return None
-        # the prior decides most of how a contact's load is spread over its cells
+        # mostly the prior decides how a contact's load is spread over its cells
         std = math.sqrt(PRIOR_DOUBT) * posterior.std(loads, weights)
-        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load all over its cell about the centre
+        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load spread evenly over its cell
         return Contact(
             centroid_m=centroid,
             centroid_std_m=std[1:4],
@@ -118,10 +119,11 @@ class ContactFinder:
 
 @njit
 def _number_regions(near: Index, seed: Index, label: Index, region: Index, stack: Index) -> int:
-    """Number the connected groups of the cells ``seed``, and return how many there are.
+    """Number the connected groups of the cells ``seed`` from 1, and return the number of groups.
 
-    The numbers, from 1, go into ``label`` (Q,), 0 elsewhere. Those of the cells and their neighbours go into
-    ``region`` (Q,), a cell between two groups to the first. ``stack`` (Q,) is scratch.
+    ``label`` (Q,) receives the group number of each seed cell, ``region`` (Q,) that of each seed cell and its
+    neighbours; both are 0 elsewhere. A cell between two groups belongs to the first. ``stack`` (Q,) is
+    scratch.
     """
     label[:], region[:] = 0, 0
     for cell in seed:
@@ -158,9 +160,9 @@ def _sum_region(  # noqa: PLR0913 - a kernel: cells, loads and outputs by name
 ) -> tuple[float, float]:
     """Return the normal force, N, and the mean r² of the pressure, m², on the cells ``region`` (n,).
 
-    ``centroid`` (3,), m, and ``shear`` (3,), N, are written. So are ``loads`` and ``weights`` (7, n): how
-    force, centroid, mean r² and shear change with the loads, to first order (delta method). All but the
-    force are undefined if it is not positive.
+    Writes ``centroid`` (3,), m, and ``shear`` (3,), N. Also writes ``loads`` and ``weights`` (7, n), the
+    first-order sensitivities of force, centroid, mean r² and shear to the loads (delta method). If the force
+    is not positive, all other outputs are undefined.
     """
     force, mean = 0.0, 0.0
     for t in range(3):

@@ -1,7 +1,7 @@
-"""Gating: χ² tests of which wires moved, and of which a deformation explains.
+"""Gating: χ² tests for wires that moved and for wires that no deformation explains.
 
-The test of a wire is on χ² of its residuals, and on each of its coordinates alone, since χ² overlooks an
-electrode that moved by 7 standard deviations.
+A wire is tested on the χ² of its residuals and on each of its coordinates separately, because χ² alone
+overlooks an electrode that moved by 7 standard deviations.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 
 QUIET_CHANCE: Final = 0.005
-"""Chance a frame at which a wire at rest, or unmoved, is taken for moved: χ² test."""
+"""Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Standard deviations by which a single coordinate must seem to move for its wire to be taken for moved: one
-in 15 unmoved frames of 300 coordinates."""
+"""Apparent move of a single coordinate, in standard deviations, at which its wire counts as moved; noise
+alone causes it in one of 15 unmoved frames of 300 coordinates."""
 KEPT: Final = 50
-"""Frames for which the equations of a wire are used after it moved and the others did not predict that."""
+"""Number of frames for which the equations of a wire stay in use after a move that the others missed."""
 
 
 class Fit(NamedTuple):
-    """How badly a displacement explains a frame."""
+    """Misfit of a displacement to a frame."""
 
     chi_squared: Float
     """(U,) χ² of each wire."""
     sharpest: Float
-    """(U,) standard deviations by which a single coordinate is off at most."""
+    """(U,) largest error of a single coordinate, in its standard deviations."""
     move: Float
-    """(U, f) move of each coordinate that would explain the wire best, were it the only one; pitches."""
+    """(U, f) size of the move that fits the wire best if only this coordinate moves, pitches."""
 
 
 class Gate:
-    """The χ² tests of one patch, and the wires they keep in the estimate.
+    """χ² tests of one patch, with the list of wires that they keep in the estimate.
 
     Args:
         wires: Number of upper wires.
@@ -47,14 +47,14 @@ class Gate:
         self._quiet, self._impossible = (
             chi_squared_limits(equations, chance) for chance in (QUIET_CHANCE, IMPOSSIBLE_CHANCE)
         )
-        self._kept = np.zeros(wires, np.int64)  # frames left to each wire that was kept
+        self._kept = np.zeros(wires, np.int64)  # frames left for each kept wire
 
     def reset(self) -> None:
-        """Keep no wire."""
+        """Release all kept wires."""
         self._kept[:] = 0
 
     def next_frame(self) -> None:
-        """Let a frame pass for the wires kept."""
+        """Count one frame for the kept wires."""
         self._kept -= self._kept > 0
 
     def keep(self, wires: Index) -> None:
@@ -65,9 +65,9 @@ class Gate:
         """Return the wires (U,) whose residuals are beyond noise.
 
         Args:
-            fit: Fit of the displacement that is tested.
+            fit: Misfit of the tested displacement.
             count: (U,) usable resistances of each wire.
-            noises: Variance of the residuals' noise, in its own: a number or (U,).
+            noises: Noise variance of the residuals, relative to that of one frame; a number or (U,).
         """
         limit = self._quiet[count]
         return np.asarray(
@@ -75,12 +75,12 @@ class Gate:
         )
 
     def touched(self, fit: Fit, count: Index, members: Index) -> Index:
-        """Return the indices of the wires whose resistances are not those at rest.
+        """Return the indices of the wires whose resistances differ from those at rest.
 
         Args:
-            fit: Fit of the rest position.
+            fit: Misfit of the rest position.
             count: (U,) usable resistances of each wire.
-            members: Wires of the last estimate; they stay a little longer.
+            members: Wires of the last estimate, to which a lower limit applies.
         """
         touched = self.moved(fit, count)
         stay = np.zeros(len(touched), bool)
@@ -91,12 +91,12 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return χ² of each wire (U,) over the χ² that no wire obeying the model has."""
+        """Return χ² of each wire (U,), relative to the χ² above which the model cannot hold."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 
 def chi_squared_limits(most: int, chance: float) -> Float:
-    """Return the χ² (most + 1,) that 0, 1, … degrees of freedom exceed with ``chance``; tiny for none."""
+    """Return the χ² (most + 1,) that 0, 1, … degrees of freedom exceed with probability ``chance``."""
     from scipy.special import chdtri
 
     return np.concatenate([[1e-300], chdtri(np.arange(1.0, most + 1.0), chance)])

@@ -1,6 +1,6 @@
-"""Hyperparameters of the posterior: the prior's scale s, where it expects loads, and the noise.
+"""Hyperparameters of the posterior: scale s of the prior, expected places of loads, and noise.
 
-They follow the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
+All are set from the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Number of directions that the prior of s² is worth, of a hundred or two that the data determine."""
+"""Weight of the prior of s², in directions; the data determine 100 to 200 directions."""
 SCALE_REST: Final = 0.005
-"""Scale, clearances, that this prior expects: where presses of a tenth of the layer come out."""
+"""Scale that the prior of s² expects, in clearances: typical of presses to a tenth of the layer."""
 SCALE_MOST: Final = 1.0
-"""Greatest scale, clearances: beyond, the surface would lie below the lower layer."""
+"""Largest scale, in clearances; above it the surface would lie below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
-"""Logarithm of the change of scale at which it is set anew: the standard deviations change by less."""
+"""Logarithm of the scale change that triggers an update; the standard deviations change by less."""
 SCALE_LEAST: Final = 1.0
-"""Smallest scale, in that of a field that moves the resistances by their noise on the average. A smaller one
-would go unnoticed, and must not be denied by the standard deviations of an untouched patch."""
+"""Smallest scale, relative to that of a field that on average changes the resistances by their noise. A
+smaller field would go unnoticed, so the standard deviations of an untouched patch must allow for it."""
 ADAPTIONS: Final = 5
-"""Maximum times a frame sets the prior or the noise anew."""
+"""Maximum updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3
-"""Maximum times a frame refines where loads are expected; each costs as much as two solves."""
+"""Maximum updates of the expected places of loads per frame; each costs as much as two solves."""
 NOISE_WORTH: Final = 20.0
-"""Number of resistances that the noise given is worth when it is estimated."""
+"""Weight of the configured noise when the noise is estimated, in resistances."""
 NOISE_STEP: Final = math.log(1.1)
-"""Logarithm of the change of the noise at which it is set anew."""
+"""Logarithm of the noise change that triggers an update."""
 
 Observe = Callable[[float], Observation]
-"""Makes the observation of a frame at a noise factor."""
+"""Function that returns the observation of a frame for a noise factor."""
 
 
 class Hyperparameters:
-    """Scale, places of the loads and noise of one patch's posterior. One owner.
+    """Scale, expected places of loads and noise of one patch. Not shared between owners.
 
     Args:
-        estimator: Of the patch.
+        estimator: Estimator of the patch.
         clearance: Median clearance, pitches.
-        scale2: s² if it is fixed, pitch².
+        scale2: s² if fixed, pitch².
         estimate_noise: Whether the noise is estimated.
 
     Attributes:
-        noise_factor: Estimated noise over the noise given.
+        noise_factor: Ratio of the estimated noise to the configured noise.
         loads: Posterior of the loads.
     """
 
@@ -68,42 +68,42 @@ class Hyperparameters:
         self.noise_factor = 1.0
 
     def reset(self) -> None:
-        """Forget the stream, and reset the estimator with it."""
+        """Forget the stream, and reset the estimator."""
         self._estimator.reset(self._fixed or self._expected)
         self.noise_factor = 1.0
         self._least = self._expected
 
     def set_least(self, observation: Observation) -> None:
-        """Set the smallest scale by the noise of a frame."""
+        """Set the smallest scale from the noise of a frame."""
         power = float((observation.weight**2 * self._signal).sum())
         count = np.count_nonzero(observation.weight)
         least = SCALE_LEAST**2 * count / power if power > 0 else math.inf
         self._least = min(least, self._most)
 
     def spread(self, observation: Observation, members: Index) -> None:
-        """Expect loads all over the patch alike, then at the scale that the frame suggests."""
+        """Expect equal loads all over the patch, then set the scale that the frame suggests."""
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect loads all over the patch alike, at the scale that the frame suggests before that."""
+        """Expect equal loads all over the patch, at the scale that the frame suggests under the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 
     def adapt(
         self, observation: Observation, observe: Observe, members: Index, *, local: bool
     ) -> Observation:
-        """Set the hyperparameters that the field at hand speaks for, and solve again until they stay.
+        """Set the hyperparameters from the current field, and solve again until they no longer change.
 
         Args:
             observation: The frame.
-            observe: Makes its observation at another noise factor.
+            observe: Function that returns the observation of the frame for another noise factor.
             members: Wires of the estimate.
-            local: Whether to set the places of the loads too.
+            local: Whether to set the expected places of loads too.
 
         Returns:
-            The observation at the noise found.
+            The observation at the estimated noise.
         """
         estimator, prior = self._estimator, self._prior
         if not local and self._fixed is None and (prior.share != 1.0).any():
@@ -125,7 +125,7 @@ class Hyperparameters:
             if not changed:
                 break
             if not (estimator.track(observation, members) or estimator.anneal(observation, members)):
-                # back to the field that was found and its prior; the next frame starts with the noise found
+                # restore the previous field and prior; the next frame starts with the estimated noise
                 self.noise_factor = found
                 estimator.moved[:], estimator.g[:], observation = moved, g, before
                 if not prior.localise(scale2 * share):
@@ -135,7 +135,7 @@ class Hyperparameters:
         return observation
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
-        """Set scale and places by the evidence; whether they changed."""
+        """Set scale and places of loads from the evidence; return whether they changed."""
         prior, changed = self._prior, False
         if local:
             variance = np.minimum(self.loads.expected(self._least), self._most)
@@ -149,7 +149,7 @@ class Hyperparameters:
         return changed
 
     def _noise_found(self, observation: Observation, members: Index) -> float:
-        """Factor on the noise at which the residuals are what they should be (MacKay)."""
+        """Return the noise factor at which the residuals match the noise (MacKay)."""
         residuals: Float = self._estimator.residuals(observation)
         total = float((residuals[members] ** 2).sum())
         count = float(np.count_nonzero(observation.weight[members]))

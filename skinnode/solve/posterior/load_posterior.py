@@ -1,6 +1,6 @@
-"""The loads on a patch given a frame: their mean, standard deviation, and which of them are found.
+"""Posterior of the loads on a patch: mean, standard deviations, and the loads found in a frame.
 
-Everything is by the factors at hand of a :class:`skinnode.solve.posterior.map_estimate.MapEstimator`.
+All results use the current factors of a :class:`skinnode.solve.posterior.map_estimate.MapEstimator`.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.map_estimate import MapEstimator
 
 LOCAL_SIGNIFICANT: Final = 4.0
-"""Square of the standard deviations at which a load counts as found."""
+"""Squared significance at which a load counts as found, in standard deviations squared."""
 LOCAL_CERTAIN: Final = 100.0
-"""Square of the standard deviations at which something certainly presses. At 25 and with much noise the
-places found first are not yet to be relied on, and errors are 1 % larger; from 1000 on half a press is still
-expected all over the patch if a layout sees little (`aligned`), which costs 14 %."""
+"""Squared significance at which a press is certain, in standard deviations squared. At 25, with high noise,
+the first places found are unreliable and errors are 1 % larger. From 1000 on, half of a press is still
+expected all over the patch on layouts with low sensitivity (`aligned`), which costs 14 %."""
 
 
 class LoadPosterior:
-    """Loads of one patch given the frame that its estimator solved.
+    """Posterior of the loads on one patch, given the frame that its estimator solved.
 
     Args:
-        estimator: Of the patch.
+        estimator: Estimator of the patch.
     """
 
     def __init__(self, estimator: MapEstimator) -> None:
@@ -35,26 +35,26 @@ class LoadPosterior:
         loads = self._prior.response.shape[1]
         self._whitened = np.empty((estimator.equations, loads))
         self._stiffness = np.empty(loads)
-        self._factors = -1  # the factors to which the last two belong
+        self._factors = -1  # the factors for which the last two were computed
 
     @property
     def factors(self) -> int:
-        """Number of the factors at hand."""
+        """Number of the current factors."""
         return self._estimator.factors
 
     def mean(self) -> Float:
-        """Return the mean of the loads (Q, 3) given the displacement, in units of the prior's."""
+        """Return the mean of the loads (Q, 3) given the displacement, in units of the prior's loads."""
         return self._prior.loads(self._estimator.free_displacement())
 
     def std(self, loads: Index, weights: Float) -> Float:
         """Return the standard deviations of weighted sums of loads.
 
         Args:
-            loads: (F, n) numbers of the loads, below 3Q.
-            weights: (F, n) their weights.
+            loads: (F, n) indices of the loads, below 3Q.
+            weights: (F, n) weights of the loads.
 
         Returns:
-            (F,) standard deviations, in units of the prior's loads times weights.
+            (F,) standard deviations, in units of the prior's loads times the weights.
         """
         prior = self._prior
         shared = weights * prior.share[loads // 3]
@@ -64,11 +64,11 @@ class LoadPosterior:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def expected(self, least: float) -> Float:
-        """Return the variances (Q,) of loads that those found speak for, pitch²; at least ``least``.
+        """Return the load variances (Q,), pitch², implied by the loads found; at least ``least``.
 
-        A load whose own prior is taken away has the estimate q / s² k and the variance 1/k − s², with k what
-        a unit of it adds to χ² (Tipping and Faul, Fast marginal likelihood maximisation for sparse Bayesian
-        models, 2003).
+        Without its own prior, a load has the estimate q / s² k and the variance 1/k − s², where k is what a
+        unit of the load adds to χ² (Tipping and Faul, Fast marginal likelihood maximisation for sparse
+        Bayesian models, 2003).
         """
         prior = self._prior
         found = np.empty(len(prior.share))
@@ -78,7 +78,7 @@ class LoadPosterior:
         return prior.expected(found, least, certain=most > LOCAL_CERTAIN)
 
     def _whiten(self) -> Float:
-        """(m, 3Q) L⁻¹ J G by the factors at hand; k of each load with it."""
+        """Return L⁻¹ J G (m, 3Q) by the current factors; also updates k of each load."""
         rows = self._whitened[: self._estimator.factored_rows]
         if self._factors != self._estimator.factors:
             self._factors = self._estimator.factors
@@ -89,9 +89,9 @@ class LoadPosterior:
 
 @njit
 def _squares(whitened: Float, loads: Index, weights: Float, out: Float) -> None:
-    """Write ‖L⁻¹ J G w‖² of sums into ``out`` (F,), from ``whitened`` (m, 3Q), L⁻¹ J G.
+    """Write ‖L⁻¹ J G w‖² of each weighted sum into ``out`` (F,), given L⁻¹ J G as ``whitened`` (m, 3Q).
 
-    ``loads`` (F, n) and ``weights`` (F, n) as in :meth:`LoadPosterior.std`.
+    ``loads`` (F, n) and ``weights`` (F, n) are as in :meth:`LoadPosterior.std`.
     """
     for f in range(out.size):
         out[f] = 0.0
@@ -106,10 +106,10 @@ def _squares(whitened: Float, loads: Index, weights: Float, out: Float) -> None:
 
 @njit
 def _found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
-    """Write the squares of loads freed from their own prior into ``found`` (Q,), by cell the largest.
+    """Write the largest squared load of each cell, without its own prior, into ``found`` (Q,).
 
-    A load that is not significant counts 0. ``q`` (Q, 3), ``own`` (Q,) prior variances, ``stiffness`` (3Q,).
-    Returns the largest square over its noise.
+    Loads that are not significant count as 0. ``q`` (Q, 3) are the loads, ``own`` (Q,) their prior variances
+    and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its noise variance.
     """
     most = 0.0
     for cell in range(found.size):

@@ -1,9 +1,10 @@
-"""The prior of the loads on a patch, and of the displacement that they cause: where loads are expected.
+"""Prior of the loads on a patch and of the displacement that they cause.
 
-At first loads are expected all over the patch alike, at one scale s². From the loads found, the prior expects
-loads there and hardly any elsewhere (:meth:`LoadPrior.localise`): a contact is stiff where nothing else
-touches. Compared with one scale for the whole patch that divides the error by two to three, and a narrow
-contact no longer sticks out of the reported deviation.
+At first, equal loads are expected all over the patch, at one scale s². Once loads are found, the prior
+expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin beside a contact
+moves only as the loads of the contact require. Compared with one scale for the whole patch, this reduces the
+error by a factor of two to three, and the error of a narrow contact no longer exceeds the reported standard
+deviation.
 """
 
 from __future__ import annotations
@@ -24,35 +25,35 @@ from skinnode.solve.linalg.vectors import Index
 from skinnode.solve.posterior.prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
-"""Standard deviation, in cells, of the Gaussian that spreads the squares of the loads found over their
-neighbours. Less trusts single cells, which is better for contacts on rubber as the prior has it, and
+"""Standard deviation, in cells, of the Gaussian that spreads the squared loads found over neighbouring cells.
+A smaller value trusts single cells, which is better for contacts on rubber that matches the prior and
 overconfident for others; 1 loses a quarter of the gain."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected where none was found, over the mean: for a light touch beside a press."""
+"""Mean square load expected where none was found, relative to the mean; allows light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
-"""Share of the expected loads that must have moved elsewhere before the prior is made anew: at 0.5 frames of
-a slow press reach 6 standard deviations, at 0.25 twice as many frames pay for it."""
+"""Fraction of the expected loads that must move elsewhere before the prior is rebuilt. At 0.5, errors in a
+slow press reach 6 standard deviations; at 0.25, twice as many frames pay for a rebuild."""
 LOCAL_SURPRISE: Final = 16.0
-"""Square of a load at one cell over the square expected there, above which the prior is made anew however
-little moved elsewhere: after an odd motion that left little to expect, a press twice as deep as the last
-frame's was 7 standard deviations off. Costs nothing: as many frames are factorised in slow presses at 16 as
-without."""
+"""Ratio of the squared load of a cell to its expected square above which the prior is rebuilt however little
+moved elsewhere. Without this limit, a press twice as deep as in the last frame was 7 standard deviations off
+after an unusual motion that left little to expect. At 16 it is free: slow presses factorise as many frames as
+without it."""
 
 
 class LoadPrior:
-    """Prior u ~ N(0, s² C) of the free coordinates of a patch, made of loads of unequal variance.
+    """Prior u ~ N(0, s² C) of the free coordinates of a patch, caused by loads of unequal variance.
 
     Args:
         elastic: Elasticity of the patch.
-        free: (U f,) numbers of the coordinates that move.
+        free: (U f,) indices of the free coordinates.
 
     Attributes:
         scale2: s², pitch².
-        share: (Q,) variance of the loads of a cell over s²; their mean is 1.
+        share: (Q,) load variance of each cell relative to s²; the mean is 1.
         covariance: (U f, U f) C.
-        uniform: (U f, U f) C with loads expected all over the patch alike.
-        response: (U f, 3Q) displacement by the loads, pitches.
-        version: Counts the covariances made.
+        uniform: (U f, U f) C if equal loads are expected all over the patch.
+        response: (U f, 3Q) displacement caused by unit loads, pitches.
+        version: Number of times that C was rebuilt.
     """
 
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
@@ -64,10 +65,10 @@ class LoadPrior:
         self.scale2 = 1.0
         self.share = np.ones(len(self._blur))
         self.version = 0
-        self._loads: tuple[Float, Float] | None = None  # displacement, loads; by the covariance at hand
+        self._loads: tuple[Float, Float] | None = None  # displacement, and loads by the current covariance
 
     def spread(self, scale2: float) -> None:
-        """Expect loads all over the patch alike, at scale s²."""
+        """Expect equal loads all over the patch, at scale s²."""
         self.scale2 = scale2
         self.share[:] = 1.0
         self.covariance[:] = self.uniform
@@ -80,7 +81,7 @@ class LoadPrior:
             variance: (Q,) variance of the loads of each cell, pitch².
 
         Returns:
-            False, and nothing done, if hardly any load would have to be expected elsewhere.
+            False, with the prior unchanged, if hardly any load is expected elsewhere.
         """
         mean = float(variance.mean())
         share = variance / mean
@@ -95,15 +96,16 @@ class LoadPrior:
         return True
 
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
-        """Return the variances (Q,), pitch², that the loads found speak for; at least ``least``.
+        """Return the variances (Q,), pitch², implied by the loads found; at least ``least``.
 
-        They are half of the way from those at hand, or neighbours would take turns; all of it from loads
-        expected all over the patch alike, if something certainly presses.
+        The variances move halfway from their current values to the implied values, because with a full step
+        neighbouring cells would alternate. The full step is taken from equal loads all over the patch if a
+        press is certain.
 
         Args:
-            found: (Q,) squares of the loads found.
-            least: Least variance of a cell, pitch².
-            certain: Whether a load is certain.
+            found: (Q,) squared loads found.
+            least: Smallest variance of a cell, pitch².
+            certain: Whether a press is certain.
         """
         floor = LOCAL_FLOOR * float(found.mean()) + least
         wanted = np.empty_like(found)
@@ -120,7 +122,7 @@ class LoadPrior:
             displacement: (U f,) free coordinates, pitches.
 
         Returns:
-            (Q, 3) loads of each cell, in units of the prior's.
+            (Q, 3) loads of each cell, in units of the prior's loads.
         """
         if self._loads is not None and np.array_equal(self._loads[0], displacement):
             return self._loads[1]
@@ -134,7 +136,7 @@ class LoadPrior:
     def roughness(self, displacement: Float) -> float:
         """Return uᵀ C⁻¹ u, pitch², of a displacement (U f,), which is overwritten.
 
-        It is the square of the scale that the displacement asks for, times the number of unknowns.
+        The value is the number of unknowns times the squared scale that fits the displacement best.
         """
         solve_lower_vector(self._root, displacement, displacement.size)
         return float(displacement @ displacement)
@@ -147,7 +149,7 @@ class LoadPrior:
 
 
 def _blur(shape: tuple[int, int]) -> Float:
-    """(Q, Q) weights of a Gaussian of :data:`LOCAL_SPREAD` cells around each cell, summing to 1."""
+    """Return Gaussian weights (Q, Q) of :data:`LOCAL_SPREAD` cells around each cell; each row sums to 1."""
     cell = np.indices(shape).reshape(2, -1)
     square = ((cell[:, :, None] - cell[:, None, :]) ** 2).sum(axis=0)
     weight = np.exp(-0.5 * square / LOCAL_SPREAD**2)

@@ -1,11 +1,11 @@
-"""The MAP estimate of one frame: Gauss-Newton, chord steps, and annealing for large jumps.
+"""MAP estimate of one frame: Gauss-Newton, chord steps, and annealing for large jumps.
 
-chord     from the last field with the factors of an older frame: two evaluations of F and J as a rule
-newton    new factors at the field at hand, then chord steps
-anneal    from the rest position with the noise taken as 3 %, then a quarter of that, and so on down to what
-          it is. At a high noise the posterior has one maximum, near the prior's. It leads to the right one:
-          presses of 70 % of the layer between two frames arrive, on layouts on which the samples of the press
-          itself lead the exact inversion astray.
+chord     starts at the last field with the factors of an older frame; typically two evaluations of F and J
+newton    computes new factors at the current field, then takes chord steps
+anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
+          its true value. At high noise the posterior has a single maximum, near that of the prior, and
+          following it leads to the right one: presses of 70 % of the layer between two frames are solved, on
+          layouts where the exact inversion goes wrong even along the samples of the press.
 """
 
 from __future__ import annotations
@@ -28,53 +28,53 @@ from skinnode.solve.posterior.prior import ElasticPrior
 from skinnode.solve.wires.problem import PatchProblem
 
 ANNEAL_NOISE: Final = 0.03
-"""First relative noise of the annealing: there one Gauss-Newton step from rest is close to the maximum."""
+"""Initial relative noise of annealing, at which one Gauss-Newton step from rest gets close to the maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Ratio of the noise from one step of the annealing to the next. On staggered and aligned, h = 0.5 and 1, of
-presses to 70 % from rest, ratio 3 brings 80 of 80 to the right maximum, 5 all but one."""
+"""Ratio of the noise of one annealing step to that of the next. On staggered and aligned, h = 0.5 and 1, with
+presses to 70 % from rest, a ratio of 3 brings 80 of 80 to the right maximum and a ratio of 5 brings 79."""
 SETTLED: Final = 0.02
-"""RMS of a correction over the RMS standard deviation below which it is the last."""
+"""RMS of a correction, relative to the RMS standard deviation, at which chord steps stop."""
 CHORDS: Final = 4
-"""Maximum chord steps with one set of factors."""
+"""Maximum number of chord steps per set of factors."""
 CHORD_RATE: Final = 0.35
-"""Contraction of chord steps above which new factors are the shorter way: they cost ten chord steps."""
+"""Contraction of chord steps above which new factors are cheaper; they cost ten chord steps."""
 NEWTONS: Final = 12
-"""Maximum factorisations of a solve that starts near: one or two as a rule, more if full steps would
-cycle."""
+"""Maximum factorisations of a solve that starts near the maximum: typically one or two, more if full steps
+would cycle."""
 HALVINGS: Final = 6
-"""Maximum halvings of such a step."""
+"""Maximum halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
-"""Factor on the part of σ² that only the prior speaks of, in the standard deviation: how much load to expect
-where is known to a factor only. At 1 the hidden part of a first touch is 5 to 7 standard deviations off in
-one wire of 20 000, and so are dents that no half-space makes; at 2 one of 12 000 coordinates of such dents
-is 5.6, of the hard cases none is beyond 5."""
+"""Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
+expected load at a place is only known to within a factor. At 1, the hidden part of a first touch is 5 to 7
+standard deviations off in one wire of 20 000, and so are dents that no half-space makes. At 2, one of 12 000
+coordinates of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor on the same part in the 95 % interval. Independent loads on cells are rougher than bodies: measured,
-0.0 to 0.13 of that variance is in the errors of spheres, 0.02 to 0.5 in those of Gaussian dents. The tail of
-the errors sets the standard deviation, their body the interval."""
+"""Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than bodies:
+the measured errors contain 0.0 to 0.13 of that variance for spheres and 0.02 to 0.5 for Gaussian dents.
+The tail of the error distribution sets the standard deviation, its centre sets the interval."""
 
 
 class MapEstimator:
-    """MAP estimate of one patch: displacement, nuisances, and the factors of the last step. One owner.
+    """Displacement, nuisances and last factors of one patch's MAP estimate. Not shared between owners.
 
     Args:
         problem: The patch.
-        elastic: Its elasticity.
-        free: (f,) coordinates of a wire that move.
-        nuisances: Their number, p.
+        elastic: Elastic prior of the patch.
+        free: (f,) free coordinates of a wire.
+        nuisances: Number of nuisances, p.
 
     Attributes:
         load_prior: Prior of the loads and of the displacement.
         moved: (U, 3N) displacement, pitches; fixed coordinates stay 0.
         g: (p,) nuisances.
         std: (U, f) standard deviations by the last factors, pitches.
-        core: (U, f) the same under bodies as smooth as they are, for the 95 % interval.
-        noise_variance: (U f,) variance that noise and nuisances put into the displacement, pitch².
+        core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
+        noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
         members: Wires whose equations are in the factors.
-        factors: Number of the factors at hand.
+        factors: Number of the current factors.
         evaluations: Evaluations of F with J since the owner set it to 0.
         factorisations: Factorisations since the owner set it to 0.
-        until: Time of :func:`time.perf_counter` after which a solve is broken off with a TimeoutError.
+        until: Time of :func:`time.perf_counter` after which a solve raises TimeoutError.
     """
 
     def __init__(self, problem: PatchProblem, elastic: ElasticPrior, free: Index, nuisances: int) -> None:
@@ -86,7 +86,7 @@ class MapEstimator:
         self._b = kernels.make_buffers(wires, equations, coordinates, free.size, nuisances)
         self._rows = min(equations, free.size + nuisances)
         self._reach = roots.NEAR * float(problem.clearance.min())
-        self._enough = math.inf  # RMS of a correction that is small against the standard deviation
+        self._enough = math.inf  # RMS of a correction that is small compared with the standard deviation
         self._at_rest = np.zeros((wires, equations)), np.zeros((wires, coordinates, equations))
         kernels.potentials(np.arange(wires), problem.rest.copy(), problem.lower, *self._at_rest)
         self._correction = np.zeros(wires * free.size + nuisances)
@@ -106,23 +106,23 @@ class MapEstimator:
 
     @property
     def equations(self) -> int:
-        """Equations of all wires after reduction."""
+        """Number of equations of all wires after reduction."""
         return len(self._b.v)
 
     @property
     def factored_rows(self) -> int:
-        """Equations in the factors at hand."""
+        """Number of equations in the current factors."""
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Go back to the rest position, with nothing known and the loads spread at scale s², pitch²."""
+        """Return to rest, forget everything, and expect loads everywhere at scale s², pitch²."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()
         self.load_prior.spread(scale2)
 
     def forget_factors(self) -> None:
-        """Forget what is known of the field at hand."""
+        """Discard the factors and standard deviations of the current field."""
         self.std[:] = np.inf
         self.core[:] = np.inf
         self._enough = math.inf
@@ -131,10 +131,10 @@ class MapEstimator:
     # -- solving ---------------------------------------------------------------------------------------
 
     def track(self, observation: Observation, members: Index) -> bool:
-        """Solve from the displacement at hand, on the equations of the wires ``members`` (P,).
+        """Solve from the current displacement, using the equations of the wires ``members`` (P,).
 
         Returns:
-            False if the maximum is not near.
+            False if there is no maximum nearby.
         """
         if self._fits(observation, members) and self._settle(observation):
             return True
@@ -150,7 +150,7 @@ class MapEstimator:
         return False
 
     def anneal(self, observation: Observation, members: Index) -> bool:
-        """Solve from rest, with a noise that falls from :data:`ANNEAL_NOISE` to what it is.
+        """Solve from rest, with a noise that falls from :data:`ANNEAL_NOISE` to its true value.
 
         Returns:
             False if a step failed.
@@ -169,12 +169,12 @@ class MapEstimator:
         return self._settle(observation) or self.track(observation, members)
 
     def step_s(self, observation: Observation) -> float:
-        """Return the time of one factorisation of all wires with its standard deviations, s.
+        """Return the time to factorise all wires and compute their standard deviations, s.
 
-        Forgets the factors.
+        Discards the factors.
         """
         self.until = least = math.inf
-        for _ in range(3):  # the first may wait for memory
+        for _ in range(3):  # the first run may wait for memory
             start = perf_counter()
             self._newton(observation, self._every)
             self._measure(observation)
@@ -182,15 +182,15 @@ class MapEstimator:
         self.forget_factors()
         return least
 
-    # -- what the field at hand says -------------------------------------------------------------------
+    # -- properties of the current field ---------------------------------------------------------------
 
     def residuals(self, observation: Observation, moved: Float | None = None) -> Float:
-        """Return r − H g (U, K) at the displacement at hand, or another; its noise has deviation 1."""
+        """Return r − H g (U, K), whose noise has variance 1, at the current or another displacement."""
         self._square(observation, self._every, self.moved if moved is None else moved, self.g)
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return how badly a displacement (U, 3N), pitches, explains a frame; None for the rest position."""
+        """Return the misfit of a displacement (U, 3N), pitches, to a frame; None means at rest."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -203,7 +203,7 @@ class MapEstimator:
     def objective(
         self, observation: Observation, moved: Float | None = None, g: Float | None = None
     ) -> float:
-        """Return −2 log posterior, to a constant, at the field at hand or another; with equal factors."""
+        """Return −2 log posterior of the current or another field; its constant depends on the factors."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
         square = self._square(observation, self.members, moved, g)
         prior = self.roughness(moved) / self.load_prior.scale2
@@ -225,7 +225,7 @@ class MapEstimator:
         return np.asarray(self.load_prior.scale2 * self.load_prior.covariance - explained)
 
     def whiten(self, response: Float, out: Float) -> None:
-        """Write L⁻¹ J G into ``out`` (m, C) for a response G (U f, C), by the factors at hand."""
+        """Write L⁻¹ J G into ``out`` (m, C) for a response G (U f, C), by the current factors."""
         b, f, rows = self._b, self._free.size, self._rows
         for i, u in enumerate(self.members.tolist()):
             block = slice(i * rows, (i + 1) * rows)
@@ -235,7 +235,7 @@ class MapEstimator:
     # -- evidence --------------------------------------------------------------------------------------
 
     def signal(self) -> Float:
-        """Return the variance (U, K) of each relative change of R at rest under a prior of s = 1, pitch⁻²."""
+        """Return the variance (U, K), pitch⁻², of each relative change of R at rest if s = 1."""
         wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
         plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
         self._linearise_at_rest(plain)
@@ -244,7 +244,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s², pitch², at which the resistances would differ from rest as much as they do."""
+        """Return the s², pitch², at which the expected deviation of R from rest matches the measured one."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())
@@ -252,7 +252,7 @@ class MapEstimator:
         return excess / trace if trace > 0 else 0.0
 
     def gamma(self) -> float:
-        """Return the number of directions in the space of the data that the data determine (MacKay's γ)."""
+        """Return the number of directions in data space that the data determine (MacKay's γ)."""
         if self._gamma is None:
             b, m = self._b, self.factored_rows
             inverse_diagonal(b.innovation_covariance, b.work, b.v, m)
@@ -263,8 +263,8 @@ class MapEstimator:
         """Return the next s², pitch², of MacKay's fixed point (Neural Computation 4, 415, 1992).
 
         Args:
-            weight: Number of directions that the prior of s² is worth.
-            scale2: s² that it expects, pitch².
+            weight: Weight of the prior of s², in directions.
+            scale2: s² that the prior expects, pitch².
         """
         return (self.roughness(self.moved) + weight * scale2) / (self.gamma() + weight)
 
@@ -296,7 +296,7 @@ class MapEstimator:
         self.evaluations += members.size
 
     def _linearise_at_rest(self, observation: Observation) -> None:
-        """Linearise all wires at rest, where F and J are known."""
+        """Linearise all wires at rest, where F and J are stored."""
         b = self._b
         b.r[:], b.jt[:] = self._at_rest
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)
@@ -306,7 +306,7 @@ class MapEstimator:
         return kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, self._b)
 
     def _newton(self, observation: Observation, members: Index) -> float:
-        """One Gauss-Newton step with new factors; how far it moved any coordinate, inf if it failed."""
+        """Take a Gauss-Newton step with new factors; return the largest move in pitches, inf on failure."""
         b, prior = self._b, self.load_prior
         self._factored = None
         self._linearise(observation, self.moved, members)
@@ -326,10 +326,10 @@ class MapEstimator:
         return size
 
     def _shorten(self, observation: Observation, moved: Float, g: Float) -> None:
-        """Go from there towards the field at hand, to the minimum of a parabola through the objective.
+        """Search from ``moved`` and ``g`` towards the current field for the minimum of a fitted parabola.
 
-        Gauss-Newton leaves out the curvature of F, and if the data say little its full steps go to and fro
-        across the minimum for ever.
+        Gauss-Newton neglects the curvature of F. If the data determine little, full steps can alternate
+        forever between the two sides of the minimum.
         """
         way = self.moved - moved, self.g - g
 
@@ -338,7 +338,7 @@ class MapEstimator:
 
         start, far = at(0.0), 1.0
         middle, end = at(0.5), at(1.0)
-        for _ in range(HALVINGS):  # far from the minimum it is no parabola
+        for _ in range(HALVINGS):  # far from the minimum the objective is not parabolic
             if end < 4.0 * start + 1.0:
                 break
             far *= 0.5
@@ -348,7 +348,7 @@ class MapEstimator:
         self.moved[:], self.g[:] = moved + share * way[0], g + share * way[1]
 
     def _measure(self, observation: Observation) -> None:
-        """Standard deviations by the factors at hand."""
+        """Compute standard deviations from the current factors."""
         b, m, prior = self._b, self.factored_rows, self.load_prior
         self._gamma = None
         b.whitened[:m] = b.cross_covariance[:m]
@@ -361,7 +361,7 @@ class MapEstimator:
         self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
 
     def _settle(self, observation: Observation) -> bool:
-        """Chord steps to the maximum; if they do not settle, the better of the fields before and after."""
+        """Take chord steps to the maximum; if they do not settle, keep the better field, old or new."""
         moved, g = self.moved.copy(), self.g.copy()
         if self._chord(observation):
             return True
@@ -370,7 +370,7 @@ class MapEstimator:
         return False
 
     def _chord(self, observation: Observation) -> bool:
-        """Chord steps until the correction is small against the standard deviation."""
+        """Take chord steps until the correction is small compared with the standard deviation."""
         b, wires, prior, step = self._b, len(self.moved), self.load_prior, self._correction
         before = math.inf
         for _ in range(CHORDS):

@@ -1,11 +1,11 @@
-"""The measurement update: the linear algebra of one Gauss-Newton step of the posterior.
+"""Measurement update: the linear algebra of one Gauss-Newton step of the posterior.
 
-It works in the space of the data, as a Kalman filter does.
+The update works in data space, like that of a Kalman filter.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
 g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, its model
 
-    r(x) − H g = noise of deviation 1,      H: what a unit of each nuisance does to r
+    r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
 With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
@@ -13,18 +13,19 @@ With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 
 with S the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain,
 
-and the covariance there s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
-2005, 3.4). No eigenvalue of S is below 1, so that rounding costs ε ‖S‖ of a standard deviation: a thousandth
-at signals of 10⁶ σ, whatever the condition of J.
+and the covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
+2005, 3.4). No eigenvalue of S is below 1, so rounding errors are at most ε ‖S‖ standard deviations: one
+thousandth for signals of 10⁶ σ, whatever the condition number of J.
 
-A step with the factors of an older J still leads to the same place. At the maximum of the posterior
+Steps with the factors of an older J converge to the same point. At the maximum of the posterior
 e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish, and with the old J, H, S
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
-is Newton's correction, a chord step, at the cost of two triangular solves.
+is the Newton correction, here called a chord step, which costs two triangular solves.
 
-A wire with more equations than unknowns is first reduced to as many by a QR of [J H], which loses nothing.
+A wire with more equations than unknowns is first reduced by a QR of [J H] to one equation per unknown,
+without loss of information.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ from skinnode.solve.linalg.vectors import Index, dot
 
 
 class Buffers(NamedTuple):
-    """Arrays that the step of a patch writes to.
+    """Arrays that a step of one patch writes to.
 
-    U wires, K equations and f free coordinates each, p nuisances, R = min(K, f + p) rows a wire after
+    U wires with K equations and f free coordinates each, p nuisances, R = min(K, f + p) rows per wire after
     reduction.
     """
 
@@ -59,21 +60,21 @@ class Buffers(NamedTuple):
     jt: Float
     """(U, 3N, K) transposed Jacobians."""
     free_jt: Float
-    """(f + p, K) free rows of one wire's Jᵀ, then its Hᵀ."""
+    """(f + p, K) free rows of one wire's Jᵀ, followed by its Hᵀ."""
     jacobian: Float
-    """(U R, f) J of the wires in the step, one below the other."""
+    """(U R, f) J of the wires in the step, stacked."""
     nuisance: Float
-    """(U R, p) H of the wires in the step."""
+    """(U R, p) H of the wires in the step, stacked."""
     y: Float
     """(U R,) J x − r."""
     cross_covariance: Float
-    """(U R, U f) s² J C, of the data with the displacement."""
+    """(U R, U f) s² J C, between the data and the displacement."""
     innovation_covariance: Float
     """(U R, U R) S, then its Cholesky factor L."""
     whitened: Float
     """(U R, U f) V = L⁻¹ (s² J C)."""
     kalman_gain_t: Float
-    """(U R, U f) Kᵀ, estimate by a unit of noise of each equation."""
+    """(U R, U f) Kᵀ, effect of a unit of noise in each equation on the estimate."""
     work: Float
     """(U R, U R) scratch."""
     gradient: Float
@@ -81,21 +82,21 @@ class Buffers(NamedTuple):
     v: Float
     """(U R,) scratch."""
     block: Float
-    """(f, R) Jᵀ of one wire in one piece."""
+    """(f, R) contiguous copy of Jᵀ of one wire."""
     qr: Float
     """(K, f + p) QR of [J H] of one wire."""
     diagonal: Float
-    """(f + p,) of R."""
+    """(f + p,) diagonal of the triangular factor."""
     beta: Float
-    """(f + p,) of the Householder vectors."""
+    """(f + p,) scale factors of the Householder vectors."""
     scratch: Float
-    """(f + p,)"""
+    """(f + p,) scratch."""
     e: Float
     """(K,) scratch."""
 
 
 def make_buffers(wires: int, equations: int, coordinates: int, free: int, nuisances: int) -> Buffers:
-    """Return zeroed buffers for a patch with these numbers of wires, equations a wire, and so on."""
+    """Return zeroed buffers for a patch; all sizes except ``wires`` and ``nuisances`` are per wire."""
     columns = free + nuisances
     rows = min(equations, columns)
     m, n = wires * rows, wires * free
@@ -114,14 +115,14 @@ def make_buffers(wires: int, equations: int, coordinates: int, free: int, nuisan
 def linearise(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float
 ) -> None:
-    """Write r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
+    """Write r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) of the wires ``members`` (P,)."""
     potentials(members, x, lower, r, jt)
     weigh(members, a, weight, r, jt)
 
 
 @njit
 def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> None:
-    """Write F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N), for the wires ``members``."""
+    """Write F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N) of the wires ``members``."""
     for i in range(members.size):
         u = members[i]
         potential_jacobian(x[u], lower, f[u], jt[u])
@@ -129,7 +130,7 @@ def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> N
 
 @njit
 def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
-    """Replace F and its Jacobian by r = w (a F − 1) and the Jacobian of r."""
+    """Replace F and its Jacobian with r = w (a F − 1) and the Jacobian of r."""
     for i in range(members.size):
         u = members[i]
         r_u, jt_u, a_u, w_u = r[u], jt[u], a[u], weight[u]
@@ -164,11 +165,11 @@ def residuals(  # noqa: PLR0913 - a kernel: arrays by name
 def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
     free: Index, h: Float, g: Float, jt: Float, r: Float, square_sum: Float, top: Float, move: Float
 ) -> None:
-    """Measure how badly ``r`` (U, K) fits; r − H g replaces it.
+    """Measure the misfit of the residuals ``r`` (U, K), and replace ``r`` with r − H g.
 
-    χ² of each wire goes into ``square_sum`` (U,); by how much each coordinate alone would be off, |Jᵢᵀ r| /
-    ‖Jᵢ‖², into ``move`` (U, f); and the largest of a wire in its standard deviations, |Jᵢᵀ r| / ‖Jᵢ‖, into
-    ``top`` (U,).
+    Writes χ² of each wire into ``square_sum`` (U,), the error of each coordinate on its own,
+    |Jᵢᵀ r| / ‖Jᵢ‖², into ``move`` (U, f), and the largest such error of each wire in standard deviations,
+    |Jᵢᵀ r| / ‖Jᵢ‖, into ``top`` (U,).
     """
     for u in range(jt.shape[0]):
         r_u = r[u]
@@ -191,7 +192,7 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
 def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     u: int, top: int, free: Index, h: Float, x: Float, b: Buffers
 ) -> None:
-    """Write J, H and y of wire ``u`` into the rows from ``top`` on, at most as many rows as columns."""
+    """Write J, H and y of wire ``u`` into the rows from ``top`` on, reduced to at most f + p rows."""
     f, p = free.size, h.shape[2]
     equations = h.shape[1]
     y = b.e
@@ -233,8 +234,8 @@ def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 ) -> float:
     """Write J, H, y, s² J C and S of the wires ``members`` (P,) from the r and Jᵀ in ``b``.
 
-    ``free`` (f,) coordinates of a wire that move; ``c`` (U f, U f) their prior; ``h`` (U, K, p), ``d`` (p,).
-    Only the upper triangle of S is written. Returns the trace of s² J C Jᵀ.
+    ``free`` (f,) lists the free coordinates of a wire, ``c`` (U f, U f) is C, and ``h`` (U, K, p) and
+    ``d`` (p,) describe the nuisances. Writes only the upper triangle of S. Returns the trace of s² J C Jᵀ.
     """
     f, p = free.size, h.shape[2]
     rows = b.jacobian.shape[0] // x.shape[0]
@@ -275,7 +276,7 @@ def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers
 ) -> None:
-    """Take the Gauss-Newton step into ``x`` (U, 3N) and ``g`` (p,), with L in place of S."""
+    """Write the result of a Gauss-Newton step to ``x`` (U, 3N) and ``g`` (p,); the buffer of S holds L."""
     f = free.size
     rows = b.jacobian.shape[0] // x.shape[0]
     m = members.size * rows
@@ -303,9 +304,9 @@ def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
 def noise_variance(  # noqa: C901 - a kernel: sums as loops
     m: int, d: Float, b: Buffers, out: Float
 ) -> None:
-    """Write the variance that noise and nuisances put into the estimate into ``out`` (U f,), pitch².
+    """Write the variance of the estimate due to noise and nuisances into ``out`` (U f,), pitch².
 
-    It is diag(K (I + H d Hᵀ) Kᵀ) with Kᵀ = L⁻ᵀ V over ``m`` equations. V and L are at hand.
+    The variance is diag(K (I + H d Hᵀ) Kᵀ) with Kᵀ = L⁻ᵀ V over ``m`` equations. Reads V and L from ``b``.
     """
     n = out.size
     for k in range(m):
@@ -334,10 +335,10 @@ def noise_variance(  # noqa: C901 - a kernel: sums as loops
 def standard_deviations(  # noqa: PLR0913 - a kernel: arrays by name
     m: int, c: Float, s2: float, noise: Float, doubt: float, share: float, std: Float, core: Float, b: Buffers
 ) -> None:
-    """Write standard deviations (U, f) from the variance of the posterior, s² C − Vᵀ V, with V at hand.
+    """Write standard deviations (U, f) of the posterior from its covariance s² C − Vᵀ V; reads V from ``b``.
 
-    The part of ``noise`` (U f,) counts whole. The rest, of which only the prior speaks, counts ``doubt``
-    times in ``std`` and ``share`` times in ``core``.
+    The variance due to ``noise`` (U f,) counts in full. The rest, which only the prior determines, is
+    multiplied by ``doubt`` for ``std`` and by ``share`` for ``core``.
     """
     n, f = noise.size, std.shape[1]
     explained = b.gradient
@@ -366,11 +367,10 @@ def chord_step(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     step: Float,
     b: Buffers,
 ) -> tuple[float, float]:
-    """Write the chord step with the factors at hand into ``step`` (U f + p,).
+    """Write the chord step with the current factors into ``step`` (U f + p,).
 
-    The buffers hold r and Jᵀ at ``x`` (U, 3N).
-
-    Returns the RMS and the largest of its U f coordinates, pitches.
+    Reads r and Jᵀ at ``x`` (U, 3N) from ``b``. Returns the RMS and the largest absolute value of the U f
+    displacements, pitches.
     """
     f, p = free.size, g.size
     equations = b.r.shape[1]

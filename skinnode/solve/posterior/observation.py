@@ -1,7 +1,7 @@
-"""The observation model of a frame: residuals, weights, and what each nuisance does to them.
+"""Observation model of a frame: residuals, weights, and the effect of the nuisances.
 
-A wire's residual is r = w (a F(x) − 1) with w = 1/σ. It is modelled as r(x) − H g = noise of deviation 1,
-with a few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), and an error of the
+A wire's residual is r = w (a F(x) − 1) with w = 1/σ. The model is r(x) − H g = noise of variance 1, with a
+few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), and an error of the
 forward model in proportion to the change of each resistance.
 """
 
@@ -24,14 +24,14 @@ class Readings:
     """Resistances of one frame in the units of the problem."""
 
     a: Float
-    """(U, K) R · gain; at rest if a resistance is not usable."""
+    """(U, K) R · gain; the value at rest for a resistance that is not usable."""
     noise: Float
     """(U, K) standard deviation relative to R."""
     usable: NDArray[np.bool_]
-    """(U, K)"""
+    """(U, K) whether a resistance is used."""
 
     def without(self, wires: list[int]) -> Readings:
-        """Return the readings with those of some wires not usable."""
+        """Return a copy in which the readings of ``wires`` are not usable."""
         usable = self.usable.copy()
         usable[wires] = False
         return Readings(self.a, self.noise, usable)
@@ -39,34 +39,34 @@ class Readings:
 
 @dataclass
 class Observation:
-    """One frame as the estimator sees it, with U wires, K resistances a wire and p nuisances."""
+    """Input of the estimator for one frame, with U wires, K resistances per wire and p nuisances."""
 
     a: Float
     """(U, K) R · gain."""
     weight: Float
     """(U, K) 1/σ, 0 if a resistance is missing."""
     h: Float
-    """(U, K, p) H, residual by a unit of each nuisance."""
+    """(U, K, p) H, change of the residual per unit of each nuisance."""
     d: Float
     """(p,) prior variances of the nuisances."""
 
     @functools.cached_property
     def count(self) -> Index:
-        """(U,) usable resistances of each wire."""
+        """(U,) number of usable resistances of each wire."""
         return np.asarray(np.count_nonzero(self.weight, axis=1))
 
 
 class ObservationModel:
-    """Makes observations of readings.
+    """Converts readings to observations.
 
     Args:
         problem: The patch.
-        drift: ``none``, ``patch`` (one gain error) or ``wire`` (one for each upper wire).
+        drift: ``none``, ``patch`` (one gain error) or ``wire`` (one per upper wire).
         drift_std: Prior standard deviation of a gain error.
-        model_error: Share of the change of each resistance that the forward model may get wrong.
+        model_error: Standard error of the forward model, as a fraction of the change of each resistance.
 
     Attributes:
-        gains: Number of gain errors, the first of the nuisances.
+        gains: Number of gain errors; they come first among the nuisances.
         variance: (p,) prior variances of the nuisances.
     """
 
@@ -81,7 +81,7 @@ class ObservationModel:
             self.variance[-1] = model_error**2
 
     def observe(self, readings: Readings, noise_factor: float) -> Observation:
-        """Return the observation of a frame whose noise is ``noise_factor`` times the noise given."""
+        """Return the observation of a frame whose noise is ``noise_factor`` times the configured noise."""
         a = readings.a
         change = a / self._problem.a_rest - 1.0
         variance = (noise_factor * readings.noise) ** 2 + 0.5 * (self._model_error * change) ** 2
@@ -97,7 +97,7 @@ class ObservationModel:
 
 
 def eased(observation: Observation, level: float) -> Observation:
-    """Return the observation with a noise of deviation ``level`` added, for annealing."""
+    """Return the observation with added noise of standard deviation ``level``, for annealing."""
     weight = observation.weight
     loose = 1.0 / np.hypot(
         level, np.divide(1.0, weight, out=np.full_like(weight, math.inf), where=weight > 0)

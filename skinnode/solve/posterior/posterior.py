@@ -1,10 +1,12 @@
-"""The posterior of a patch, followed through a stream of frames.
+"""Posterior of a patch, tracked through a stream of frames.
 
-gate      the wires whose resistances differ from those at rest by more than noise give the equations
-hold      if the last field explains all of them within noise, nothing is solved
-track     chord or Gauss-Newton steps from the last field; a jump is annealed from rest (``map_estimate``)
-adapt     the prior's scale, the places of the loads and, if wanted, the noise follow the evidence
-refuse    a wire whose residual no deformation explains is INCONSISTENT and left out; the rest is solved again
+gate      use the equations of wires whose resistances differ from those at rest by more than noise
+hold      if the last field explains the whole frame within noise, solve nothing
+track     take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
+          (``map_estimate``)
+adapt     set the prior's scale, the places of loads and, on request, the noise from the evidence
+reject    mark a wire whose residual no deformation explains INCONSISTENT, leave it out and solve the others
+          again
 """
 
 from __future__ import annotations
@@ -34,13 +36,14 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Least relative noise: a fifth of a 16-bit code. Less forces the field onto a root of F = b, and there are
-wrong ones, on layouts with folds from ten times as much on; and the forward model is no better than that."""
+"""Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. A smaller noise
+forces the field onto a root of F = b, which can be a wrong root; on layouts with folds this happens already
+below ten times this noise."""
 LEFT_OUT: Final = 3
-"""Maximum wires left out one after the other before the whole frame is called INCONSISTENT."""
+"""Maximum number of wires to leave out in turn before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""Least time of an answer from rest, in factorisations of all wires with their standard deviations: 11 to 20
-were measured for presses on 1 to 10 wires."""
+"""Least time of a solve from rest, as a number of factorisations of all wires including standard deviations;
+11 to 20 were measured for presses on 1 to 10 wires."""
 
 Mask = NDArray[np.bool_]
 
@@ -48,20 +51,20 @@ Mask = NDArray[np.bool_]
 class Posterior:
     """Estimates the displacement, loads and contacts of one patch, frame by frame.
 
-    One owner; the compiled parts hold no GIL. Compiles its kernels on construction.
+    Not shared between owners. Compiled code releases the GIL. The constructor compiles the kernels.
 
     Args:
-        layout: The patch; any number of lower wires.
+        layout: The patch, with any number of lower wires.
         options: Options of the estimate; default :class:`skinnode.solve.options.PosteriorOptions()`.
-        **arguments: Options by name, in place of those in ``options``.
+        **arguments: Options by name, which override ``options``.
 
     Attributes:
         layout: The patch.
-        options: The options in force.
-        from_rest_s: Least time that a touched frame takes from rest, s; 0 without a deadline.
+        options: Options in effect.
+        from_rest_s: Least time of a touched frame solved from rest, s; 0 without a deadline.
 
     Raises:
-        ValueError: If an option has the wrong shape or is out of its range.
+        ValueError: If an option has the wrong shape or is out of range.
     """
 
     def __init__(
@@ -100,14 +103,14 @@ class Posterior:
             self.reset()
 
     def _warm_up(self) -> None:
-        """Solve a touched frame, so that the first touch of a stream does not wait for the compiler."""
+        """Solve a touched frame so that the first touch of a stream does not wait for the compiler."""
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
-        seconds, self._seconds = self._seconds, math.inf  # a deadline would leave kernels uncompiled
+        seconds, self._seconds = self._seconds, math.inf  # a deadline could skip kernels
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compiled by this call, otherwise on the first frame without a touch
+        self._estimator.gamma()  # compile it now, not on the first frame without a touch
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads)
 
@@ -117,35 +120,36 @@ class Posterior:
         self._hyper.reset()
         self._gate.reset()
         self._members: Index = np.arange(0)
-        self._trusted = np.zeros_like(self._estimator.moved)  # last field that passed, its nuisances
+        self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field, then its nuisances
         self._trusted_g = np.zeros_like(self._estimator.g)
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
-        self._compared = np.zeros_like(self._trusted)  # field when it was last compared with the annealed
-        self._annealed = False  # whether the field at hand came from rest
+        self._compared = np.zeros_like(self._trusted)  # field at the last comparison with an annealed field
+        self._annealed = False  # whether the current field was annealed from rest
         self._known = False  # whether the estimator's factors belong to the trusted field
         self._wires = np.arange(wires)
         self._overlooked = np.zeros_like(self._estimator.std)
-        self._seen = np.zeros(self.layout.shape, bool)  # resistances that the trusted field had
+        self._seen = np.zeros(self.layout.shape, bool)  # resistances used for the trusted field
 
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
     ) -> FieldFrame:
-        """Estimate the displacement field of one frame, its loads and contacts.
+        """Estimate the displacement field, loads and contacts of one frame.
 
-        No value raises. A wire without usable resistances is estimated from its neighbours, and its standard
-        deviation shows it. A wire that no deformation explains is INCONSISTENT and left out of the estimate.
-        A wire that no steps solve, not even on its own, is MAX_STEPS and left out too. If the whole frame
-        cannot be solved, the last trusted field is held with an infinite standard deviation.
+        No resistance value raises an exception. A wire without usable resistances is estimated from its
+        neighbours, with a larger standard deviation. A wire that no deformation explains is INCONSISTENT and
+        left out of the estimate. A wire that does not converge even on its own is MAX_STEPS and also left
+        out. If the whole frame cannot be solved, the last trusted field is held with an infinite standard
+        deviation.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; a value that is not positive and finite is not used.
+            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: A number or (U, K), noise of this frame only. A resistance whose noise is not
-                positive and finite is not used.
+            relative_noise: A number or (U, K), noise of this frame only. Resistances whose noise is not
+                positive and finite are ignored.
 
         Returns:
-            The field, with one status a wire.
+            The field, with one status per wire.
 
         Raises:
             ValueError: If a shape is wrong.
@@ -172,13 +176,13 @@ class Posterior:
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:
-        """Let the next updates end at this time of :func:`time.perf_counter`, inf for never."""
+        """Set the time of :func:`time.perf_counter` at which the next updates stop; inf for no limit."""
         self._until = until
 
     def covariance_m2(self) -> Float:
-        """Return the covariance of the last frame's displacement, by its factors.
+        """Return the covariance of the last frame's displacement, from its factors.
 
-        It leaves out the allowance for what the prior itself may get wrong (``PRIOR_DOUBT``).
+        The covariance does not include the allowance for errors of the prior (``PRIOR_DOUBT``).
 
         Returns:
             (3UN, 3UN) covariance, m²; 0 for coordinates that are not free.
@@ -195,7 +199,7 @@ class Posterior:
         return full
 
     def energy(self, moved: Float) -> float:
-        """Return uᵀ (s² C)⁻¹ u, −2 log of the prior density to a constant, with the last frame's prior.
+        """Return uᵀ (s² C)⁻¹ u, −2 log of the last frame's prior density up to a constant.
 
         Args:
             moved: (U, 3N) displacement, pitches.
@@ -225,13 +229,13 @@ class Posterior:
         return roots.beyond_prior(self._estimator.g, observation.d, deviations)
 
     def _is_quiet(self, observation: Observation) -> bool:
-        """Whether the last field explains the frame within noise.
+        """Return whether the last field explains the frame within noise.
 
-        A member's residual is the difference of two noises, its own and the one solved into the field.
+        The residual of a wire in use contains two noises: that of this frame and that of the last field.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
-            return False  # fewer resistances know less of the field, more know more
+            return False  # with other resistances, the field has another uncertainty
         if self._beyond_prior(observation, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
@@ -241,14 +245,14 @@ class Posterior:
         return not self._gate.moved(fit, observation.count, noises).any()
 
     def _solve(self, observation: Observation, readings: Readings) -> tuple[NDArray[np.int64], Mask]:
-        """(U,) statuses and wires not solved. Moves the estimator, and on success the trusted field."""
+        """Solve a frame; return statuses (U,) and held wires (U,). Updates the trusted field on success."""
         if not readings.usable.any():
             return self._give_up(Status.ILL_CONDITIONED)
         status = np.full(len(self._wires), int(Status.CONVERGED))
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # it takes all wires to say that nothing is there
+        # only all wires together can show that nothing touches
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):
@@ -279,7 +283,7 @@ class Posterior:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Wires that moved, and not as the others predict, or stayed where they predict a move; kept then."""
+        """Return and keep the wires outside ``wanted`` that contradict the field of the others."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)
@@ -289,7 +293,7 @@ class Posterior:
     def _accept(
         self, status: NDArray[np.int64], members: Index, seen: Mask
     ) -> tuple[NDArray[np.int64], Mask]:
-        """Trust the field at hand, if it is within reach."""
+        """Trust the current field if it is within reach."""
         estimator = self._estimator
         if self._problem.out_of_reach(self._problem.rest + estimator.moved).any():
             return self._give_up(Status.ILL_CONDITIONED)
@@ -298,7 +302,7 @@ class Posterior:
         self._members, self._known, self._seen = members, True, seen
         held = np.ones(len(status), bool)
         held[members] = False
-        held &= seen.any(axis=1)  # the frame says nothing of a wire without resistances
+        held &= seen.any(axis=1)  # the frame says nothing about a wire without resistances
         return status, held
 
     def _give_up(self, status: Status) -> tuple[NDArray[np.int64], Mask]:
@@ -307,10 +311,10 @@ class Posterior:
         self._estimator.forget_factors()
         return np.full(len(self._wires), int(status)), np.zeros(len(self._wires), bool)
 
-    # -- maxima ----------------------------------------------------------------------------------------
+    # -- finding the maximum ---------------------------------------------------------------------------
 
     def _converge(self, observation: Observation, members: Index) -> bool:
-        """Solve from the last trusted field, else from rest by annealing."""
+        """Solve from the last trusted field, or else by annealing from rest."""
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
@@ -326,9 +330,9 @@ class Posterior:
         return estimator.anneal(observation, members)
 
     def _anneal_and_compare(self, observation: Observation, members: Index) -> bool:
-        """Keep the likelier of the field at hand and the annealed one.
+        """Keep the likelier of the current field and the annealed field.
 
-        Far from where it was last compared, the maximum found by tracking need not be the right one.
+        Far from the field of the last comparison, tracking may have found a wrong maximum.
         """
         estimator = self._estimator
         self._compared[:] = estimator.moved
@@ -346,10 +350,11 @@ class Posterior:
     def _refine(
         self, observation: Observation, readings: Readings, members: Index, *, local: bool
     ) -> Observation:
-        """Adapt the hyperparameters; with folds, to the likelier of two maxima.
+        """Adapt the hyperparameters; if the layout has folds, to the likelier of two maxima.
 
-        Loads expected all over the patch may have led to a wrong maximum. The field annealed with the loads
-        expected where they were found replaces it if it is likelier by :data:`skinnode.solve.roots.LIKELIER`.
+        The prior that expects loads everywhere may have led to a wrong maximum. The field is therefore
+        annealed again with loads expected where they were found, and replaced if the new field is likelier
+        by :data:`skinnode.solve.roots.LIKELIER`.
         """
 
         def observe(noise_factor: float) -> Observation:
@@ -376,7 +381,7 @@ class Posterior:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # half of what it may overlook
+        if held.all():  # at least half of the move that the gate may overlook
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

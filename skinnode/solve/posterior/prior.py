@@ -1,15 +1,17 @@
-"""The elastic prior: the displacement of rubber before any resistance is read.
+"""Elastic prior: the displacement expected of the rubber before any resistance is read.
 
-Independent surface loads, one a cell of a pitch around each electrode site, displace the electrodes by the
-half-space's response G (Boussinesq, Cerruti; :func:`skinnode.model.elastic.rectangle_compliance`), so that
+Each electrode site lies in a cell one pitch wide. Independent surface loads on the cells displace the
+electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
+:func:`skinnode.model.elastic.rectangle_compliance`), so that
 
     u ~ N(0, s² C),   C = G diag(q) Gᵀ + ε² I
 
-with one scale s for the patch, set from the data. The cells go on beyond the outermost electrodes, since
-skin is pressed there too. ε lets every electrode deviate a little from the half-space on its own.
+with one scale s for the patch, set from the data. The cells extend beyond the outermost electrodes, because
+the skin can be pressed there too. ε allows small independent deviations of each electrode from the
+half-space.
 
-A curved skin is unrolled: distances are chords, and the response to a load is laid into the tangent frame of
-each electrode.
+Curved skin is unrolled: distances are chords, and the response to a load is expressed in the tangent frame
+of each electrode.
 """
 
 from __future__ import annotations
@@ -26,42 +28,39 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.linalg.cholesky import multiply
 
 MARGIN: Final = 2
-"""Rings of cells beyond the outermost electrodes. A third and fourth change the evidence of Hertz presses
-all over the patch and half off it by less than 1 in 800."""
+"""Rings of cells beyond the outermost electrodes. A third and a fourth ring change the evidence of Hertz
+presses, on the patch or half off it, by less than 1 in 800."""
 SHEAR_SHARE: Final = 0.4
-"""Standard deviation of the shear loads over that of the normal loads: a contact that slides at a friction of
-0.6 lies at 1.5 standard deviations. From 0.25 to 0.4 the evidence changes by 2 %; below, layouts that hardly
-see the shear (`aligned`) promise more than they know."""
+"""Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
+coefficient of 0.6 is at 1.5 standard deviations. From 0.25 to 0.4 the evidence changes by 2 %. With smaller
+ratios, layouts that are insensitive to shear (`aligned`) report too small standard deviations."""
 SLACK: Final = 0.005
-"""ε over the standard deviation of the normal displacement. From 0.001 to 0.02 it changes nothing; it keeps C
-regular."""
+"""Ratio of ε to the standard deviation of the normal displacement; keeps C regular. Values from 0.001 to 0.02
+give the same results."""
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticPrior:
-    """The prior of one layout for s = 1.
-
-    The median standard deviation of the normal displacement is then one pitch.
-    """
+    """Prior of one layout for s = 1; the median standard deviation of normal displacement is 1 pitch."""
 
     covariance: Float
     """(3UN, 3UN) C, pitch²."""
     response: Float
-    """(3UN, 3Q) pitches, displacement by the loads, each scaled to a standard deviation of 1 at s = 1."""
+    """(3UN, 3Q) displacement per load, pitches; loads have a standard deviation of 1 at s = 1."""
     load_n: Float
-    """(3,) N, size of such a load: along the wire, across, along the normal."""
+    """(3,) force of a load of 1 along the wire, across it and along the normal, N."""
     cell_m: Float
-    """(Q, 3) m, centres of the cells."""
+    """(Q, 3) centres of the cells, m."""
     frame: Float
-    """(Q, 3, 3) rows: tangent along the wire, tangent across, normal out of the skin."""
+    """(Q, 3, 3) unit vectors as rows: tangent along the wire, tangent across it, outward normal."""
     cell_area_m2: float
     """Area of a cell, m²."""
     shape: tuple[int, int]
-    """Cells as a lattice, across and along the wires; Q is their product."""
+    """Number of cells across and along the wires; the product is Q."""
 
     @classmethod
     def of(cls, layout: PatchLayout, rubber: Rubber | None = None) -> ElasticPrior:
-        """Make the prior of ``layout`` on ``rubber``, whose modulus only scales the forces."""
+        """Return the prior of ``layout`` on ``rubber``, whose modulus only scales the forces."""
         rubber = Rubber() if rubber is None else rubber
         wires, electrodes = layout.upper_m.shape[:2]
         cell, along, across, normal = _lattice(layout)
@@ -103,23 +102,23 @@ class ElasticPrior:
 
 
 def _lattice(layout: PatchLayout) -> tuple[Float, Float, Float, Float]:
-    """Electrode sites (U+, N+, 3), m, with :data:`MARGIN` more beyond each edge, and their surface.
+    """Return electrode sites (U+, N+, 3), m, extended by :data:`MARGIN` at each edge, and their surface.
 
-    The surface is the steps along and across the wires and the normals, which point away from the lower
-    layer.
+    The surface consists of the steps along and across the wires, m, and the unit normals, which point away
+    from the lower layer.
     """
     site = layout.upper_m
     lower = layout.lower_m.reshape(-1, 3)
     nearest = np.argmin(((site[:, :, None] - lower) ** 2).sum(axis=-1), axis=-1)
     up = (site - lower[nearest]).mean(axis=(0, 1))
     wires, electrodes = site.shape[:2]
-    if min(wires, electrodes) == 1:  # no surface of their own: the lower layer's
+    if min(wires, electrodes) == 1:  # a single row defines no surface: use the lower layer
         flat = np.linalg.svd(lower - lower.mean(axis=0))[2][-1]
         up = flat * np.sign(flat @ up) if len(lower) > 2 and flat @ up != 0 else up
     up = up / np.linalg.norm(up)
     if electrodes > 1:
         along = np.gradient(site, axis=1)
-    else:  # a wire of one electrode has no direction of its own
+    else:  # a wire with one electrode has no direction
         axis = np.diff(site[:, 0], axis=0).mean(axis=0) if wires > 1 else np.eye(3)[np.argmin(np.abs(up))]
         along = np.broadcast_to(_sized(np.cross(axis, up), layout.pitch_m), site.shape)
     if wires > 1:
@@ -141,7 +140,7 @@ def _sized(direction: Float, length: float) -> Float:
 def _carried_on(
     fields: tuple[Float, Float, Float, Float], axis: int, step: Float
 ) -> tuple[Float, Float, Float, Float]:
-    """Sites, steps and normals with :data:`MARGIN` more rows before and after along ``axis``, straight on."""
+    """Extrapolate sites linearly by :data:`MARGIN` rows at each end of ``axis``; repeat steps and normals."""
     pad = [(MARGIN, MARGIN) if i == axis else (0, 0) for i in range(3)]
     site, along, across, normal = fields
     along, across, normal = (np.pad(field, pad, mode="edge") for field in (along, across, normal))

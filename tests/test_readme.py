@@ -60,6 +60,7 @@ def test_the_table_has_every_command() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.real_time
 def test_the_second_example_runs_against_simulated_patches(multicast_group: str) -> None:
     folder = Path(__file__).parents[1]
     simulator = subprocess.Popen(

@@ -35,6 +35,7 @@ def missed(figures: dict[str, Any]) -> list[str]:
 
 
 @pytest.mark.long
+@pytest.mark.real_time
 def test_a_hand_under_faults_does_not_grow_and_its_sums_agree(tmp_path: Path) -> None:
     file = tmp_path / "figures.json"
     command = ["-c", "from skinnode.cli.main import main; main()", "bench", "soak", "--minutes", "0.33"]
@@ -94,6 +95,7 @@ def _children() -> set[int]:
 
 
 @pytest.mark.long
+@pytest.mark.real_time
 def test_what_grows_or_is_miscounted_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[Any] = []
     publish, on_summary = Publisher.publish, PatchStream.on_summary
@@ -116,6 +118,7 @@ def test_what_grows_or_is_miscounted_is_found(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.long
+@pytest.mark.real_time
 def test_a_frame_that_is_lost_uncounted_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a kind that no other counter sees."""
     send, heartbeats = FaultyPort.send, itertools.count()

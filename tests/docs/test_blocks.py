@@ -116,6 +116,7 @@ def _to_run(page: Path, *, on_vcan: bool) -> list[Block]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 @pytest.mark.long
+@pytest.mark.real_time
 def test_blocks_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
     _run(_to_run(page, on_vcan=False), tmp_path, slowed=page.name in SLOWED)
 

@@ -9,6 +9,7 @@ import pytest
 OLD = {
     "skinnode.wire.codec": ("skinnode.protocol.codec", "unpack_chunk", "unpack_summary"),
     "skinnode.model.config": ("skinnode.config", "parse_hand"),
+    "skinnode.cli.demo": ("skinnode.demo.hand", "demo_hand"),
 }
 
 

@@ -1,6 +1,6 @@
 """Entry point of ``vcan-sim``.
 
-The command is in :mod:`vcan_sim.command`, exit statuses in :mod:`skinnode.cli._exit_status`.
+The command is in :mod:`vcan_sim.command`, the exit statuses in :mod:`skinnode.cli._exit_status`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run ``vcan-sim`` with these arguments, or those of the process."""
+    """Run ``vcan-sim`` with ``argv``, or with the arguments of the process."""
     main_of("vcan_sim.command", argv)
 
 

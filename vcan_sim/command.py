@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vcan_sim.fleet import Fleet, NodeReport
 
 _WARN_AGAIN_S = 10.0
-"""Time after which the warning about a busy machine is repeated."""
+"""Seconds before the warning about a busy machine is repeated."""
 
 app = typer.Typer(
     pretty_exceptions_enable=False,
@@ -42,9 +42,9 @@ def simulate(
         ),
     ] = None,
 ) -> None:
-    """Simulate the patches of a hand: CANopen nodes on a bus, a sphere pressing and sliding over each.
+    """Simulate the patches of a hand as CANopen nodes on a bus, with a sphere pressing and sliding over each.
 
-    Bring them up with `skinnode host` and the same file in another terminal.
+    Bring them up by running `skinnode host` with the same file in another terminal.
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections
@@ -70,7 +70,7 @@ def simulate(
 
 
 def _watch(fleet: Fleet, wait: Callable[[float], bool], seconds: float | None) -> None:
-    """Print a line a second until ``wait`` returns True, time is up, or a node thread has failed."""
+    """Print a line every second until ``wait`` returns True, time is up, or a node thread has failed."""
     start = time.monotonic()
     before = fleet.report()
     silent_until_s = 0.0
@@ -98,7 +98,7 @@ def _progress(elapsed_s: float, before: Sequence[NodeReport], now: Sequence[Node
 
 
 def _too_slow(before: Sequence[NodeReport], now: Sequence[NodeReport]) -> str:
-    """Return a warning if this machine was too slow for the nodes; empty otherwise."""
+    """Return a warning if this machine was too slow for the nodes, or an empty string."""
     steps = list(zip(before, now, strict=True))
     skipped = sum(new.slow_overruns - old.slow_overruns for old, new in steps)
     if not skipped:
@@ -121,7 +121,7 @@ def _summary(reports: Sequence[NodeReport]) -> str:
 
 
 def _injected(fleet: Fleet) -> list[str]:
-    """Return the counts of injected faults, one line for each patch."""
+    """Return the counts of injected faults, one line per patch."""
     lines = []
     for patch in fleet.patches:
         counts = dataclasses.asdict(fleet.injected(patch))

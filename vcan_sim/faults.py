@@ -1,6 +1,6 @@
-"""Faults that can be injected into a node, as data, and counts of those that were.
+"""Faults that can be injected into a node, as data, and counts of the injected faults.
 
-A chunk suffers at most one fault, so that counts can be compared with those of a receiver.
+A chunk suffers at most one fault, so that the counts can be compared with a receiver's.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LOST_OUT: Final = {
     Kind.BOOT_UP: "boot_up_lost",
     Kind.EMCY: "emcy_lost",
 }
-"""Faults that drop frames sent by the node, by kind."""
+"""Faults that drop frames sent by the node, by frame kind."""
 LOST_IN: Final = {
     Kind.NMT: "nmt_lost",
     Kind.SDO_REQUEST: "sdo_request_lost",
@@ -31,7 +31,7 @@ LOST_IN: Final = {
     Kind.COMMAND: "command_lost",
     Kind.HEARTBEAT: "heartbeat_lost",
 }
-"""Faults that drop frames meant for the node, by kind. For SYNC there is ``sync_lost``."""
+"""Faults that drop frames addressed to the node, by frame kind; SYNC has ``sync_lost``."""
 _SHARES: Final = (
     *OF_CHUNKS,
     *OF_SCANS,
@@ -52,90 +52,90 @@ _RATES: Final = ("emcy_per_s", "babble_per_s", "restart_every_s")
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults of one node. None by default.
+    """Faults of one node; none by default.
 
     Raises:
-        ConfigError: A share is not between 0 and 1, shares of chunks or of scans exceed 1 together, or a rate
-            is negative.
+        ConfigError: A fraction is not between 0 and 1, the fractions of chunks or of scans add up to more
+            than 1, or a rate is negative.
     """
 
     seed: int = 1
-    """The same seed and the same frames suffer the same faults."""
+    """Seed of the draws; the same seed and the same frames give the same faults."""
 
-    # --- shares of the chunks
+    # --- fractions of the chunks
     lost: float = 0.0
     duplicated: float = 0.0
-    """Sent twice."""
+    """The chunk is sent twice."""
     reordered: float = 0.0
-    """Changes places with the frame after it."""
+    """The chunk changes places with the next frame."""
     late: float = 0.0
-    """Arrives after the first frame of the next scan."""
+    """The chunk arrives after the first frame of the next scan."""
     short: float = 0.0
-    """A byte is missing."""
+    """The chunk lacks one byte."""
     remote: float = 0.0
     """A remote frame is sent instead."""
     miscounted: float = 0.0
-    """Has the counter of another scan."""
+    """The chunk carries the counter of another scan."""
     miscounted_by: int | None = None
-    """Error of that counter, modulo 256; None: a random error."""
+    """Error of the ``miscounted`` counter, modulo 256; None for a random error."""
     corrupted: float = 0.0
-    """A code differs from the one that the node packed; length and counters are right."""
+    """One code differs from the code that the node packed; length and counters are correct."""
 
-    # --- shares of the scans
+    # --- fractions of the scans
     torn: float = 0.0
-    """Breaks off after its first half, without a summary, and the next scan has the same counter."""
+    """The scan stops after its first half, without a summary, and the next scan has the same counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
     """The node resets itself after half of the chunks, as a watchdog would."""
     displaced: float = 0.0
-    """A chunk has the counter of the next scan, whose own chunk of that index is lost."""
+    """A chunk has the counter of the next scan, whose own chunk with that index is lost."""
     understated: float = 0.0
-    """A chunk is lost, and the summary says that only changed chunks were sent, one fewer; its check, if
-    any, is correct for that summary. Scans of changed chunks only lose the chunk."""
+    """A chunk is lost, and the summary claims that only changed chunks were sent, one fewer. Its check, if
+    any, is correct for that summary. A scan that sends only changed chunks just loses the chunk."""
     unchecked: float = 0.0
-    """The summary carries no check: it has the form of revision 1.0."""
+    """The summary carries no check, as in revision 1.0."""
     struck: int | None = None
-    """Index of the chunk that ``displaced`` and ``understated`` strike; None: any."""
+    """Index of the chunk that ``displaced`` and ``understated`` affect; None for a random chunk."""
 
-    # --- shares of other frames
+    # --- fractions of other frames
     sync_lost: float = 0.0
-    """The node does not hear a SYNC."""
+    """The node does not receive a SYNC."""
     long: float = 0.0
-    """A heartbeat has one byte too many; chunks and summaries already fill their frames."""
+    """A heartbeat has one byte too many. (Chunks and summaries already fill their frames.)"""
     nmt_lost: float = 0.0
-    """The node does not hear an NMT command."""
+    """The node does not receive an NMT command."""
     sdo_request_lost: float = 0.0
-    """The node does not hear an SDO request."""
+    """The node does not receive an SDO request."""
     sdo_response_lost: float = 0.0
     """An SDO response does not arrive."""
     lss_request_lost: float = 0.0
-    """The node does not hear an LSS request."""
+    """The node does not receive an LSS request."""
     lss_response_lost: float = 0.0
     """An LSS response does not arrive."""
     heartbeat_lost: float = 0.0
-    """A heartbeat does not arrive, whether sent by the node or meant for it."""
+    """A heartbeat sent by the node, or addressed to it, does not arrive."""
     boot_up_lost: float = 0.0
     """A boot-up message does not arrive."""
     emcy_lost: float = 0.0
-    """An emergency message does not arrive; this includes *error reset*."""
+    """An emergency message, including *error reset*, does not arrive."""
     command_lost: float = 0.0
-    """The node does not hear a command PDO, such as a tare."""
+    """The node does not receive a command PDO, such as a tare."""
 
-    # --- as long as they are set
+    # --- active as long as they are set
     silent: bool = False
-    """No frame of the node arrives."""
+    """No frame from the node arrives."""
     deaf: bool = False
-    """The node hears nothing: its receiver is stuck."""
+    """The node receives nothing because its receiver is stuck."""
     frozen: bool = False
-    """The converter gives the same values again and again."""
+    """The converter keeps returning the same values."""
     unplugged: bool = False
-    """The node has neither bus nor supply. It boots when this ends."""
+    """The node is disconnected from bus and supply; it boots when this ends."""
     wrong_identity: bool = False
-    """The node reports another product code."""
+    """The node reports a different product code."""
     wrong_layout: bool = False
-    """The node reports another layout hash."""
+    """The node reports a different layout hash."""
     open_upper: int | None = None
-    """This upper wire is broken. Wires are counted from 0, and are sound while a node tares at power-on."""
+    """This upper wire is broken. Wires are numbered from 0 and are intact while a node tares at power-on."""
     open_lower: int | None = None
     """This lower wire is broken."""
     shorted_upper: int | None = None
@@ -143,15 +143,15 @@ class Faults:
     shorted_lower: int | None = None
     """This lower wire touches all upper wires."""
     noisy_upper: int | None = None
-    """This upper wire has a bad contact: a noise of 0.3 % of each resistance."""
+    """This upper wire has a bad contact, which adds noise of 0.3 % to each of its resistances."""
     noisy_lower: int | None = None
     """This lower wire has a bad contact."""
     restart_every_s: float = 0.0
-    """Seconds between resets of the node by itself; 0: never."""
+    """Seconds between spontaneous resets of the node; 0 for never."""
     emcy_per_s: float = 0.0
-    """Emergency messages a second; after the last follows one that reports *error reset*."""
+    """Emergency messages per second; when they stop, one more reports *error reset*."""
     babble_per_s: float = 0.0
-    """Frames a second with COB-ID 0x3F0, which no device uses."""
+    """Frames per second with COB-ID 0x3F0, which no device uses."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -171,7 +171,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Injected:
-    """Number of times that each fault was injected into one node."""
+    """Number of times each fault was injected into one node."""
 
     lost: int = 0
     duplicated: int = 0
@@ -182,7 +182,7 @@ class Injected:
     miscounted: int = 0
     torn: int = 0
     torn_chunks: int = 0
-    """Chunks sent of the first halves of torn scans."""
+    """Chunks sent in the first halves of torn scans."""
     summary_lost: int = 0
     reset: int = 0
     """Resets in the middle of a scan."""
@@ -209,12 +209,12 @@ class Injected:
     frozen: int = 0
     """Readings that repeated the previous reading."""
     miswired: int = 0
-    """Readings with a wire open, shorted or noisy."""
+    """Readings with an open, shorted or noisy wire."""
     unplugged: int = 0
     restarts: int = 0
-    """Resets by ``restart_every_s``."""
+    """Resets caused by ``restart_every_s``."""
     impostures: int = 0
-    """Wrong answers about identity or layout."""
+    """Falsified answers about identity or layout."""
     emergencies: int = 0
     babbled: int = 0
     scans_spoilt: int = 0
@@ -227,15 +227,15 @@ NO_FAULTS: Final = Faults()
 
 
 def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]:
-    """Return the faults of each patch from the texts of ``--fault``.
+    """Return the faults of each patch from the values of ``--fault``.
 
     Args:
-        texts: Such as ``lost=0.01,silent``, for all patches, and ``palm:open_upper=3``, for one; later texts
-            add to earlier ones.
-        patches: Names of the patches of the hand.
+        texts: ``lost=0.01,silent`` applies to all patches, ``palm:open_upper=3`` to one. Later values add to
+            earlier ones.
+        patches: Names of the hand's patches.
 
     Raises:
-        ConfigError: As :func:`parse_faults`, or a patch is not in the hand.
+        ConfigError: A patch is not in the hand, or a text is invalid (see :func:`parse_faults`).
     """
     found = dict.fromkeys(patches, NO_FAULTS)
     for text in texts:
@@ -248,14 +248,14 @@ def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]
 
 
 def parse_faults(text: str, added_to: Faults = NO_FAULTS) -> Faults:
-    """Return faults from a text such as ``lost=0.01,restart_every_s=2,silent``.
+    """Return the faults in a text such as ``lost=0.01,restart_every_s=2,silent``.
 
     Args:
-        text: Names of faults with their values, separated by commas.
-        added_to: Faults to which they are added.
+        text: Fault names with their values, separated by commas.
+        added_to: Faults to extend.
 
     Raises:
-        ConfigError: A name is unknown or a value is not possible.
+        ConfigError: A name is unknown or a value is invalid.
     """
     kinds = {field.name: type(field.default) for field in dataclasses.fields(Faults)}
     values: dict[str, int | float | bool] = {}
@@ -267,7 +267,7 @@ def parse_faults(text: str, added_to: Faults = NO_FAULTS) -> Faults:
             values[name] = _value(kinds[name], value)
         except ValueError:
             raise ConfigError(f"--fault {name}", value, _allowed(kinds[name])) from None
-    return dataclasses.replace(added_to, **values)  # type: ignore[arg-type]  # each of the kind of its field
+    return dataclasses.replace(added_to, **values)  # type: ignore[arg-type]  # types match
 
 
 def _value(kind: type, text: str) -> int | float | bool:

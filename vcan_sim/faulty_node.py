@@ -1,7 +1,7 @@
-"""A real node with faults: every frame between it and its bus passes through here.
+"""A real node with faults. Every frame between the node and its bus passes through this module.
 
-Faults of readings are in :mod:`vcan_sim.sensor`, faults of scans in :mod:`vcan_sim.faulty_scans`. Faults are
-drawn from a seed and the order of frames, not from the clock, except for events at a rate.
+Reading faults are in :mod:`vcan_sim.sensor`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults are drawn
+from a seed and the order of the frames, not from the clock, except for events at a rate.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from vcan_sim.tally import Kind, Tally, kind_of
 
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
-"""Pacing of a simulated node. It may be away for half a SYNC period of the reference hand and still finish
-its scan in time, because a busy machine is not part of the simulation. Four nodes then send bursts of up to
-270 frames, which fit the default receive buffer of a socket."""
+"""Pacing of a simulated node. The node may stall for half a SYNC period of the reference hand and still
+finish its scan in time, because a busy machine is not part of the simulation. Four nodes then send bursts of
+up to 270 frames, which fit the default receive buffer of a socket."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
-"""EMCY 0xFF0F, error register: generic and manufacturer's."""
+"""EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum events of a rate in one turn; events missed beyond that are not made up for."""
+"""Maximum number of events of one rate per turn; events beyond that are dropped."""
 
 
 class Emit(Protocol):
-    """Puts a frame on the bus, as :meth:`skinnode.transport.CanPort.send` does."""
+    """Puts a frame on the bus, like :meth:`skinnode.transport.CanPort.send`."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Put a frame on the bus. Raises BusError if the bus refuses it."""
 
 
 class FaultyNode(PatchNode):
-    """A :class:`PatchNode` with :attr:`faults`, which may be replaced at any time from any thread.
+    """A :class:`PatchNode` with :attr:`faults`, which can be replaced at any time from any thread.
 
     Args:
         node_id: Node-ID.
         layout: Layout of the patch.
-        source: What the converter of the node measures.
+        source: Resistances that the node's converter measures.
         emit: Puts a frame on the bus.
-        on_sent: Called with the COB-ID of each frame of the node after it was sent or lost.
+        on_sent: Called with the COB-ID of each frame of the node after the frame was sent or lost.
         serial: Serial number.
         profile: Protocol of the node.
-        faults: Faults from the start; their seed remains.
+        faults: Initial faults; their seed stays in force.
     """
 
-    def __init__(  # noqa: PLR0913 - those of PatchNode, and three
+    def __init__(  # noqa: PLR0913 - the arguments of PatchNode and three more
         self,
         node_id: int,
         layout: PatchLayout,
@@ -95,7 +95,7 @@ class FaultyNode(PatchNode):
 
     @property
     def faults(self) -> Faults:
-        """Faults that the node suffers now."""
+        """Current faults of the node."""
         return self._injector.faults
 
     @faults.setter
@@ -109,10 +109,10 @@ class FaultyNode(PatchNode):
 
     @property
     def tally(self) -> Tally:
-        """Live counts of the frames of the node, by kind."""
+        """Live counts of the node's frames, by kind."""
         return self._injector.tally
 
-    # --- frames and time on their way to the node
+    # --- frames and time passed to the node
 
     def on_frame(self, can_id: int, data: bytes, t_ns: int, remote: bool = False) -> None:
         """Pass a frame to the node, unless a fault drops it."""
@@ -135,13 +135,13 @@ class FaultyNode(PatchNode):
         self._reset_if_due(t_ns)
 
     def _concerns(self, kind: Kind, can_id: int) -> bool:
-        """Return whether the frame is meant for the node: requests to its neighbours are not its loss."""
+        """Return whether the frame is meant for the node; a request to a neighbour does not count as lost."""
         if kind is Kind.SDO_REQUEST:
             return can_id == od.sdo_request_cob_id(self.node_id)
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Let the node and the events at a rate do what is due at ``t_ns``."""
+        """Let the node and the events at a rate do everything due at ``t_ns``."""
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
         if self._unplugged:
@@ -151,7 +151,7 @@ class FaultyNode(PatchNode):
         self._do_due_events(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`on_timer` is to be called next; None: not before the next frame."""
+        """Return when to call :meth:`on_timer` next, or None if not before the next frame."""
         faults = self.faults
         if faults.unplugged != self._unplugged:
             return 0
@@ -213,7 +213,7 @@ class FaultyNode(PatchNode):
             case _:
                 self.injected.babbled += self._put_or_lose(BABBLE_COB_ID, bytes(8))
 
-    # --- frames on their way from the node
+    # --- frames sent by the node
 
     def _out(self, can_id: int, data: bytes) -> None:
         if can_id == self._chunk_id:
@@ -240,7 +240,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the answer to an upload, changed if a fault gives a wrong identity or layout."""
+        """Return the answer to an upload, falsified if a fault asks for a wrong identity or layout."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -258,7 +258,7 @@ class FaultyNode(PatchNode):
         return data
 
     def _put(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """Put a frame on the bus unless the node is cut off from it. Returns whether it did."""
+        """Put a frame on the bus unless the node is cut off from it. Returns whether the frame was sent."""
         kind = kind_of(can_id, data, remote)
         if self._is_cut_off:
             self.injected.silenced += 1
@@ -279,7 +279,7 @@ class FaultyNode(PatchNode):
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:
-    """Return the period of each event at a rate, in ns; 0: never."""
+    """Return the period of each event at a rate, in ns; 0 for never."""
     rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
     periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
     return {"restart": round(faults.restart_every_s * 1e9), **periods}

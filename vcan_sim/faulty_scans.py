@@ -1,4 +1,4 @@
-"""Faults of scans and their frames: chunks and summaries on their way from a node to its bus."""
+"""Faults of scans and of their chunks and summaries on the way from a node to its bus."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SUMMARY_COUNTER_BYTE: Final = 0
 
 
 class Put(Protocol):
-    """Puts a frame on the bus unless the node is cut off from it, and returns whether it did."""
+    """Puts a frame on the bus unless the node is cut off from it, and returns whether it was sent."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
         """Put a frame on the bus. Raises BusError if the bus refuses it."""
@@ -28,11 +28,11 @@ class Put(Protocol):
 class FaultyScans:
     """Sends the chunks and summaries of a node with faults.
 
-    A scan suffers at most one fault of scans. A chunk suffers at most one fault of chunks, and none in a scan
-    that has a fault of its own.
+    A scan suffers at most one scan fault. A chunk suffers at most one chunk fault, and none if its scan has a
+    fault.
 
     Args:
-        injector: Faults, chance and counts of the node.
+        injector: The node's faults, random generator and counts.
         node_id: Node-ID.
         profile: Protocol of the node.
         put: Puts a frame on the bus.
@@ -49,36 +49,36 @@ class FaultyScans:
         counter_overflow: Callable[[], int],
     ) -> None:
         self.reset_due = False
-        """The node is to be reset; until then no frame reaches the bus."""
+        """Whether the node must be reset; until then no frame reaches the bus."""
         self._injector, self._profile = injector, profile
         self._put, self._counter_overflow = put, counter_overflow
         self._chunk_id, self._summary_id = od.chunk_cob_id(node_id), od.summary_cob_id(node_id)
-        self._counter = -1  # of the scan being sent, as the node gave it
-        self._chunks = 0  # of that scan, so far
+        self._counter = -1  # counter of the scan being sent, as set by the node
+        self._chunks = 0  # chunks of that scan so far
         self._half = max(1, profile.n_chunks // 2)
-        self._fate = ""  # of that scan: a name in OF_SCANS
+        self._fate = ""  # fault of that scan: a name in OF_SCANS
         self._spoilt = False
-        self._counter_instead: int | None = None  # of a scan that follows a torn scan
+        self._counter_instead: int | None = None  # counter of a scan that follows a torn scan
         self._index_of = chunk_indexer(profile)
         self._packed: list[bytes] = []  # chunks of that scan, as the node packed them
-        self._struck = -1  # index of the chunk of that scan that its fault strikes
+        self._struck = -1  # index of the chunk that the scan's fault affects
         self._lost_next = -1  # index of the chunk that the next scan loses
         self._swapped: bytes | None = None  # chunk that changes places with the next frame
         self._late: list[tuple[int, bytes]] = []  # late chunks, each with the counter of its scan
 
     @property
     def needs_next_scan(self) -> bool:
-        """Whether the fault of this scan needs the next scan to follow in time."""
+        """Whether this scan's fault needs the next scan to follow in time."""
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
-        """Drop the chunks that wait to be sent."""
+        """Drop the chunks that are waiting to be sent."""
         tally = self._injector.tally
         tally.silenced[Kind.CHUNK] += tally.waiting.pop(Kind.CHUNK, 0)
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk of the node, with the faults that it and its scan suffer."""
+        """Send a chunk with the faults that it and its scan suffer."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
@@ -94,11 +94,11 @@ class FaultyScans:
         swapped, self._swapped = self._swapped, None
         try:
             self._suffer_chunk(fault, changed)
-        finally:  # a bus may refuse one frame and accept the other
+        finally:  # the bus may refuse one frame and accept the other
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Send a summary of the node, with the faults that its scan suffers."""
+        """Send a summary with the faults that its scan suffers."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])
@@ -118,7 +118,7 @@ class FaultyScans:
         finally:
             self._release([] if swapped is None else [swapped])
 
-    # --- faults of scans
+    # --- scan faults
 
     def _begin_scan(self, counter: int) -> None:
         was_torn, before = self._fate == "torn", self._counter
@@ -135,7 +135,7 @@ class FaultyScans:
             self._struck = int(self._injector.random.integers(chunks)) if struck is None else struck
 
     def _suffer_scan(self, data: bytes) -> bytes | None:
-        """Return a chunk as the fault of its scan leaves it; None if it is lost."""
+        """Return a chunk with its scan's fault applied, or None if the chunk is lost."""
         injected = self._injector.injected
         if self._fate == "reset" and self._chunks > self._half and not self.reset_due:
             self.reset_due, self._fate = True, ""
@@ -155,19 +155,19 @@ class FaultyScans:
         return data
 
     def _following(self, counter: int) -> int:
-        """Return the counter of the scan after the scan with ``counter``."""
+        """Return the counter that follows ``counter``."""
         overflow = self._counter_overflow()
         return counter % overflow + 1 if overflow else counter + 1 & 0xFF
 
     def _untrue(self, data: bytes) -> bytes:
-        """Return the summary of a scan that is understated or unchecked."""
+        """Return the summary of an understated or unchecked scan."""
         said, injected = unpack_summary(data), self._injector.injected
         if self._fate == "unchecked":
             injected.unchecked += 1
             return pack_summary(
                 said.scan, said.flags & ~SummaryFlag.CHECKED, said.chunks, said.device_time_us
             )
-        if len(self._packed) != self._profile.n_chunks:  # the codes of the other chunks are unknown here
+        if len(self._packed) != self._profile.n_chunks:  # the codes in the other chunks are not known here
             return data
         injected.understated += 1
         head = said.scan, said.flags | SummaryFlag.CHANGED_ONLY, said.chunks - 1, said.device_time_us
@@ -175,14 +175,14 @@ class FaultyScans:
             return pack_summary(*head)
         return pack_checked_summary(*head, unpack_scan_with_check(b"".join(self._packed), self._profile)[1])
 
-    # --- faults of chunks
+    # --- chunk faults
 
     def _suffer_chunk(self, fault: str, data: bytes) -> None:
         if not fault:
             self._send(self._chunk_id, data)
             return
         if not _CHUNK_FAULTS[fault](self, data):
-            return  # the node was cut off: the frame was silenced, with or without the fault
+            return  # the node is cut off: the frame counts as silenced, whatever the fault
         self._injector.count(fault)
         if fault not in ("duplicated", "reordered") and not self._spoilt:
             self._spoilt = True
@@ -235,8 +235,8 @@ class FaultyScans:
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
         """Send a chunk or summary, and then the late chunks of earlier scans.
 
-        A ``spoilt`` frame does not belong to its scan for a receiver, so late chunks wait on. Returns whether
-        the frame was sent.
+        A receiver does not assign a ``spoilt`` frame to its scan, so late chunks stay queued after it.
+        Returns whether the frame was sent.
         """
         if not self._put(can_id, data):
             return False
@@ -248,7 +248,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send chunks that waited, even after the bus has refused one. Raises BusError if it refused any."""
+        """Send queued chunks, even after the bus refuses one. Raises BusError if the bus refused any."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

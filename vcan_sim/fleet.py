@@ -1,4 +1,4 @@
-"""All simulated nodes of a hand, each bus with its port and its thread, started and stopped together."""
+"""All simulated nodes of a hand, with one port and one thread per bus, started and stopped together."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from vcan_sim.tally import Kind, Tally, kind_of
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """Counts of one simulated node since its start."""
+    """Counts of one simulated node since it started."""
 
     patch: str
     node_id: int
     nmt_state: NmtState
     frames_sent: int
     pdos_sent: int
-    """Frames that carried process data: chunks and summaries."""
+    """Frames that carried process data (chunks and summaries)."""
     scans_sent: int
     """Scans sent completely."""
     overruns: int
@@ -43,25 +43,25 @@ class NodeReport:
 
 
 class Fleet:
-    """The patches of a hand as CANopen nodes, each with a scene of its own.
+    """A hand's patches as CANopen nodes, each with its own scene.
 
     A scene begins when its node has sent its first scan: bring-up may take any time, and a tare at power-on
-    sees an untouched patch. :meth:`start` opens the buses and powers the nodes on, :meth:`stop` takes them to
-    pre-operational and closes the buses; a ``with`` block does both.
+    sees an untouched patch. :meth:`start` opens the buses and powers the nodes on. :meth:`stop` sets the
+    nodes to pre-operational and closes the buses. A ``with`` block does both.
 
     Args:
         hand: Buses, patches and scene.
-        interface: python-can interface in place of the file's.
-        channel: Channel in place of the file's.
-        faults: Faults of every node from the start; see also :meth:`inject`.
-        wire_up: Returns what the converter of a patch is connected to; default: the simulated patch itself.
-        unchecked: Names of patches of revision 1.0, whose summaries carry no check.
+        interface: python-can interface that overrides the file's.
+        channel: Channel that overrides the file's.
+        faults: Initial faults of every node; see also :meth:`inject`.
+        wire_up: Returns the source that a patch's converter reads; default: the simulated patch itself.
+        unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
 
     Raises:
-        ConfigError: A channel is given for a hand of several buses.
+        ConfigError: A channel is given for a hand with several buses.
     """
 
-    def __init__(  # noqa: PLR0913 - keyword arguments, each rarely given
+    def __init__(  # noqa: PLR0913 - keyword arguments, most of them rarely given
         self,
         hand: HandConfig,
         *,
@@ -92,7 +92,7 @@ class Fleet:
         """Open the buses and power the nodes on.
 
         Raises:
-            BusError: A bus cannot be opened; none is left open.
+            BusError: A bus cannot be opened. No bus is left open.
         """
         with ExitStack() as opened:
             runners, ports = [], {}
@@ -107,15 +107,15 @@ class Fleet:
         self._runners, self._ports = runners, ports
 
     def stop(self) -> None:
-        """Take the nodes to pre-operational, join the threads and close the buses. Stopping twice is fine.
+        """Set the nodes to pre-operational, join the threads and close the buses. Can be called repeatedly.
 
-        Raises the error that ended a thread early, if there was one.
+        Raises the error that ended a thread early, if any.
         """
         self._running.close()
 
     @property
     def failed(self) -> bool:
-        """Whether a bus has ended early; :meth:`stop` raises why."""
+        """Whether a bus has ended early; :meth:`stop` raises the error."""
         return any(runner.failed for runner in self._runners)
 
     @property
@@ -128,21 +128,21 @@ class Fleet:
         return tuple(station.report() for station in self._stations.values())
 
     def inject(self, faults: Faults, patch: str | None = None) -> None:
-        """Replace the faults of one patch, or of all. The seed stays that of the start.
+        """Replace the faults of one patch or of all patches. The initial seed stays in force.
 
         Args:
-            faults: The new faults.
-            patch: Name of the patch; None: all patches.
+            faults: New faults.
+            patch: Name of the patch; None for all patches.
 
         Raises:
-            ConfigError: A patch does not have the wire of a fault.
+            ConfigError: A patch does not have the wire that a fault names.
         """
         for name, station in self._stations.items():
             if patch in (None, name):
                 station.inject(faults)
 
     def injected(self, patch: str) -> Injected:
-        """Return the counts of faults injected so far into the node of a patch."""
+        """Return the counts of the faults injected so far into a patch's node."""
         return self._stations[patch].injected()
 
     def tally(self, patch: str) -> Tally:
@@ -154,21 +154,21 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Take the controller of the nodes on a bus off the bus, or put it back.
+        """Set the controller of the nodes on a bus to bus-off, or reconnect it.
 
-        The nodes end if it lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
+        The nodes end if bus-off lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
         """
         self._ports[bus].off = off
 
     def truth_m(self, patch: str, device_time_us: int) -> Float:
-        """Return the true electrodes (U, N, 3) of a scan, metres.
+        """Return the true electrode positions (U, N, 3) of a scan, metres.
 
         Args:
             patch: Name of the patch.
-            device_time_us: Time in the summary of the scan.
+            device_time_us: Device time in the scan's summary, µs.
 
         Raises:
-            LookupError: The patch is not in the hand, or the scan was not sent or is too long ago.
+            LookupError: The patch is not in the hand, or the scan was never sent or is too old.
         """
         source = self._stations[patch].source
         try:
@@ -187,18 +187,18 @@ class Fleet:
 
 
 class Passed:
-    """Frames that passed through an interface, by kind; data and remote frames only."""
+    """Counts of the data and remote frames that passed through an interface, by kind."""
 
     def __init__(self) -> None:
         self.sent: Counter[Kind] = Counter()
         self.heard: Counter[Kind] = Counter()
-        """Frames given to the nodes."""
+        """Frames passed to the nodes."""
         self.missed: Counter[Kind] = Counter()
-        """Frames on the bus while the controller was off it."""
+        """Frames on the bus while the controller was bus-off."""
 
 
 class FaultyPort(CanPort):
-    """A port whose controller may go off the bus: it then sends nothing, and misses every frame."""
+    """A port whose controller may go bus-off; it then sends nothing and misses every frame."""
 
     off = False
 
@@ -207,14 +207,14 @@ class FaultyPort(CanPort):
         self.passed = Passed()
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Send a frame. Raises BusError if the bus refuses it or the controller is off the bus."""
+        """Send a frame. Raises BusError if the bus refuses it or the controller is bus-off."""
         if self.off:
             raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
         super().send(can_id, data, remote=remote)
         self.passed.sent[kind_of(can_id, data, remote)] += 1
 
     def recv_batch(self, timeout_s: float, most: int = 1) -> list[Frame]:
-        """Receive frames. Raises BusError if the controller is off the bus."""
+        """Receive frames. Raises BusError if the controller is bus-off."""
         if self.off:
             while frames := super().recv_batch(0.0):
                 _count(frames, self.passed.missed)
@@ -231,7 +231,7 @@ def _count(frames: list[Frame], counter: Counter[Kind]) -> None:
 
 
 class _Station:
-    """A node, its analogue front end, and counts of its frames."""
+    """A node, its analogue front end and the counts of its frames."""
 
     def __init__(
         self,
@@ -250,7 +250,7 @@ class _Station:
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
-        """Return a new node on the patch that sends by ``emit``."""
+        """Return a new node on the patch that sends through ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,

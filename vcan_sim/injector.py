@@ -1,4 +1,4 @@
-"""Faults of one node: which are set, the chance that draws them, and counts of what was injected."""
+"""Fault injector of one node: its current faults, the random generator and the counts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from vcan_sim.tally import Tally
 class Injector:
     """Draws faults from a seed and the order of calls, and counts them.
 
-    :attr:`faults` may be replaced at any time from any thread.
+    :attr:`faults` can be replaced at any time from any thread.
 
     Args:
-        faults: Faults from the start; their seed remains.
-        node_id: Node-ID, so that each node of a seed has faults of its own.
+        faults: Initial faults; their seed stays in force.
+        node_id: Node-ID; makes nodes with the same seed draw different faults.
     """
 
     def __init__(self, faults: Faults, node_id: int) -> None:
@@ -28,7 +28,7 @@ class Injector:
         return share > 0.0 and bool(self.random.random() < share)
 
     def draw_one(self, names: tuple[str, ...]) -> str:
-        """Return one of the faults with the probability of its share, or an empty text."""
+        """Return one of the faults, each with the probability given by its fraction, or an empty string."""
         faults = self.faults
         if faults is NO_FAULTS:
             return ""

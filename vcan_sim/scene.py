@@ -1,12 +1,12 @@
-"""Deforms the skin: a sphere presses, slides and lifts, again and again, and the rubber follows.
+"""Deformation of the skin: a sphere presses, slides and lifts repeatedly, and the rubber follows.
 
 The displacement of the electrodes is the closed form of a sliding Hertz contact on a half-space
-(:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and does not depend on the
-discretisation of a solver. A scene is a pure function of scene time: it can be asked for any instant, in any
-order, and the same seed gives the same scene.
+(:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and does not depend on a solver's
+discretisation. A scene is a pure function of scene time: it can be evaluated at any time, in any order, and
+the same seed gives the same scene.
 
-The onset of sliding is simplified: shear grows in proportion to the pressure from none to full friction while
-the sphere gathers speed; a real contact slips from its rim inwards (Cattaneo, Mindlin).
+The onset of sliding is simplified: shear grows in proportion to the pressure, from zero to full friction,
+while the sphere accelerates; a real contact slips from its rim inwards (Cattaneo, Mindlin).
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
 
 LEAD_S: Final = 0.8
-"""Rest before the first press in s, for the baseline and for a viewer."""
+"""Rest before the first press, s; gives time for the baseline and for a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Shares of a cycle; the remainder is rest. In a cycle of 4 s a press takes 1.4 s."""
+"""Fractions of a cycle; the remainder is rest. In a 4 s cycle a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
-"""Share of a slide in which the sphere accelerates, and at the end decelerates."""
+"""Fraction of a slide in which the sphere accelerates, and of its end in which the sphere decelerates."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times in s since first touch."""
+    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times in s since first contact."""
 
     radius_m: float
     depth_m: float
@@ -49,7 +49,7 @@ class Stroke:
     lift_s: float
 
     def contact(self, rubber: Rubber, t_s: float) -> HertzContact | None:
-        """Return the contact at ``t_s``, or None if the sphere does not touch."""
+        """Return the contact at ``t_s``, or None if the sphere does not touch the skin."""
         lifting = t_s - self.press_s - self.slide_s
         depth = self.depth_m * _ease(t_s / self.press_s) * (1.0 - _ease(lifting / self.lift_s))
         if depth <= 0.0:
@@ -72,10 +72,10 @@ class Scene:
 
     Args:
         layout: The patch at rest. Its electrodes lie on the surface of the rubber; a curved skin is treated
-            as the flat one below its x and y.
-        simulation: Seed, sphere, depth, friction, speed and pace.
-        number: Number of the patch in the hand. Each has strokes and a phase of its own.
-        rubber: Material of the skin. Displacement does not depend on its Young's modulus, force does.
+            as its projection onto the plane of x and y.
+        simulation: Seed, sphere, depth, friction, speed and timing.
+        number: Number of the patch in the hand. Each patch has its own strokes and phase.
+        rubber: Material of the skin. Displacement does not depend on its Young's modulus, but force does.
     """
 
     layout: PatchLayout
@@ -85,7 +85,7 @@ class Scene:
 
     @property
     def lead_s(self) -> float:
-        """Scene time of the first touch. Patches differ by up to a quarter of a cycle."""
+        """Scene time of the first touch, s. Patches differ by up to a quarter of a cycle."""
         return LEAD_S + 0.25 * self.simulation.cycle_s * math.fmod(self.number * _GOLDEN, 1.0)
 
     def stroke(self, index: int) -> Stroke:
@@ -101,7 +101,7 @@ class Scene:
         slide_m = min(options.slide_speed_m_per_s * (1.0 - _RAMP) * slide_s, room)
         way = slide_m * heading
         first, last = low - np.minimum(way, 0.0), high - np.maximum(way, 0.0)
-        start = random.uniform(first, np.maximum(first, last))  # a way as long as the room rounds to more
+        start = random.uniform(first, np.maximum(first, last))  # rounding may put `first` above `last`
         return Stroke(
             radius_m=options.indenter_radius_m,
             depth_m=options.depth * self.layout.height_m,
@@ -123,7 +123,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3) at scene time ``t_s``, metres; ``layout.upper_m`` at rest."""
+        """Return the electrodes (U, N, 3) at scene time ``t_s``, metres; ``layout.upper_m`` if at rest."""
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m
@@ -136,9 +136,10 @@ class Scene:
 
     @functools.cached_property
     def _field_m(self) -> tuple[Float, Float]:
-        """Corners of the rectangle that the centre of the sphere stays in.
+        """Corners of the rectangle to which the centre of the sphere is confined.
 
-        It is one pitch inside the outermost electrodes, or their middle on a patch too small for that.
+        The rectangle lies one pitch inside the outermost electrodes, or shrinks to their middle on a smaller
+        patch.
         """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))
@@ -146,13 +147,13 @@ class Scene:
 
 
 def _ease(share: float) -> float:
-    """Rise from 0 to 1 with zero speed and acceleration at both ends: least jerk (Flash and Hogan 1985)."""
+    """Rise from 0 to 1 with zero speed and acceleration at both ends: minimum jerk (Flash and Hogan 1985)."""
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
 
 def _glide(share: float) -> float:
-    """Rise from 0 to 1 at constant speed, with smooth ramps of ``_RAMP`` at both ends."""
+    """Rise from 0 to 1 at constant speed, with smooth ramps of length ``_RAMP`` at both ends."""
     s = min(max(share, 0.0), 1.0)
     if s > 0.5:
         return 1.0 - _glide(1.0 - s)

@@ -1,4 +1,4 @@
-"""Simulated resistances at the analogue port of a node, and the faults of wires and converter."""
+"""Simulated resistances at a node's analogue port, with faults of the wires and the converter."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from vcan_sim.injector import Injector
 from vcan_sim.scene import Scene
 
 REMEMBERED_READINGS: Final = 4096
-"""Number of readings whose time is kept: more than five minutes of scans at 12.5 a second."""
+"""Number of readings whose time is kept: more than five minutes of scans at 12.5 per second."""
 
 WIRE_NOISE: Final = 3e-3
-"""Standard deviation of a resistance through a bad contact, relative."""
+"""Relative standard deviation of a resistance measured through a bad contact."""
 
 Fault = Callable[[Float, int], Float]
 """Function from resistances (U, K) in ohm and the time in ns to the resistances that the converter sees
-instead; inf is an open pair of wires, 0 a short."""
+instead; inf means an open pair of wires, 0 a short."""
 
 
 class SimulatedPatch:
-    """The resistances of a patch in a scene, as a converter with noise reads them.
+    """Resistances of a patch in a scene, as read by a converter with noise.
 
-    A :class:`skinnode.node.ResistanceSource`. The scene lies at rest until :meth:`start` sets its origin of
-    time, so that readings at power-on (a tare) see an untouched patch. The truth is a pure function of time
-    and is not stored: :meth:`truth_m` gives it for any time, :meth:`read_ns` gives the time of a scan.
+    Implements :class:`skinnode.node.ResistanceSource`. The skin stays at rest until :meth:`start` sets the
+    scene's time origin, so that readings at power-on (a tare) see an untouched patch. The truth is a pure
+    function of time and is not stored: :meth:`truth_m` returns it for any time, and :meth:`read_ns` returns
+    the time of a scan.
 
     Args:
-        scene: What happens on the skin.
+        scene: Motion of the indenter and the skin.
         converter_noise: Standard deviation of a reading, relative to the resistance. Default: the scene's.
-        fault: Applied to each reading, after the noise.
+        fault: Function applied to each reading, after the noise.
     """
 
     def __init__(
@@ -46,9 +47,9 @@ class SimulatedPatch:
         self.scene = scene
         self.fault = fault
         self.reads = 0
-        """Number of readings so far, including those of a tare."""
+        """Number of readings so far, including readings for a tare."""
         self.last_read_ns = 0
-        """Time of the newest reading."""
+        """Time of the newest reading, ns."""
         self._noise = scene.simulation.converter_noise if converter_noise is None else converter_noise
         self._random = np.random.default_rng([scene.simulation.seed, scene.number])
         self._forward = _Forward(scene.layout)
@@ -62,13 +63,13 @@ class SimulatedPatch:
         return self._origin_ns is not None
 
     def start(self, t_ns: int) -> None:
-        """Let the scene begin, or begin again, at ``t_ns``."""
+        """Start or restart the scene at ``t_ns``."""
         self._origin_ns = t_ns
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at ``t_ns`` with the converter's noise.
+        """Return the resistances (U, K) in ohm at ``t_ns``, with converter noise.
 
-        The k-th reading of a seed has the same noise whenever it is taken.
+        For a given seed the k-th reading always has the same noise, whenever it is taken.
         """
         self.reads += 1
         self.last_read_ns = t_ns
@@ -80,14 +81,14 @@ class SimulatedPatch:
         return read if self.fault is None else self.fault(read, t_ns)
 
     def read_ns(self, device_time_us: int) -> int:
-        """Return when a reading was taken.
+        """Return the time of a reading, ns.
 
         Args:
-            device_time_us: Time of the reading as the node has it: its lower 32 bits, of which a checked
-                summary carries all but the lowest 6.
+            device_time_us: The node's time of the reading, µs: its lower 32 bits, of which a checked summary
+                carries all but the lowest 6.
 
         Raises:
-            LookupError: There was no such reading, or it is too long ago.
+            LookupError: There was no such reading, or it is too old.
         """
         try:
             return self._read_ns[(device_time_us & 0xFFFF_FFFF) // TIME_STEP_US]
@@ -97,7 +98,7 @@ class SimulatedPatch:
             ) from None
 
     def truth_m(self, t_ns: int) -> Float:
-        """Return the true electrodes (U, N, 3) at ``t_ns``, metres."""
+        """Return the true electrode positions (U, N, 3) at ``t_ns``, metres."""
         if self._origin_ns is None:
             return self.scene.layout.upper_m
         return self.scene.upper_m((t_ns - self._origin_ns) * 1e-9)
@@ -111,11 +112,11 @@ class SimulatedPatch:
 class FaultyConverter:
     """A converter whose readings may be frozen, or taken through open, shorted or noisy wires.
 
-    Wires are sound while the node boots, so that its tare at power-on is sound.
+    The wires are intact while the node boots, so that its tare at power-on is valid.
 
     Args:
-        source: What the sound converter measures.
-        injector: Faults, chance and counts of the node.
+        source: Resistances that an intact converter would measure.
+        injector: The node's faults, random generator and counts.
         booting: Returns whether the node is booting.
     """
 
@@ -124,7 +125,7 @@ class FaultyConverter:
         self._reading: Float | None = None
 
     def read(self, t_ns: int) -> Float:
-        """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading if frozen."""
+        """Return the resistances (U, K) in ohm at ``t_ns``, or the previous reading while frozen."""
         if self._injector.faults.frozen and self._reading is not None:
             self._injector.injected.frozen += 1
         else:
@@ -152,9 +153,9 @@ class FaultyConverter:
 
 
 def simulated(layout: PatchLayout) -> SimulatedPatch:
-    """Return a patch that a sphere presses: the source ``simulated`` of ``skinnode node``.
+    """Return a patch that a sphere presses: the source named ``simulated`` in ``skinnode node``.
 
-    The scene begins with this call. The first touch comes after 0.8 s, so that a tare at power-on sees an
+    The scene starts immediately. The first touch comes after 0.8 s, so that a tare at power-on sees an
     untouched patch.
     """
     source = SimulatedPatch(Scene(layout))
@@ -163,10 +164,10 @@ def simulated(layout: PatchLayout) -> SimulatedPatch:
 
 
 class _Forward:
-    """Computes the resistances of a patch by plain sums.
+    """Computes the resistances of a patch by direct summation.
 
-    It shares no code with the solver's kernels, so that truth and solver cannot share a bug, and is six times
-    as fast as the reference model because it makes no (…, 3) temporaries.
+    It shares no code with the solver's kernels, so that truth and solver cannot share a bug. It is six times
+    as fast as the reference model because it allocates no (…, 3) temporaries.
     """
 
     def __init__(self, layout: PatchLayout) -> None:

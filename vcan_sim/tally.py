@@ -13,7 +13,7 @@ _BOOT_UP_DATA: Final = bytes((NmtState.INITIALISING,))
 
 
 class Kind(enum.StrEnum):
-    """Kind of a frame, by its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
+    """Kind of a frame, determined by its COB-ID in the predefined connection set (CiA 301, 7.3.3)."""
 
     NMT = "NMT"
     SYNC = "SYNC"
@@ -52,7 +52,7 @@ _HEARTBEAT: Final = od.heartbeat_cob_id(0)
 def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
     """Return the kind of a frame with an 11-bit identifier.
 
-    Remote frames are a kind of their own; a frame of wrong length has the kind of its COB-ID.
+    Remote frames are a separate kind. A frame of the wrong length has the kind given by its COB-ID.
     """
     if remote:
         return Kind.REMOTE
@@ -65,7 +65,7 @@ def kind_of(can_id: int, data: bytes, remote: bool = False) -> Kind:
 
 
 class Tally:
-    """Frames of one node by kind.
+    """Counts of one node's frames, by kind.
 
     Sent frames: ``handed = emitted + lost + silenced + refused + waiting``; received frames:
     ``heard = taken + lost_in + unheard``.
@@ -73,28 +73,28 @@ class Tally:
 
     def __init__(self) -> None:
         self.handed: Counter[Kind] = Counter()
-        """Frames that the node, or a fault that adds frames, wanted to send."""
+        """Frames to send, from the node or from a fault that adds frames."""
         self.emitted: Counter[Kind] = Counter()
         """Frames put on the bus."""
         self.lost: Counter[Kind] = Counter()
-        """Frames dropped by a fault on their way to the bus."""
+        """Frames dropped by a fault on the way to the bus."""
         self.silenced: Counter[Kind] = Counter()
         """Frames held back while the node was silent, unplugged or being reset."""
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus refused."""
         self.waiting: Counter[Kind] = Counter()
-        """Frames held back to be sent later: chunks that are late or change places."""
+        """Frames held back to be sent later: late chunks and chunks that change places."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()
         """Frames passed to the node."""
         self.lost_in: Counter[Kind] = Counter()
-        """Frames dropped by a fault on their way to the node."""
+        """Frames dropped by a fault on the way to the node."""
         self.unheard: Counter[Kind] = Counter()
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return a line for each sum that does not agree; empty if all do. Call when the node is at rest."""
+        """Return one line per sum that does not agree; empty if all agree. Call when the node is idle."""
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [

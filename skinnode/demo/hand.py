@@ -9,7 +9,7 @@ from skinnode.config import HandConfig, parse_hand
 
 _NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
 _SYNC_MS_PER_PATCH: Final = 20
-"""A 10 × 30 patch takes up to 101 × 135 bits a scan: at 20 ms a patch a plan needs 68 % of 1 Mbit/s."""
+"""A 10 × 30 patch needs up to 101 × 135 bits per scan; at 20 ms per patch a plan loads 1 Mbit/s to 68 %."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:
@@ -17,7 +17,7 @@ def demo_hand(patches: int, seed: int) -> HandConfig:
 
     Args:
         patches: Number of patches, 1 to 127.
-        seed: Seed of the scene and of the converter noise.
+        seed: Seed of the scene and the converter noise.
     """
     names = [_NAMES[i] if i < len(_NAMES) else f"patch{i + 1}" for i in range(patches)]
     return parse_hand(

@@ -1,4 +1,4 @@
-"""Plot of a demo: truth, estimate and error of each patch."""
+"""Plot of a demo: truth, estimate and error for each patch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchTrace:
-    """Data of one patch for the plot. Times in s since the first scan, lengths in m."""
+    """Plot data of one patch. Times in s since the first scan, lengths in m."""
 
     name: str
     rest_m: Float
@@ -23,13 +23,13 @@ class PatchTrace:
     time_s: Float
     """(T,)"""
     depth_m: Float
-    """(T,), true depth of the deepest electrode."""
+    """(T,), true depth at the deepest electrode."""
     error_m: Float
     """(T,), RMS error of the field."""
     reported_m: Float
     """(T,), RMS of the reported standard deviations."""
     snapshot_truth_m: Float
-    """(U, N, 3), true displacement of the deepest scan."""
+    """(U, N, 3), true displacement in the deepest scan."""
     snapshot_m: Float
     """(U, N, 3), decoded displacement of that scan."""
 
@@ -37,7 +37,7 @@ class PatchTrace:
 def _map(  # noqa: PLR0913 - the options of an image
     axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: str, low: float
 ) -> Any:
-    """Draw depth as an image over the patch; axes in mm."""
+    """Draw the depth as an image over the patch, axes in mm."""
     x, y = 1e3 * rest_m[..., 0], 1e3 * rest_m[..., 1]
     half = 0.5 * (x[0, 1] - x[0, 0]) if x.shape[1] > 1 else 1.0
     extent = (x.min() - half, x.max() + half, y.min() - half, y.max() + half)
@@ -56,11 +56,11 @@ def _map(  # noqa: PLR0913 - the options of an image
 
 
 def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
-    """Draw one column for each patch: truth, estimate, their difference, and error over time.
+    """Draw one column per patch: truth, estimate, their difference, and error over time.
 
     Args:
-        file: File to write; its suffix names the format.
-        traces: Data of the patches.
+        file: File to write; its suffix sets the format.
+        traces: Data of each patch.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -100,10 +100,10 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
             figure.colorbar(image, ax=grid[:2, :].ravel().tolist(), label="depth (µm); arrows: shear")
         image = _map(grid[2, column], error, trace.rest_m, scale_um=error_um, colours="coolwarm", low=-1.0)
         if column == count - 1:
-            figure.colorbar(image, ax=grid[2, :].ravel().tolist(), label="error in depth (µm)")
+            figure.colorbar(image, ax=grid[2, :].ravel().tolist(), label="depth error (µm)")
         axes = grid[3, column]
         axes.plot(trace.time_s, 1e6 * trace.error_m, ".", ms=3, color="tab:blue", label="error (RMS)")
-        axes.plot(trace.time_s, 1e6 * trace.reported_m, "-", color="tab:orange", label="reported deviation")
+        axes.plot(trace.time_s, 1e6 * trace.reported_m, "-", color="tab:orange", label="reported std. dev.")
         axes.set_ylim(0, 1.5 * highest_um)
         axes.set_xlabel("time (s)")
         depth = axes.twinx()

@@ -1,4 +1,4 @@
-"""Runs ``skinnode demo``: plays the scene, follows the fields, and scores them by the truth."""
+"""The run of ``skinnode demo``: plays the scene, collects the fields and scores them against the truth."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Seconds without a field after which the scans of a SYNC are solved and the next have not yet arrived."""
+"""Seconds without a field that show a SYNC's scans are solved and the next scans have not yet arrived."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReport:
-    """One patch's line of the report."""
+    """One patch's row of the report."""
 
     patch: str
     node_id: int
@@ -49,7 +49,7 @@ class PatchReport:
     """Scans replaced by a newer scan before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """PDOs of the node that did not become part of a scan."""
+    """PDOs from the node that did not become part of a scan."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -68,7 +68,7 @@ class Report:
     """PDOs that became part of a scan."""
     frames_lost: int
     bus_load: float
-    """Share of a 1 Mbit/s bus that all frames of the scan phase would have used, with stuff bits."""
+    """Fraction of a 1 Mbit/s bus that all frames of the scan phase would have used, including stuff bits."""
     faults: tuple[str, ...]
     """Reasons for exit status 1; empty if there are none."""
 
@@ -90,7 +90,7 @@ class _Watch:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
     latency_ms: list[float] = field(default_factory=list)
     history: list[tuple[float, float, float, float]] = field(default_factory=list)
-    """Time, true depth, RMS error and RMS reported standard deviation of each scan."""
+    """Time, true depth, RMS error and RMS reported standard deviation for each scan."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
 
@@ -136,13 +136,13 @@ class _Watch:
 
 
 def _depth_std_m(frame: FieldFrame) -> float:
-    """Return the reported standard deviation of the depth of the deepest electrode."""
+    """Return the reported standard deviation of the depth at the deepest electrode."""
     deepest = frame.displacement_m[..., 2].argmin()
     return float(frame.displacement_std_m[..., 2].flat[deepest])
 
 
 class _Progress:
-    """Shows the run: a live view on a terminal, a line a second elsewhere."""
+    """Shows the run: a live view on a terminal, one line per second elsewhere."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -187,12 +187,12 @@ class _Progress:
 
 
 def play(hand: HandConfig, seconds: float, console: Console) -> Run:
-    """Play a hand and score the decoded fields.
+    """Play a hand and score the decoded fields against the truth.
 
     Args:
         hand: The hand, on a virtual bus.
-        seconds: Length of the run from the first scan.
-        console: Where progress is printed.
+        seconds: Duration of the run, from the first scan.
+        console: Console that progress is printed to.
 
     Raises:
         SkinError: The hand cannot be run.
@@ -224,14 +224,12 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Between two scans, so that score and screen take no time from the host.
+                    # Between two scans, so that scoring and drawing do not delay the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
             bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
-        while (
-            frame := subscription.get(0.0)
-        ) is not None:  # fields that were being solved when the host closed
+        while (frame := subscription.get(0.0)) is not None:  # fields still being solved when the host closed
             unscored.append(frame)
         for frame in unscored:
             _take(frame, watches, fleet, t_start_ns)
@@ -269,7 +267,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
     assert frame.stamp is not None  # the host stamps every field
-    if frame.stamp.device_time_us == 0:  # its summary was lost: the time of its truth is unknown
+    if frame.stamp.device_time_us == 0:  # summary lost, so the time to look the truth up at is unknown
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
     watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
@@ -280,7 +278,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the losses that the host knows of: frames dropped by its queue, and chunks that never came."""
+    """Return the losses known to the host: frames dropped by its queue, and chunks that never arrived."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())
@@ -307,14 +305,15 @@ def _faults(rows: Sequence[PatchReport], lost: int) -> tuple[str, ...]:
             score = row.score
             found.append(
                 f"{row.patch}: error {1e6 * score.error_rms_m:.2f} µm RMS, "
-                f"{score.worst_deviations:.1f} deviations at worst, {score.untrusted} scans not converged; "
+                f"{score.worst_deviations:.1f} standard deviations at worst, "
+                f"{score.untrusted} scans not converged; "
                 f"reported ± {1e6 * score.reported_rms_m:.2f} µm"
             )
     return tuple(found)
 
 
 def print_report(console: Console, report: Report) -> None:
-    """Print the final table, and one line for each fault."""
+    """Print the final table and one line per fault."""
     table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
     table.add_column("\npatch")
     for heading in (
@@ -345,7 +344,7 @@ def print_report(console: Console, report: Report) -> None:
     load = f"{100 * report.bus_load:.0f} %"
     console.print(
         f"{report.frames_sent} PDOs sent, {report.frames_lost} lost; "
-        f"{report.scan_rate_hz:.1f} scans/s a patch; a 1 Mbit/s bus would have been loaded to {load}",
+        f"{report.scan_rate_hz:.1f} scans/s per patch; load on a 1 Mbit/s bus would have been {load}",
         soft_wrap=True,
     )
     pressed = [row.score for row in report.patches if row.score.deepest_m > 10 * row.score.reported_rms_m]
@@ -356,7 +355,7 @@ def print_report(console: Console, report: Report) -> None:
             soft_wrap=True,
         )
     else:
-        console.print("nothing was pressed in this time; use more --seconds")
+        console.print("no patch was pressed in this time; use a larger --seconds")
     for fault in report.faults:
         console.print("fault: ", style="bold red", end="")
         console.print(fault)
@@ -366,12 +365,12 @@ def print_report(console: Console, report: Report) -> None:
             "no scan torn, no frame lost, errors as large as reported", style="green", end=" ", soft_wrap=True
         )
         console.print(
-            f"(RMS within {EXCESS_LIMIT} of it, worst coordinate {worst:.1f} deviations)",
+            f"(RMS within {EXCESS_LIMIT} times reported, worst coordinate {worst:.1f} standard deviations)",
             soft_wrap=True,
         )
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the report as plain data; a missing figure is None."""
+    """Return the report as plain data, with None for missing figures."""
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

@@ -1,7 +1,7 @@
-"""Simulated patches for a command that shows a host at work.
+"""Simulated patches for commands that show a host at work.
 
-They run in a process of their own, as the nodes of a real hand do: they share no interpreter with the host,
-and the host's figures are its own.
+They run in a separate process, so that, as with a real hand, they share no interpreter with the host and the
+host's figures cover the host alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from skinnode.process.child_processes import starting_children
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
     """Return the same hand on unused buses that connect processes on this machine.
 
-    Simulated nodes must not appear among real ones.
+    Simulated nodes must not appear on a bus with real nodes.
     """
     groups = random.sample(range(1 << 16), len(hand.buses))
     buses = tuple(
@@ -38,10 +38,10 @@ def on_simulated_buses(hand: HandConfig) -> HandConfig:
 
 @contextmanager
 def simulated(hand: HandConfig) -> Iterator[None]:
-    """Run a hand's patches as nodes on its buses, in a child process that exits with this one.
+    """Run a hand's patches as nodes on its buses, in a child process that exits with this process.
 
     Raises:
-        SkinError: The child process cannot run them.
+        SkinError: The child process cannot run the patches.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -63,12 +63,12 @@ def simulated(hand: HandConfig) -> Iterator[None]:
 
 
 def _run_nodes(hand: HandConfig, parent: Connection) -> None:
-    """Run the nodes until the parent closes its end of the pipe, which happens even if it is killed."""
+    """Run the nodes until the parent closes its end of the pipe, as also happens if the parent is killed."""
     import signal
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group; the parent ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group, but the parent ends this process
     try:
         with Fleet(hand):
             parent.send("")

@@ -1,4 +1,4 @@
-"""Live view of the demo on a terminal: a height map for each patch, health, rates and bus load."""
+"""Live terminal view of the demo: each patch's height map, health and rates, and the bus load."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a height map in characters; each shows two pixels, one above the other, so the map is square."""
+"""Width of a height map in characters. Each shows two pixels, one above the other, so the map is square."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """Data of one patch for the view. Lengths in metres, NaN if not yet known."""
+    """View data of one patch. Lengths in metres, NaN if not yet known."""
 
     name: str
     health: str
     displacement_m: Float | None
     """(U, N, 3)"""
     depth_std_m: float
-    """Reported standard deviation of the depth of the deepest electrode."""
+    """Reported standard deviation of the depth at the deepest electrode."""
     error_m: float
-    """RMS error of the last field."""
+    """RMS error of the newest field."""
     rate_hz: float
     torn: int
 
 
 @dataclass(frozen=True, slots=True)
 class BusView:
-    """Data of the bus and of the run for the view."""
+    """View data of the bus and the run."""
 
     elapsed_s: float
     seconds: float
@@ -53,7 +53,7 @@ class BusView:
 
 
 class HeightMap:
-    """Draws the depth of a surface as the monitor does; the first upper wire is at the bottom."""
+    """Draws the depth of a surface as the monitor does, with the first upper wire at the bottom."""
 
     def __init__(self, surface: Surface, full_scale_m: float) -> None:
         height = MAP_SIZE // 2
@@ -69,7 +69,7 @@ class HeightMap:
 
 
 def _surface(displacement_m: Float | None) -> Surface:
-    """Return the surface of a field without its deviations; a flat one if there is no field yet."""
+    """Return the surface of a field without its standard deviations, or a flat one before the first field."""
     moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
     unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
     return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)
@@ -102,7 +102,7 @@ def _patch_panel(patch: PatchView, full_scale_m: float) -> Panel:
 
 
 def panels_in(columns: int, lines: int) -> int:
-    """Return the number of patches that fit on a terminal of this size."""
+    """Return the number of patches that fit on a terminal of the given size."""
     across, down = columns // (MAP_SIZE + 4), (lines - 4) // (MAP_SIZE // 2 + 7)
     return max(1, across) * max(1, down)
 
@@ -113,9 +113,9 @@ def render(
     """Return the whole screen.
 
     Args:
-        patches: Data of the patches.
+        patches: Data of each patch.
         bus: Data of the bus.
-        full_scale_m: Depth drawn brightest, metres.
+        full_scale_m: Depth drawn at full brightness, metres.
         room: Maximum number of patches to draw.
     """
     line = Text.assemble(

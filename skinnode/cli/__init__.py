@@ -1,5 +1,5 @@
-"""Subcommands of ``skinnode``, one file each: options in, text and exit status out, no logic of their own.
+"""Subcommands of ``skinnode``, one file each: they parse options and return text and an exit status.
 
-A file imports its dependencies only when its command runs, so that ``--help`` responds at once. Files that
-begin with an underscore serve several commands.
+A file imports its dependencies only when its command runs, so that ``--help`` responds at once. Files whose
+names begin with an underscore are shared by several commands.
 """

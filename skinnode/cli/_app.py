@@ -1,4 +1,4 @@
-"""The typer application ``skinnode``: all subcommands under their names."""
+"""Typer application ``skinnode`` with all subcommands."""
 
 from __future__ import annotations
 

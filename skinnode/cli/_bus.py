@@ -1,4 +1,4 @@
-"""The bus that a command works on, from its options: an interface, or a bus of a hand file; and its node."""
+"""Bus and node that a command works on, as given by its options: an interface, or a bus of a hand file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus, and the hand it belongs to."""
+    """A bus and the hand that it belongs to."""
 
     bus: BusConfig
     hand: HandConfig | None
@@ -21,7 +21,7 @@ class Place(NamedTuple):
         return () if self.hand is None else self.hand.patches_on(self.bus.name)
 
     def patch_name(self, node_id: int) -> str:
-        """Return the name of the patch at that node-ID, or an empty text."""
+        """Return the name of the patch with that node-ID, or an empty string."""
         return next((patch.name for patch in self.patches if patch.node_id == node_id), "")
 
 
@@ -81,10 +81,10 @@ def find_bus(
     hand: Path | None,
     bus: str | None,
 ) -> Place:
-    """Return the one bus that the options name; arguments as for :func:`find_buses`.
+    """Return the single bus that the options name; arguments as for :func:`find_buses`.
 
     Raises:
-        ConfigError: The options are not valid or leave several buses.
+        ConfigError: The options are not valid, or they match several buses.
     """
     from skinnode.errors import NOTHING, ConfigError
 
@@ -126,27 +126,27 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and the node-ID of NODE, a node-ID or the name of a patch on any bus of the hand.
+    """Return the bus and node-ID of NODE: a node-ID, or the name of a patch on any bus of the hand.
 
-    The other arguments are those of :func:`find_buses`.
+    The other arguments are as for :func:`find_buses`.
 
     Raises:
-        ConfigError: No patch has the name, or the node-ID could be on several buses.
+        ConfigError: No patch has the name, or the node-ID may be on several buses.
     """
     places = find_buses(interface, channel, bitrate, fd, hand, bus)
     return node_among(node, places, "NODE")
 
 
 def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
-    """Return the bus and the node-ID of a node.
+    """Return the bus and node-ID of a node.
 
     Args:
         node: A node-ID or the name of a patch.
-        places: Buses where the node may be.
-        key: Argument that has the value ``node``, for errors.
+        places: Buses to search.
+        key: Name of the argument with the value ``node``, for error messages.
 
     Raises:
-        ConfigError: As :func:`find_node`.
+        ConfigError: No patch has the name, or the node-ID may be on several buses.
     """
     from skinnode.errors import ConfigError
 
@@ -170,4 +170,4 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     if not found:
         raise ConfigError(key, node_id, f"a node-ID of the hand, or any with {buses}")
     which = " and ".join(f"{patch.name} on {place.bus.name}" for place, patch in found)
-    raise ConfigError(key, node_id, f"a node-ID of one bus: it is {which}; name the patch, or add {buses}")
+    raise ConfigError(key, node_id, f"a node-ID on one bus: it is {which}; name the patch, or add {buses}")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Width of a pipe in columns, more than any line of skinnode has."""
+"""Console width for a pipe, in columns: more than skinnode's longest line."""
 
 
 def print_json(value: Any) -> None:
@@ -33,9 +33,9 @@ def print_json(value: Any) -> None:
 def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
     """Return the console of all commands.
 
-    It prints square brackets and colons literally, because names contain them; styles are arguments of
-    ``print``. The console is as wide as the terminal. Output to a pipe or file is not wrapped, so that
-    programs read whole lines, unless ``COLUMNS`` sets a width.
+    It prints square brackets and colons literally, because names may contain them; styles are passed as
+    arguments of ``print``. The console is as wide as the terminal. Output to a pipe or file is not wrapped,
+    so that programs can read whole lines, unless ``COLUMNS`` sets a width.
 
     Args:
         stderr: Print to stderr instead of stdout.
@@ -53,7 +53,7 @@ def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
 
 def _width(stream: TextIO) -> int | None:
     if stream.isatty() or os.environ.get("COLUMNS", "").isdigit():
-        return None  # rich asks the terminal
+        return None  # rich queries the terminal
     return UNBOUNDED
 
 
@@ -80,7 +80,7 @@ def _console_type() -> type[Console]:
 
 
 def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
-    """Return an empty table with few rules; ``right`` names the columns of numbers, aligned right."""
+    """Return an empty table with few rules; ``right`` names the numeric columns, which are right-aligned."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -99,9 +99,9 @@ def indented(text: str, columns: int = 10) -> Padding:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the current step on one line of stderr, erased at the end.
+    """Yield a function that shows the current step on one line of stderr, which is erased at the end.
 
-    Nothing is shown if ``quiet``, or if stderr is not a terminal.
+    Nothing is shown if ``quiet`` is set or stderr is not a terminal.
     """
     if quiet or not sys.stderr.isatty():
         yield lambda text: None

@@ -1,4 +1,4 @@
-"""Contacts of a field as JSON."""
+"""JSON form of a field's contacts."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
     """Return the contacts of a field, strongest first, each value with its standard deviation.
 
     Returns:
-        Lengths in m, areas in m², forces in N; None if there is no field yet, or if the posterior did not
-        produce it.
+        Lengths in m, areas in m², forces in N. None if there is no field yet, or if the field does not come
+        from the posterior.
     """
     if field is None or field.method != "posterior":
         return None

@@ -1,4 +1,4 @@
-"""Runs a typer application and reports each error as one line on stderr, with exit status 2."""
+"""Runner for typer applications that reports each error as one line on stderr, with exit status 2."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skinnode.cli._exit_status import COULD_NOT_RUN, FINE, closed_pipe
 from skinnode.errors import ConfigError, SkinError
 from skinnode.text.printable import PrintableStream
 
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # of click, or of typer's own copy of it
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click or typer's copy of it
 
 
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
@@ -22,7 +22,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
     Args:
         app: The application.
-        argv: Its arguments; default: those of the process.
+        argv: Command-line arguments; default: the arguments of the process.
     """
     sys.stdout, sys.stderr = _printable(sys.stdout), _printable(sys.stderr)
     try:
@@ -34,7 +34,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return closed_pipe()
     except SystemExit as ended:
-        if isinstance(ended.__context__, BrokenPipeError):  # typer has turned it into status 1
+        if isinstance(ended.__context__, BrokenPipeError):  # typer has turned this into status 1
             return closed_pipe()
         raise
     except (SkinError, ValueError, OSError) as error:
@@ -43,7 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Return ``stream`` limited to printable text, with escapes for characters that its encoding lacks."""
+    """Return ``stream`` limited to printable text, with characters that its encoding lacks escaped."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
@@ -51,7 +51,7 @@ def _printable(stream: Any) -> Any:
 
 def _line_of(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return str(ConfigError(error.strerror, str(error.filename), "a file or folder that can be used"))
+        return str(ConfigError(error.strerror, str(error.filename), "an accessible file or folder"))
     return " ".join(str(error).split())
 
 
@@ -61,10 +61,10 @@ def _refused(line: str) -> int:
 
 
 def _wants_help(error: Any) -> bool:
-    """Return whether a group was called without a command; its help is then printed."""
+    """Return whether a command group was called without a command, in which case its help is printed."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
-    text = error.ctx.get_help()  # rich prints it by itself and returns nothing
+    text = error.ctx.get_help()  # rich prints the help itself and returns nothing
     if text:
         typer.echo(text, err=True)
     return True
@@ -73,8 +73,8 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    Typer's own text is kept, except about missing and bad values: it names neither what the argument means,
-    nor the value, nor the whole range.
+    Typer's own text is kept except for missing and invalid values, where it does not state the meaning of the
+    argument, the value given or the whole range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")
     param, kind = getattr(error, "param", None), type(error).__name__
@@ -91,20 +91,20 @@ def usage_line(error: Any) -> str:
 
 
 def _name(param: Any) -> str:
-    """Return the name as the user writes it: the option, or the argument's name in the help."""
+    """Return the name as the user types it: the option, or the argument's name in the help."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper())
 
 
 def _meaning(param: Any) -> str:
-    """Return the first sentence of the help."""
+    """Return the first sentence of the parameter's help."""
     help_text = str(getattr(param, "help", None) or "a value").split(". ")[0].rstrip(".")
     return help_text[:1].lower() + help_text[1:]
 
 
 def _values(param: Any) -> str:
-    """Return the allowed numbers or words; empty for other types. Typer keeps them in two places."""
+    """Return the allowed numbers or words; empty for other types. Typer stores them in two places."""
     converter = getattr(param, "type", param)
     described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
     if get_origin(described) is Literal:

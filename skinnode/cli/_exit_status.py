@@ -1,19 +1,19 @@
-"""Exit statuses, signals and closed pipes of every command.
+"""Exit statuses and the handling of signals and closed pipes, for every command.
 
 ======  ==============================================================================================
 status  meaning
 ======  ==============================================================================================
-0       success; also a command that runs until stopped (host, node, record, replay, monitor, vcan-sim), when
-        SIGINT (Ctrl-C), SIGTERM or SIGHUP stops it
+0       success; also when SIGINT (Ctrl-C), SIGTERM or SIGHUP ends a command that runs until it is stopped
+        (host, node, record, replay, monitor, vcan-sim)
 1       a fault was found
-2       could not run; one line on stderr says why
+2       could not run; one line on stderr states the reason
 128+n   ended by signal n before its work was done: 129 SIGHUP, 130 SIGINT, 143 SIGTERM; 141 if the
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-Nothing is printed about a signal, because its sender knows of it. Open resources are closed first. SIGHUP
-stays ignored if it was ignored at the start, as under nohup. The module imports nothing slow, so that its
-handlers are installed before anything else is loaded.
+Nothing is printed about a signal, because its sender knows about it. Open resources are closed first. SIGHUP
+stays ignored if it was ignored at the start, as it is under nohup. This module imports nothing slow, so that
+its handlers are installed before anything else is loaded.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def status_of(number: int) -> int:
-    """Return the exit status after signal ``number``, by the convention of shells."""
+    """Return the exit status after signal ``number``, following the shell convention."""
     return 128 + number
 
 
@@ -41,11 +41,11 @@ class Stopped(SystemExit):
 
 
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
-    """Run a typer application and exit with its status. From here on, signals end the process.
+    """Run a typer application and exit with its status. From then on, signals end the process.
 
     Args:
-        module: Module that holds the application as ``app``.
-        argv: Its arguments; default: those of the process.
+        module: Name of the module that defines the application as ``app``.
+        argv: Command-line arguments; default: the arguments of the process.
     """
     _handle(_exit_at_once)
     run: Callable[..., int] = import_module("skinnode.cli._errors").run
@@ -57,12 +57,12 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     except Stopped as stopped:
         status = int(stopped.code or 0)
         _flush(status)
-    _handle(_exit_at_once)  # Python now waits for threads; a signal would print a traceback
+    _handle(_exit_at_once)  # while Python waits for threads, a signal would print a traceback
     sys.exit(status)
 
 
 def _handle(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Install ``handler`` for the signals, if this is the main thread; Python allows no other."""
+    """Install ``handler`` for the signals in the main thread, the only thread in which Python allows it."""
     import threading
 
     if threading.current_thread() is threading.main_thread():
@@ -76,10 +76,10 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Unwind the stack, or exit at once during an import while there is no other thread.
+    """Unwind the stack, or exit immediately if an import is running and there is no other thread.
 
-    During an import, some of Python's callbacks would lose the exception or print it. While there is no other
-    thread, nothing is open.
+    During an import, some of Python's callbacks would lose the exception or print it. Without another thread,
+    nothing is open yet.
     """
     import threading
 
@@ -97,7 +97,7 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _flush(status: int) -> int:
-    """Flush the output. Return ``status``, or that of SIGPIPE if the reader has closed the pipe."""
+    """Flush the output. Returns ``status``, or the SIGPIPE status if the reader has closed the pipe."""
     try:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:
@@ -108,7 +108,7 @@ def _flush(status: int) -> int:
 
 
 def closed_pipe() -> int:
-    """Discard the buffers of stdout and stderr, and return the status for a reader that has gone."""
+    """Discard the buffers of stdout and stderr, and return the exit status for a closed pipe."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for descriptor in (1, 2):
         os.dup2(nowhere, descriptor)

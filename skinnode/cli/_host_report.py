@@ -1,4 +1,4 @@
-"""What ``skinnode host`` reports: a line or a JSON object a second, and its faults at the end."""
+"""Reports of ``skinnode host``: a line or JSON object every second, and the faults at the end."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from skinnode.model.frames import FieldFrame
 
 _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
-"""Maximum wait at the end for an overrun to clear: seconds, or SYNC periods if that is longer."""
+"""Maximum wait at the end for overruns to clear: seconds or SYNC periods, whichever is longer."""
 
 _POLL_S = 0.01
 
 _FIRST_SCANS = 3
-"""SYNCs after which a patch must have sent a scan."""
+"""Number of SYNCs after which a patch must have sent a scan."""
 
 _EXPLAINED_BY_SLOWNESS: Final = (
     "scans_torn",
@@ -32,11 +32,11 @@ _EXPLAINED_BY_SLOWNESS: Final = (
     "chunks_lost",
     "summaries_lost",
 )
-"""Counters that a node on a slow computer explains: missing and late frames. Wrong frames remain a fault."""
+"""Counters of missing and late frames, which a node on a slow computer explains. Wrong frames stay faults."""
 
 
 def operational_text(running: Host) -> str:
-    """Return how many patches are operational by their heartbeat, and the condition of each other patch."""
+    """Return how many patches are operational by their heartbeats, and the condition of each other patch."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
@@ -63,7 +63,8 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults of the run, and notes that are not faults, one line each.
 
     A node that skips scans because its own computer is too slow sends EMCY 0x8110. Its missing and late
-    frames are then a note, and so is that emergency at the end. Wrong frames remain a fault.
+    frames, and that emergency if still active at the end, are then reported as notes. Wrong frames stay
+    faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -75,7 +76,7 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
         notes += [f"{name}: {text}" for text in patch_notes]
     for name, defects in stats.defects.items():
         if defects.count:
-            faults.append(f"{name}: {counted(defects.count, 'defect')} of the host, last {defects.newest}")
+            faults.append(f"{name}: {counted(defects.count, 'defect')} of the host, newest: {defects.newest}")
     return faults, notes
 
 
@@ -122,7 +123,7 @@ def _patch_faults_and_notes(
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return why a patch is faulty or refused, prefixed with ``before``; empty for other conditions."""
+    """Return why a patch is faulty or refused, after the prefix ``before``; empty for other conditions."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -130,7 +131,7 @@ def reason(health: PatchHealth, before: str = "") -> str:
     if health.condition == "faulty":
         from skinnode.canopen.emergency import register_text
 
-        if health.last_emergency is None:  # the fault is older than the host
+        if health.last_emergency is None:  # the fault occurred before the host started
             text = register_text(health.error_register)
             return f"{before}error register 0x{health.error_register:02X} ({text})"
         return f"{before}EMCY 0x{health.last_emergency:04X} {health.emergency_text}"
@@ -138,7 +139,7 @@ def reason(health: PatchHealth, before: str = "") -> str:
 
 
 def _let_overruns_end(running: Host) -> None:
-    """Wait briefly for nodes on slow computers to clear the emergency, which lasts one scan."""
+    """Wait briefly for nodes on slow computers to clear their emergencies, which last one scan."""
     end_s = time.monotonic() + max(_OVERRUN_S, _OVERRUN_SYNCS * running.hand.sync.period_s)
     while time.monotonic() < end_s:
         healths = [running.health(patch.name) for patch in running.hand.patches]
@@ -148,7 +149,7 @@ def _let_overruns_end(running: Host) -> None:
 
 
 class Second:
-    """Figures of one second; its attributes are the keys of the JSON object."""
+    """Figures of one second; its attribute names are the keys of the JSON object."""
 
     def __init__(
         self,
@@ -202,7 +203,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the depth of the deepest electrode and its standard deviation; a press moves to −z."""
+    """Return the depth of the deepest electrode and its standard deviation; a press moves it to −z."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -211,29 +212,29 @@ def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    """Return the percentile in milliseconds, or None without values."""
+    """Return the percentile in milliseconds, or None if there are no values."""
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e3, 3) if ordered else None
 
 
 class Report(Protocol):
-    """Where the host reports to: a person or a program."""
+    """Destination of the host's reports: a person or a program."""
 
     def note(self, text: str) -> None:
         """Report an event or a fault."""
 
     def second(self, second: Second) -> None:
-        """Report the figures of a second."""
+        """Report the figures of one second."""
 
 
 class TextReport:
-    """A line for the buses and a line for each patch, every second."""
+    """Prints one line for the buses and one line per patch, every second."""
 
     def note(self, text: str) -> None:
         """Print ``text``."""
         print(text, flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the figures of a second."""
+        """Print the figures of one second."""
         buses = "  ".join(
             f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
             for name, facts in second.buses.items()
@@ -262,12 +263,12 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 class JsonReport:
-    """A JSON object a line: {"note": …} or the figures of a second."""
+    """Prints one JSON object per line: {"note": …} or the figures of one second."""
 
     def note(self, text: str) -> None:
         """Print ``text`` as a note."""
         print(json.dumps({"note": text}), flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the figures of a second."""
+        """Print the figures of one second."""
         print(json.dumps(vars(second)), flush=True)

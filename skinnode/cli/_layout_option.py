@@ -1,4 +1,4 @@
-"""``--layout``: the geometry of a patch, by preset, file or Python name."""
+"""Option ``--layout``: the geometry of a patch, given by preset, file or Python name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as layout.file of a 
 
 
 def import_from_here() -> None:
-    """Let MODULE:NAME be a file in the working directory, as ``python -m`` does."""
+    """Allow MODULE:NAME to refer to a file in the working directory, like ``python -m``."""
     sys.path.insert(0, os.getcwd())
 
 
@@ -24,7 +24,7 @@ def find_layout(text: str) -> PatchLayout:
     """Return the layout that ``text`` names.
 
     Args:
-        text: A preset, a file, or MODULE:NAME of a PatchLayout or of a function that returns one; see HELP.
+        text: A preset, a file, or the MODULE:NAME of a PatchLayout or a function that returns one; see HELP.
 
     Raises:
         ConfigError: There is no such layout.

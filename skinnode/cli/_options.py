@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and what a shell offers for them."""
+"""Options and arguments shared by several commands, with their shell completions."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """Return what a shell offers for a node-ID, each with the name of its patch.
+    """Return shell completions for a node-ID, each with the name of its patch.
 
-    It offers the node-IDs of --hand, or of hand.toml if that exists, or else all node-IDs.
+    They are the node-IDs of --hand or, without it, of hand.toml if that file exists; otherwise all node-IDs.
     """
     patches = _patches(ctx)
     offered = [(str(patch.node_id), patch.name) for patch in patches]
@@ -25,7 +25,7 @@ def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
 
 
 def nodes(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """Return what a shell offers for a node: node-IDs, and the names of patches if --hand is given."""
+    """Return shell completions for a node: node-IDs, and the names of patches if --hand is given."""
     named = _patches(ctx) if ctx.params.get("hand") is not None else []
     return node_ids(ctx, incomplete) + _beginning(incomplete, [(p.name, f"node {p.node_id}") for p in named])
 
@@ -36,7 +36,7 @@ def _patches(ctx: typer.Context) -> list[PatchConfig]:
     bus = ctx.params.get("bus")
     try:
         hand = load_hand(ctx.params.get("hand") or "hand.toml")
-    except (SkinError, OSError):  # completion has no place for a message
+    except (SkinError, OSError):  # shell completion cannot show a message
         return []
     return [patch for patch in hand.patches if bus in (None, patch.bus)]
 
@@ -51,7 +51,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value < math.inf:
-        raise typer.BadParameter(f"{text!r} is not a number of seconds from 0 on")
+        raise typer.BadParameter(f"{text!r} is not a number of seconds of at least 0")
     return value
 
 
@@ -68,7 +68,7 @@ OtherChannel = Annotated[
 Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
 Fd = Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")]
 Hand = Annotated[
-    Path | None, typer.Option(help="Take buses and names of patches from this hand.", metavar="HAND.toml")
+    Path | None, typer.Option(help="Use the buses and patch names of this hand.", metavar="HAND.toml")
 ]
 Bus = Annotated[
     str | None,
@@ -79,7 +79,7 @@ Node = Annotated[
     typer.Argument(help="Node-ID, or the name of a patch of --hand.", metavar="NODE", autocompletion=nodes),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object a line instead of text.")]
+JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object per line instead of text.")]
 Seconds = Annotated[
     float | None,
     typer.Option(parser=_seconds, help="End after this many seconds; default: at Ctrl-C.", metavar="S"),

@@ -1,6 +1,6 @@
-"""``skinnode bench``: the benchmarks.
+"""``skinnode bench``: runs the benchmarks.
 
-Ratios are formed within one run, because absolute times depend on the machine.
+Ratios are computed within one run, because absolute times depend on the machine.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from skinnode.errors import ConfigError
 app = typer.Typer(help="Measure solver, node and host on this machine.", no_args_is_help=True)
 
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to FILE as well.")
+    Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures to FILE.")
 ]
 PlotFile = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Draw the figures to FILE (needs matplotlib).")
 ]
-Rounds = Annotated[int, typer.Option(min=1, help="Number of times that each candidate is measured.")]
+Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per candidate.")]
 
 
 @app.command()
@@ -35,8 +35,8 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
     for row in figures["rows"]:
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
-        "F + J and steps: a wire. A step has its evaluations in it; the trust radius is held short, so that\n"
-        "it has to be searched. LAPACK and BLAS have one thread, as ours have."
+        "F + J and steps: per wire. A step includes its evaluations; the trust radius is so short that the\n"
+        "operator must search for a step within it. LAPACK and BLAS use one thread, as skinnode does."
     )
     _write(json, figures)
     if plot is not None:
@@ -47,19 +47,19 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 from a near start with our solvers, SciPy's and Ceres' on the same F and J."""
+    """Solve one wire to 1e-9 from a nearby start with our solvers, SciPy's and Ceres' on the same F and J."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)
     figures = bench.run(rounds)
     _print_machine(figures)
-    typer.echo(f"{'':42}{'µs a wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
+    typer.echo(f"{'':42}{'µs per wire':>10}{'ratio':>8}{'error':>10}{'tolerance':>11}")
     for row in figures["rows"]:
         spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
         typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
-    typer.echo("ratio: to skinnode dogleg; tolerance: the loosest given to the solver that reaches 1e-9.")
+    typer.echo("ratio: to skinnode dogleg; tolerance: the loosest setting of the solver that reaches 1e-9.")
     if not any("pyceres" in row["who"] for row in figures["rows"]):
-        typer.echo("Ceres is not installed: after sh install.sh bench it is measured too.")
+        typer.echo("Ceres is not installed; to measure it too, run sh install.sh bench.")
     _write(json, figures)
     if plot is not None:
         from skinnode.bench.plots.ratios import draw_solve
@@ -74,9 +74,9 @@ def stability(
     seeds: Annotated[int, typer.Option(min=1, help="Number of streams for each hard case.")] = 50,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve cases in parallel.")] = 1,
 ) -> None:
-    """Solve every hard case over many seeds: error, deviation, status, verdict.
+    """Solve every hard case with many seeds and report error, standard deviation, status and verdict.
 
-    Exit status 1 if any case ends CONVERGED and wrong.
+    Exit status 1 if any wire is CONVERGED and wrong.
     """
     from skinnode.bench import stability as bench
     from skinnode.bench.verdict import named
@@ -105,13 +105,13 @@ def accuracy(
     json: JsonFile = None,
     plot: PlotFile = None,
     scenes: Annotated[
-        int, typer.Option(min=1, help="Random scenes for each line of the coverage table.")
+        int, typer.Option(min=1, help="Number of random scenes per row of the coverage table.")
     ] = 200,
     rounds: Rounds = 31,
 ) -> None:
-    """Measure error against time, noise and code width, coverage of the intervals, and time a frame.
+    """Measure error against time, noise and code width, the coverage of intervals, and the time per frame.
 
-    Exit status 1 if a requirement is not met; times depend on the machine and do not count.
+    Exit status 1 if a requirement is not met; times depend on the machine and are not counted.
     """
     from skinnode.bench import accuracy as bench
 
@@ -132,9 +132,9 @@ def accuracy(
 def path(
     json: JsonFile = None,
     plot: PlotFile = None,
-    experiments: Annotated[int, typer.Option(min=1, help="Random presses for each setting.")] = 10,
+    experiments: Annotated[int, typer.Option(min=1, help="Number of random presses per setting.")] = 10,
 ) -> None:
-    """Repeat the tables 2, 3 and 4 and the figures 8 to 13 of the paper, beside its printed values."""
+    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper, next to its printed values."""
     from skinnode.bench import path as bench
     from skinnode.text.json_values import plain
 
@@ -153,37 +153,37 @@ def path(
 def node(
     json: JsonFile = None,
     seconds: Annotated[
-        float, typer.Option(min=0.2, max=3600.0, help="Length of each measurement on the bus.")
+        float, typer.Option(min=0.2, max=3600.0, help="Duration of each measurement on the bus, s.")
     ] = 10.0,
     rounds: Rounds = 31,
     interface: Annotated[
-        str, typer.Option(help="python-can interface; virtual stays in the process.")
+        str, typer.Option(help="python-can interface; virtual stays within the process.")
     ] = "virtual",
     channel: Annotated[
         str | None, typer.Option(help="Channel of the interface; default: an unused name.")
     ] = None,
 ) -> None:
-    """Measure punctuality and cost of a node.
+    """Measure the timing accuracy and the CPU cost of a node.
 
-    These are the pacing of chunks, the time from SYNC to the first chunk, the heartbeat on a full bus, and µs
-    a frame.
+    Covers the pacing of chunks, the time from SYNC to the first chunk, the heartbeat on a full bus, and the
+    time in µs to handle each kind of frame.
     """
     from skinnode.bench import node as bench
 
     _prepare(json)
     figures = bench.run(seconds, rounds, interface, channel)
     _print_machine(figures)
-    typer.echo(f"{'ms':30}{'p50':>8}{'p99':>8}{'max':>8}{'asked':>8}{'n':>8}{'frames/s heard':>16}")
+    typer.echo(f"{'ms':30}{'p50':>8}{'p99':>8}{'max':>8}{'limit':>8}{'n':>8}{'frames/s received':>19}")
     for row in figures["rows"]:
         late_ms = [row[key] for key in ("p50_ms", "p99_ms", "max_ms")]
         spread = "".join("       -" if value is None else f"{value:8.3f}" for value in late_ms)
-        typer.echo(f"{row['what']:30}{spread}{row['goal_ms']:8.1f}{row['n']:8}{row['load_hz']:16.0f}")
+        typer.echo(f"{row['what']:30}{spread}{row['goal_ms']:8.1f}{row['n']:8}{row['load_hz']:19.0f}")
     typer.echo(f"\n{'handled by the node':30}{'µs':>8}")
     for row in figures["handling"]:
         typer.echo(f"{row['what']:30}{row['us']:8.1f}")
     typer.echo(
         "\nexact: for a board; thrifty: for many nodes on one machine, in bursts at the same mean pace.\n"
-        "Other work of this machine is in the figures."
+        "The figures include the effect of other work on this machine."
     )
     _write(json, figures)
 
@@ -192,17 +192,17 @@ def node(
 def pipeline(
     json: JsonFile = None,
     plot: PlotFile = None,
-    seconds: Annotated[float, typer.Option(min=1, help="Length of each measurement.")] = 10.0,
-    short: Annotated[bool, typer.Option("--short", help="Only the rows that have a requirement.")] = False,
-    interface: Annotated[str, typer.Option(help="udp, or socketcan: one bus, by --channel.")] = "udp",
-    channel: Annotated[str, typer.Option(help="Channel of socketcan.")] = "vcan0",
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of each measurement, s.")] = 10.0,
+    short: Annotated[bool, typer.Option("--short", help="Run only rows that have a requirement.")] = False,
+    interface: Annotated[str, typer.Option(help="udp, or socketcan for one bus, set by --channel.")] = "udp",
+    channel: Annotated[str, typer.Option(help="Channel for socketcan.")] = "vcan0",
     all_cores: Annotated[
         bool, typer.Option("--all-cores", help="Let host and load use all cores, instead of one core each.")
     ] = False,
 ) -> None:
-    """Run four full buses with sixteen patches through a host: losses, latency, CPU.
+    """Run four full buses with sixteen patches through a host and measure losses, latency and CPU load.
 
-    Exit status 1 if a frame was lost or a sum does not agree; times are reported, but do not count.
+    Exit status 1 if a frame was lost or a sum does not agree. Times are reported but not counted.
     """
     from skinnode.bench import pipeline as bench
 
@@ -234,17 +234,17 @@ def pipeline(
 @app.command()
 def soak(
     json: JsonFile = None,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Length of the soak in minutes.")] = 10.0,
-    seed: Annotated[int, typer.Option(help="Seed of the faults: the same seed draws the same rounds.")] = 1,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak in minutes.")] = 10.0,
+    seed: Annotated[int, typer.Option(help="Seed of the faults; the same seed gives the same rounds.")] = 1,
     own_cache: Annotated[
-        bool, typer.Option(hidden=True, help="Soak in this process, with the kernel cache as it is.")
+        bool, typer.Option(hidden=True, help="Run in this process, with the existing kernel cache.")
     ] = False,
 ) -> None:
     """Run a simulated hand under random faults for minutes or hours.
 
     Frames of every kind are dropped, the processor is starved, and the kernel cache is damaged at the start.
     The host must survive, every patch must recover, every sum must be exact, and memory, threads and file
-    descriptors must not grow. Exit status 1 if not.
+    descriptors must not grow. Exit status 1 if any of this fails.
     """
     from skinnode.bench import soak as bench
 
@@ -262,7 +262,7 @@ def soak(
 
 
 def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
-    """Soak in a child process whose kernel cache is a damaged copy, and return its exit status."""
+    """Run the soak in a child process with a damaged copy of the kernel cache, and return its exit status."""
     import subprocess
     import sys
     import tempfile
@@ -285,11 +285,11 @@ def _print_must(must: list[dict[str, Any]]) -> None:
     for row in must:
         got = "-" if row["got"] is None else f"{row['got']:.2f}".removesuffix(".00")
         verdict = "reached" if row["reached"] else "NOT reached"
-        typer.echo(f"{row['what']:69}{got:>9}  asked {row['asked']:g}: {verdict}")
+        typer.echo(f"{row['what']:69}{got:>9}  limit {row['asked']:g}: {verdict}")
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
-    """Check that the files can be written; if kernels must be compiled, say that the run takes longer."""
+    """Check that the files can be written, and announce a longer run if kernels must be compiled."""
     from skinnode.compiled.jit import is_cold
     from skinnode.files.output_file import require_writable
     from skinnode.files.plot_file import require_matplotlib
@@ -301,7 +301,7 @@ def _prepare(json: Path | None, plot: Path | None = None) -> None:
         require_writable("--plot", plot)
 
     if is_cold():
-        typer.echo("Compiling the kernels; the next start finds them ready.", err=True)
+        typer.echo("Compiling the kernels; the next start will not need to.", err=True)
 
 
 def _print_machine(figures: dict[str, Any]) -> None:

@@ -29,7 +29,7 @@ def conformance(
         typer.Option(help="EDS of the node; not needed for a patch of this project.", metavar="FILE"),
     ] = None,
     only: Annotated[
-        str, typer.Option(help="Areas and cases, separated by commas: SDO,PDO-03.", metavar="NAMES")
+        str, typer.Option(help="Areas and cases, separated by commas, such as SDO,PDO-03.", metavar="NAMES")
     ] = "",
     junit: Annotated[Path | None, typer.Option(help="Write JUnit XML to this file.", metavar="FILE")] = None,
     html: Annotated[Path | None, typer.Option(help="Write an HTML report.", metavar="FILE")] = None,
@@ -37,15 +37,15 @@ def conformance(
         Path | None, typer.Option("--json", help="Write all results and frames as JSON.", metavar="FILE")
     ] = None,
     list_cases: Annotated[
-        bool, typer.Option("--list", help="Print IDs, titles and clauses of the cases, and exit.")
+        bool, typer.Option("--list", help="Print the IDs, titles and clauses of the cases, and exit.")
     ] = False,
 ) -> None:
     """Test a node against CiA 301: 127 cases in raw frames, one line each.
 
     It RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
-    parameters. It reads the configuration first, and at the end restores what it changed. It sends commands
-    to all nodes and frames in their name: use a bus without another master, best without another node, on a
-    machine that may stop.
+    parameters. It reads the configuration first and restores every change at the end. It sends commands to
+    all nodes and frames that appear to come from other nodes: use a bus without another master, preferably
+    without any other node, on a machine that may stop.
 
     Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
     """

@@ -1,4 +1,4 @@
-"""``skinnode demo``: simulated patches pressed, read over a virtual CAN bus, decoded and scored."""
+"""``skinnode demo``: presses simulated patches, reads them over a virtual CAN bus, decodes and scores."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def demo(
     """Press simulated patches and decode them from real CANopen traffic.
 
     Each patch is a CANopen node on an embedded virtual bus; a spherical indenter presses and slides, the host
-    gathers the PDOs and solves. Exit status 1 if a scan was torn, a frame was lost, or errors exceed the
-    reported uncertainty: an RMS error over the run above 1.15 times the reported one, or an error of a
-    coordinate above 6 standard deviations.
+    collects the PDOs and solves. Exit status 1 if a scan was torn, a frame was lost, or errors exceed the
+    reported uncertainty: the RMS error over the run is above 1.15 times the reported RMS, or the error of a
+    coordinate is above 6 standard deviations.
     """
     import json
 

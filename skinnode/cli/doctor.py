@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: find what is wrong, how certain that is, and what to do."""
+"""``skinnode doctor [HAND.toml]``: finds what is wrong, how certain the finding is, and what to do."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    It listens and reads, and does not disturb a running hand. It checks the skin from scans, which a hand
-    that is not running sends only with --active. Do not touch the skin meanwhile. Exit status 0 if no fault
-    was found, 1 if one was, 2 if it could not run.
+    It only listens and reads, so it does not disturb a running hand. It checks the skin from scans; a hand
+    that is not running sends scans only with --active. Do not touch the skin meanwhile. Exit status 0 if no
+    fault was found, 1 if one was found, 2 if it could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
@@ -117,7 +117,7 @@ def _print(facts: list[BusFacts], groups: list[Group]) -> None:
         scans = sum(patch.scans.scans for patch in known.patches if patch.scans is not None)
         rest = (
             f" ({known.interface} {known.channel}): "
-            + (f"{there} of {len(known.patches)} patches there, " if known.patches else "no patches, ")
+            + (f"{there} of {len(known.patches)} patches present, " if known.patches else "no patches, ")
             + f"{counted(known.frames, 'frame')}, "
             f"{counted(scans, 'scan')} in {known.seconds:.1f} s, load {known.load:.0%}"
         )

@@ -1,4 +1,4 @@
-"""``skinnode eds``: the electronic data sheet of a patch of any size, for another CANopen master."""
+"""``skinnode eds``: prints the electronic data sheet of a patch of any size, for another CANopen master."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def eds(
         int | None, typer.Option(min=1, max=254, help="Upper wires U, the rows of a frame; default 10.")
     ] = None,
     upper_electrodes: Annotated[
-        int | None, typer.Option(min=1, max=255, help="Electrodes of an upper wire N; default 10.")
+        int | None, typer.Option(min=1, max=255, help="Electrodes N per upper wire; default 10.")
     ] = None,
     lower_wires: Annotated[
         int | None, typer.Option(min=1, max=254, help="Lower wires K, the columns; default 30.")
     ] = None,
     lower_electrodes: Annotated[
-        int | None, typer.Option(min=1, max=255, help="Electrodes of a lower wire M; default 10.")
+        int | None, typer.Option(min=1, max=255, help="Electrodes M per lower wire; default 10.")
     ] = None,
     layout: Annotated[
         str | None, typer.Option(help=f"Take the sizes from a layout: {LAYOUT_HELP}", metavar="LAYOUT")
@@ -52,8 +52,8 @@ def eds(
 ) -> None:
     """Print the EDS or the DCF of a patch (CiA 306).
 
-    An EDS depends only on the sizes, the code width and the bus. The files of the reference patches are in
-    eds/.
+    An EDS depends only on the sizes, the code width and the bus. The EDS files of the reference patches are
+    in eds/.
     """
     from skinnode.errors import ConfigError
     from skinnode.files.output_file import require_writable, write_text

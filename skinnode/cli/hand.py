@@ -1,4 +1,4 @@
-"""``skinnode hand``: check a hand file, print its JSON Schema, create a new one."""
+"""``skinnode hand``: checks a hand file, prints its JSON Schema, or creates a new one."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def check(
 ) -> None:
     """Validate a hand file and the files it names, and compute the load of its buses.
 
-    For each bus it prints the load of the plan with every frame at its longest and with random data, the
-    worst-case time from SYNC to the end of each patch's summary, as time and as share of the SYNC period, and
-    how long each frame of `others` waits at worst. No bus is opened. Exit status 1 if a bus needs more than
-    its max_load, 2 if the file cannot be used.
+    For each bus it prints the planned load with every frame at its longest and with random data; the
+    worst-case time from SYNC to the end of each patch's summary, also as a fraction of the SYNC period; and
+    the longest wait of each frame in `others`. No bus is opened. Exit status 1 if a bus needs more than its
+    max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
@@ -147,21 +147,21 @@ def _scan_table(plan: BusPlan) -> Table:
 
 
 def _frame_table(plan: BusPlan) -> Table:
-    """Return one line for each kind of frame, summed over all patches."""
+    """Return a table with one row per kind of frame, summed over all patches."""
     kinds: dict[str, list[float]] = {}
     for frame in plan.frames:
         sums = kinds.setdefault(frame.name.partition(" of ")[0], [0.0, 0.0, 0.0])
         for i, value in enumerate((frame.frames_per_s, frame.load, frame.typical_load)):
             sums[i] += value
-    table = _table("frames", "a second", "load at worst", "typical")
+    table = _table("frames", "per second", "load at worst", "typical")
     for kind, (rate, load, typical) in kinds.items():
         table.add_row(kind, f"{rate:.1f}", f"{load:.2%}", f"{typical:.2%}")
     return table
 
 
 def _other_table(plan: BusPlan) -> Table:
-    """Return how long each frame of other devices may wait for frames of lower identifiers."""
-    table = _table("others", "bytes", "every ms", "queued to passed ms")
+    """Return a table of the longest wait of each other device's frame for frames with lower identifiers."""
+    table = _table("others", "bytes", "every ms", "queued to sent ms")
     for frame in plan.others:
         worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"
         table.add_row(f"0x{frame.can_id:03X}", str(frame.length), f"{frame.period_s * 1e3:g}", worst)
@@ -179,7 +179,7 @@ def _remarks(plan: BusPlan) -> list[str]:
 def schema() -> None:
     """Print the JSON Schema of a hand file, for editors that complete and check TOML.
 
-    A hand file refers to it in its first line, `#:schema PATH`; the schema of this version is
+    A hand file refers to it in its first line, `#:schema PATH`; this version's schema is
     skinnode/config/hand.schema.json.
     """
     from skinnode.config.schema import schema_text
@@ -194,7 +194,7 @@ def new(
         int, typer.Option(min=1, max=16, help="Number of buses that share the patches.", metavar="N")
     ] = 1,
 ) -> None:
-    """Print a commented hand file to start from, with a SYNC period that fits the bus load.
+    """Print a commented hand file as a starting point, with a SYNC period that fits the bus load.
 
     The patches are divided evenly among the buses, in order.
     """

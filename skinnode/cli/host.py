@@ -1,4 +1,4 @@
-"""``skinnode host hand.toml``: bring a hand up, solve its scans, report every second."""
+"""``skinnode host hand.toml``: brings a hand up, solves its scans and reports every second."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skinnode.host import Host
 
 _LONGEST_WAIT_S = 0.1
-"""Maximum delay of Ctrl-C."""
+"""Maximum delay in reacting to Ctrl-C."""
 
 
 def host(
@@ -30,11 +30,11 @@ def host(
     """Bring a hand's patches up as CANopen manager, solve their scans and report every second.
 
     With --json each patch has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
-    and shear force with standard deviations, in m, m² and N. Ctrl-C ends it and leaves the nodes
+    and shear force with standard deviations, in m, m² and N. Ctrl-C ends the command and leaves the nodes
     pre-operational. Exit status 1 if a patch was not operational at the end, a scan was torn or a frame lost
     (unless its node reported that its computer was too slow), an interface failed or reported errors, or a
-    guest heard no SYNC; 2 if the hand could not be run, or if a node sent frames whose content does not match
-    their identifier.
+    guest received no SYNC; 2 if the hand could not be run, or if a node sent frames whose content does not
+    match their identifier.
     """
     from skinnode.cli._host_report import JsonReport, TextReport
     from skinnode.compiled.jit import is_cold
@@ -45,8 +45,8 @@ def host(
     plan = load_hand(hand).on(interface, channel)
     report = JsonReport() if as_json else TextReport()
     if is_cold():
-        report.note("compiling the kernels, once: takes some seconds")
-    for patch in plan.patches:  # compiles; nothing is open yet, so Ctrl-C still ends the program by itself
+        report.note("compiling the kernels once; this takes a few seconds")
+    for patch in plan.patches:  # compiles; nothing is open yet, so Ctrl-C ends the program
         check_solvable(patch, plan.solver)
     with stop_on_signal() as stop:
         status = _run(plan, seconds, report, stop)
@@ -57,8 +57,7 @@ def host(
 def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threading.Event) -> int:
     """Run the hand until it is stopped or time is up, and return the exit status.
 
-    The host has logged each frame whose content does not match its identifier; Python writes the log to
-    stderr.
+    The host logs each frame whose content does not match its identifier; Python writes the log to stderr.
     """
     from skinnode.cli._host_report import faults_and_notes, final_state_text, operational_text
     from skinnode.host import BringUpCancelled, Host
@@ -83,7 +82,7 @@ def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threadin
 
 
 def _watch(running: Host, stop: threading.Event, seconds: float | None, report: Report) -> None:
-    """Follow the fields and report every second until the host is stopped or time is up."""
+    """Collect the fields and report every second until the host is stopped or time is up."""
     from skinnode.cli._host_report import Second
 
     start_s = time.monotonic()

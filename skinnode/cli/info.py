@@ -1,4 +1,4 @@
-"""``skinnode info NODE``: all about one node on one screen."""
+"""``skinnode info NODE``: shows everything about one node on one screen."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def info(
 ) -> None:
     """Print identity, layout, baseline, errors, PDOs, wires and configuration of one node.
 
-    It only reads. Exit status 0 if the node reports no fault, 1 if it has an error, faulty wires or no
-    baseline; 2 if it does not answer.
+    The command only reads. Exit status 0 if the node reports no fault, 1 if it has an error, faulty wires or
+    no baseline; 2 if it does not answer.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
@@ -75,7 +75,7 @@ def _print(found: NodeInfo, patch_name: str) -> None:
         ("error register", f"0x{register:02X} {register_text(register)}"),
         ("error history", "\n".join(found.errors) or "empty"),
         ("heartbeat", f"every {found.heartbeat_ms} ms" if found.heartbeat_ms else "none"),
-        ("watches", ", ".join(found.heartbeats_watched) or "nobody's heartbeat"),
+        ("watches", ", ".join(found.heartbeats_watched) or "no heartbeats"),
         ("guarded", found.guarding),
         ("if alone", f"goes {found.on_communication_error} (0x1029)"),
         ("SYNC", found.sync),
@@ -111,11 +111,11 @@ def _patch_rows(patch: PatchInfo) -> list[tuple[str, str]]:
     mode = "all chunks"
     if patch.send_changed_only:
         refresh = (
-            f"all of them every {patch.send_refresh_scans} scans"
+            f"all chunks every {patch.send_refresh_scans} scans"
             if patch.send_refresh_scans
-            else "never all of them"
+            else "never all chunks"
         )
-        mode = f"chunks that moved by more than {patch.send_threshold_codes} codes, {refresh}"
+        mode = f"chunks that changed by more than {patch.send_threshold_codes} codes, {refresh}"
     when = f"every {patch.period_ms} ms by its own timer" if patch.period_ms else "at SYNC"
     averaged = f", mean of {patch.averaging}" if patch.averaging > 1 else ""
     wires = [
@@ -155,5 +155,5 @@ def _baseline(patch: PatchInfo) -> str:
     if patch.baseline_ohm is None:
         return "none: skinnode tare"
     least, median, greatest = patch.baseline_ohm
-    missing = f"; {patch.baseline_missing} crossings without" if patch.baseline_missing else ""
+    missing = f"; {patch.baseline_missing} crossings without one" if patch.baseline_missing else ""
     return f"{least:.4g} to {greatest:.4g} ohm, median {median:.4g}{missing}"

@@ -1,4 +1,4 @@
-"""``skinnode lss``: give node-ID and bit rate to nodes that have no switches."""
+"""``skinnode lss``: sets the node-ID and bit rate of nodes that have no switches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from skinnode.cli._bus import Place
     from skinnode.diagnose.lss_commissioning import Commissioned
 
-app = typer.Typer(help="Layer setting services: give nodes their node-ID and bit rate.", no_args_is_help=True)
+app = typer.Typer(help="Layer setting services: set the node-ID and bit rate of nodes.", no_args_is_help=True)
 
 
 @app.command(name="list")
@@ -74,7 +74,7 @@ def set_node(
         int | None, typer.Option(help="New bit rate, used from the next power-on.", metavar="BPS")
     ] = None,
     store: Annotated[
-        bool, typer.Option(help="Store both, so that the node keeps them without power.")
+        bool, typer.Option(help="Store both, so that the node keeps them when powered off.")
     ] = True,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
     vendor: Annotated[
@@ -94,10 +94,10 @@ def set_node(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Set node-ID or bit rate of one node, and store them.
+    """Set the node-ID or bit rate of one node, and store them.
 
-    A node that has a node-ID is reset so that it takes the new one. Exit status 0 if all was done, 1 if the
-    node did not store or did not boot, 2 if nothing could be done.
+    A node that already has a node-ID is reset so that the new one takes effect. Exit status 0 if everything
+    was done, 1 if the node did not store or did not boot, 2 if nothing could be done.
     """
     from skinnode.canopen import indices as od
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress
@@ -145,7 +145,7 @@ def set_node(
 
 
 def _bus_of(places: list[Place], serial: int | None, node_id: int | None) -> Place:
-    """Return the bus of the patch with this serial number, or else with this node-ID."""
+    """Return the bus of the patch with this serial number or, failing that, with this node-ID."""
     from skinnode.errors import NOTHING, ConfigError
 
     for number, key in ((serial, "serial"), (node_id, "node_id")):

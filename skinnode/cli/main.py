@@ -1,7 +1,7 @@
 """Entry point of ``skinnode``.
 
-It imports nothing slow, so that its signal handlers are installed first. The subcommands are in
-:mod:`skinnode.cli._app`, exit statuses in :mod:`skinnode.cli._exit_status`.
+This module imports nothing slow, so that its signal handlers are installed first. The subcommands are in
+:mod:`skinnode.cli._app`, the exit statuses in :mod:`skinnode.cli._exit_status`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from skinnode.cli._exit_status import main_of
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Run ``skinnode`` with these arguments, or those of the process."""
+    """Run ``skinnode`` with ``argv``, or with the arguments of the process."""
     main_of("skinnode.cli._app", argv)
 
 

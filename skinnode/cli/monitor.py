@@ -1,4 +1,4 @@
-"""``skinnode monitor``: a hand on a full screen, or as a line of JSON a second."""
+"""``skinnode monitor``: shows a hand on a full screen, or as one line of JSON per second."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def monitor(
     channel: OtherChannel = None,
     replay: Annotated[
         Path | None,
-        typer.Option(help="Show a recording of `skinnode record`.", metavar="RECORDING"),
+        typer.Option(help="Show a recording made by `skinnode record`.", metavar="RECORDING"),
     ] = None,
     speed: Annotated[
         float | None, typer.Option(help="Speed of --replay: 2 is twice as fast; default 1.", metavar="X")
@@ -44,21 +44,22 @@ def monitor(
         ),
     ] = False,
     output: Annotated[
-        str,  # an empty one is no folder
+        str,  # an empty string is not a folder
         typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
     ] = ".",
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="End after this many seconds; default: at q.", metavar="S")
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object a second instead of a screen.")
+        bool, typer.Option("--json", help="Print one JSON object per second instead of showing a screen.")
     ] = False,
 ) -> None:
     """Show a hand on the terminal: height and shear, touches, health, rates, load, events.
 
-    It runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 choose a patch, z shows
-    it alone, t tares it, r records, space holds the picture, ? helps, q quits. It needs the extra `tui`. Exit
-    status 0 if there was no fault, 1 if there was one (printed at the end), 2 if it could not run.
+    The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
+    patch, z shows it alone, t tares it, r records, space freezes the picture, ? shows help, q quits. It needs
+    the extra `tui`. Exit status 0 if there was no fault, 1 if there was one (printed at the end), 2 if it
+    could not run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 
@@ -69,7 +70,7 @@ def monitor(
         raise ConfigError("HAND.toml", got, "one of HAND.toml, --simulate and --replay RECORDING")
     _require_used(interface, channel, speed, played=replay is not None, simulated=simulate)
     if not output or (Path(output).exists() and not Path(output).is_dir()):
-        raise ConfigError("--output", output, "a folder; the first recording creates it")
+        raise ConfigError("--output", output, "a folder name; the first recording creates the folder")
     from skinnode.host import BringUpCancelled
     from skinnode.process.signals import stop_on_signal
 
@@ -104,7 +105,7 @@ def _require_used(
 
 
 def _require_screen() -> None:
-    """Raise ConfigError if there is no terminal, or textual is not installed."""
+    """Raise ConfigError if there is no terminal or textual is not installed."""
     from importlib.util import find_spec
 
     from skinnode.errors import ConfigError, Shown
@@ -125,7 +126,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
         plan = load_hand(hand).on(interface, channel)
     else:
         plan = demo_hand(_SIMULATED, seed=1)
-        # only the posterior has forces
+        # only the posterior provides forces
         solver = plan.solver.model_copy(update={"method": "posterior"})
         plan = plan.model_copy(update={"name": "simulated hand", "solver": solver})
     if simulate:
@@ -139,7 +140,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a source that runs a host; ``stack`` closes it. Raises as :meth:`Host.from_config`."""
+    """Return a source that runs a host, closed by ``stack``. Raises as :meth:`Host.from_config`."""
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
@@ -149,10 +150,10 @@ def _running(
     from skinnode.text.words import counted
 
     if not quiet:
-        import skinnode.monitor.app  # noqa: F401  # while nothing has a deadline yet
+        import skinnode.monitor.app  # noqa: F401  # slow, so import it before deadlines apply
 
     with progress(quiet) as tell:
-        tell("compiling the kernels, once" if is_cold() else "preparing the solvers")
+        tell("compiling the kernels once" if is_cold() else "preparing the solvers")
         for patch in plan.patches:
             check_solvable(patch, plan.solver)
         if simulate:
@@ -161,13 +162,13 @@ def _running(
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
-        stack.enter_context(without_long_collections())  # it collects before the first SYNC
+        stack.enter_context(without_long_collections())  # the garbage is collected before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
 
 
 def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """Return a source that plays a recording; ``stack`` closes it."""
+    """Return a source that plays a recording, closed by ``stack``."""
     from skinnode.monitor.source import ReplaySource
     from skinnode.record import replay
 
@@ -175,24 +176,24 @@ def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:
-    """Run the screen, and return the faults. Raises the SkinError that ended the source."""
+    """Run the screen and return the faults. Raises the SkinError that ended the source."""
     from skinnode.monitor.app import MonitorApp, terminal_colours
 
     app = MonitorApp(
         source, folder=output, colours=terminal_colours(os.environ), over=stop.is_set, seconds=seconds
     )
-    app.run(mouse=False)  # the terminal's own: text can be selected and copied
+    app.run(mouse=False)  # leaves the mouse to the terminal, for selecting and copying text
     if app.failure is not None:
         raise app.failure
     if app.return_code:  # a defect of the screen, which textual has printed
         raise typer.Exit(2)
-    if app.terminal_is_deaf:  # output would not be seen
+    if app.terminal_is_deaf:  # output would not be visible
         raise typer.Exit(1 if app.faults.lines else 0)
     return app.faults.lines
 
 
 def _print(source: Source, stop: threading.Event, seconds: float | None) -> list[str]:
-    """Print a line of JSON a second, and return the faults. Raises the SkinError that ended the source."""
+    """Print one line of JSON per second and return the faults. Raises the SkinError that ended the source."""
     from skinnode.monitor.report import FaultBook, watch
     from skinnode.text.json_values import plain
 

@@ -1,4 +1,4 @@
-"""``skinnode nmt NODE|all COMMAND``: change the NMT state of nodes, and check that they follow."""
+"""``skinnode nmt NODE|all COMMAND``: changes the NMT state of nodes and checks that they follow."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def nmt(
 ) -> None:
     """Start, stop or reset nodes, and print their state before and after, from heartbeat or guarding.
 
-    `all` means every node of the bus, or of every bus of --hand.
+    `all` means every node on the bus, or on every bus of --hand.
 
     Exit status 0 if every node followed, 1 if one did not, 2 if it could not run.
     """

@@ -1,4 +1,4 @@
-"""``skinnode node``: run a Linux board with a converter as a patch of skin on a CAN bus."""
+"""``skinnode node``: runs a Linux board with a converter as a patch of skin on a CAN bus."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def node(
     source: Annotated[
         str,
         typer.Option(
-            help="Source of resistances: MODULE:NAME, or a name that a package registered.", metavar="NAME"
+            help="Source of the resistances: MODULE:NAME, or a name registered by a package.", metavar="NAME"
         ),
     ],
     node_id: Annotated[
@@ -53,11 +53,11 @@ def node(
     store: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps configuration, baseline and node-ID without power.", metavar="FILE"
+            help="File that keeps configuration, baseline and node-ID across restarts.", metavar="FILE"
         ),
     ] = None,
     strict_timing: Annotated[
-        bool, typer.Option("--strict-timing", help="Time to 0.2 ms instead of 2 ms; needs more CPU.")
+        bool, typer.Option("--strict-timing", help="Keep time to 0.2 ms instead of 2 ms; needs more CPU.")
     ] = False,
     seconds: Seconds = None,
     as_json: JsonLines = False,
@@ -65,9 +65,9 @@ def node(
     """Run one patch as a CANopen node; its resistances come from your source.
 
     A source is a class or function that takes the layout and returns an object whose read(t_ns) returns (U,
-    K) ohms. `--source simulated` needs no hardware. It reports every second until Ctrl-C. Exit status 1 if
-    the source failed, scans were skipped, frames were not sent, another node had its node-ID or the file of
-    --store could not be used; 2 if it could not run.
+    K) ohms. `--source simulated` needs no hardware. The command reports every second until Ctrl-C. Exit
+    status 1 if the source failed, scans were skipped, frames were not sent, another node used its node-ID or
+    the --store file could not be used; 2 if it could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here
@@ -125,7 +125,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Yield the memory in ``store``, claimed for this process."""
+    """Yield the memory in ``store``, locked for this process."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory_file import FileMemory
@@ -152,7 +152,7 @@ def _memory(store: Path | None) -> Iterator[FileMemory | None]:
 
 
 def _node_text(node_id: int, given: int | None) -> str:
-    """Return the node-ID in use: a node-ID stored by LSS has priority over --node-id."""
+    """Return the node-ID in use as text; a node-ID stored by LSS has priority over --node-id."""
     from skinnode.canopen.lss import NOT_CONFIGURED
 
     who = "node without a node-ID" if node_id == NOT_CONFIGURED else f"node {node_id}"
@@ -161,7 +161,7 @@ def _node_text(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Progress of the node; all counts are from its start."""
+    """Progress of the node; all counts are since its start."""
 
     elapsed_s: float
     node_id: int | None
@@ -201,15 +201,15 @@ def _progress(runner: NodeRunner, port: CanPort, elapsed_s: float) -> _Progress:
 def _faults(end: _Progress) -> list[str]:
     """Return the faults so far, one line each."""
     counts = (
-        (end.source_failures, "failure", "failures", f" of the source, the last: {end.source_error}"),
-        (end.overruns, "scan", "scans", " skipped because earlier ones were still being sent"),
+        (end.source_failures, "failure", "failures", f" of the source, most recently: {end.source_error}"),
+        (end.overruns, "scan", "scans", " skipped because earlier scans were still being sent"),
         (
             end.rival_frames,
             "boot-up or heartbeat",
             "boot-ups or heartbeats",
-            " of another node with this node-ID",
+            " from another node with this node-ID",
         ),
-        (end.bus_errors, "bus error", "bus errors", f", the last began with: {end.bus_error}"),
+        (end.bus_errors, "bus error", "bus errors", f", the last starting with: {end.bus_error}"),
     )
     faults = [f"{counted(count, one, several)}{what}" for count, one, several, what in counts if count]
     return [*faults, f"memory: {end.memory_problem}"] if end.memory_problem else faults
@@ -218,7 +218,7 @@ def _faults(end: _Progress) -> list[str]:
 def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """Print a line a second until stopped, time is up, or the thread of the node has ended."""
+    """Print a line every second until stopped, time is up, or the node's thread has ended."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0

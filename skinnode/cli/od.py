@@ -1,4 +1,4 @@
-"""``skinnode od NODE [INDEX[:SUB]]``: read, write, dump and compare the object dictionary of a node."""
+"""``skinnode od NODE [INDEX[:SUB]]``: reads, writes, dumps and compares a node's object dictionary."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def od(
     bus: Bus = None,
     write: Annotated[
         str | None,
-        typer.Option(help="Write this value, with the type of the EDS, and read it back.", metavar="VALUE"),
+        typer.Option(help="Write this value, with the type in the EDS, and read it back.", metavar="VALUE"),
     ] = None,
     as_hex: Annotated[
         bool, typer.Option("--hex", help="Print and accept values as raw bytes in hexadecimal.")
@@ -55,8 +55,8 @@ def od(
 ) -> None:
     """Read or write objects of a node. Indices are hexadecimal, with or without 0x.
 
-    Without INDEX it dumps the whole dictionary. Exit status 0 if done, 1 if
-    --diff found differences, 2 if the node did not answer or refused.
+    Without INDEX it dumps the whole dictionary. Exit status 0 if done, 1 if --diff found differences, 2 if
+    the node did not answer or refused.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
@@ -126,7 +126,7 @@ def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
 
 
 def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
-    """Read the whole dictionary: the objects of the sheet, or of CiA 301 if the sheet has none."""
+    """Read the whole dictionary: the objects of the data sheet, or of CiA 301 if the sheet has none."""
     from skinnode.diagnose.object_dictionary import dump, dump_standard
 
     return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
@@ -140,7 +140,7 @@ def _access(
     as_hex: bool,
     node_id: int,
 ) -> list[Reading]:
-    """Write an object if ``write`` is given, and read it."""
+    """Write an object if ``write`` is given, then read it."""
     from skinnode.diagnose.object_dictionary import entries_at
 
     entries = entries_at(sheet.eds, *where, lambda: int(remote.read(where[0], 0, "u8")))
@@ -158,7 +158,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the data sheet of the node.
 
     It has no entries for a third-party device without an EDS, or for a node that refuses to identify itself;
-    CiA 301 then names the objects.
+    the objects are then named by CiA 301.
     """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of
@@ -171,12 +171,12 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
             raise
         why = ""
     except NodeError as error:
-        why = f"{error}: objects are named by CiA 301 alone"
+        why = f"{error}: objects are named only by CiA 301"
     return DataSheet(Eds("", {}, frozenset(), {}, ()), "", note=why)
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. A single object must be readable; of several, a refused one is listed as refused."""
+    """Read the objects. A single object must be readable; among several, refused objects are listed."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

@@ -1,4 +1,4 @@
-"""``skinnode record hand.toml -o FOLDER``: run a hand and record every frame."""
+"""``skinnode record hand.toml -o FOLDER``: runs a hand and records every frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def record(
     hand: Annotated[Path, typer.Argument(help="The hand to record.", metavar="HAND.toml")],
     output: Annotated[
-        str,  # an empty one is no folder
+        str,  # an empty string is not a folder
         typer.Option(
             "--output",
             "-o",
@@ -35,12 +35,12 @@ def record(
     kind: Annotated[
         Literal["log", "blf"],
         typer.Option(
-            "--format", help="Format in a folder: candump's text, or Vector's BLF.", metavar="log|blf"
+            "--format", help="File format in a folder: candump's text or Vector's BLF.", metavar="log|blf"
         ),
     ] = "log",
     listen: Annotated[
         bool,
-        typer.Option("--listen", help="Send nothing and solve nothing; only record the frames received."),
+        typer.Option("--listen", help="Do not send or solve anything; only record the frames received."),
     ] = False,
     interface: OtherInterface = None,
     channel: OtherChannel = None,
@@ -49,10 +49,10 @@ def record(
 ) -> None:
     """Run a hand's patches as `skinnode host` does and record every frame, received and sent.
 
-    Play it with `skinnode replay`; candump's tools and python-can read it too. If it is killed at any moment,
-    the recording can be read up to the last second. A recording with --listen has no baselines and thus no
-    fields; it is for candump's tools. Exit status 1 if frames could not be written, or for a fault of
-    `skinnode host`; 2 if it could not run.
+    Play the recording with `skinnode replay`; candump's tools and python-can can read it too. If the command
+    is killed, the recording can be read up to the last second. A recording made with --listen has no
+    baselines and thus no fields; it is for candump's tools. Exit status 1 if frames could not be written, or
+    for a fault of `skinnode host`; 2 if it could not run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
@@ -73,7 +73,7 @@ def record(
 def _run(
     plan: HandConfig, recorder: Recorder, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> list[str]:
-    """Run the hand, and return its faults, one line each."""
+    """Run the hand and return its faults, one line each."""
     from skinnode.cli._host_report import faults_and_notes
     from skinnode.host import BringUpCancelled, Host
     from skinnode.host.scan_solver import check_solvable
@@ -121,7 +121,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line a second until stopped or time is up; ``check`` raises to end it early."""
+    """Print a line every second until stopped or time is up; ``check`` raises to end it early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

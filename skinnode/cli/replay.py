@@ -1,4 +1,4 @@
-"""``skinnode replay RECORDING``: decode and solve a recording with the code of a live host."""
+"""``skinnode replay RECORDING``: decodes and solves a recording with the code of a live host."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def replay(
         ),
     ] = False,
 ) -> None:
-    """Decode and solve a recording of `skinnode record`, with the same results as live, bit by bit.
+    """Decode and solve a recording made by `skinnode record`, with bit-identical results to the live run.
 
     With --json each field has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
     and shear force with standard deviations, in m, m² and N.
 
-    Exit status 1 if the recording is damaged, was not ended or lacks frames, if it contains error frames, or
-    if a scan was torn or missed, or a chunk or summary lost. 2 if it cannot be read at all.
+    Exit status 1 if the recording is damaged, was not ended properly, lacks frames or contains error frames,
+    or if a scan was torn or missed, or a chunk or summary lost; 2 if it cannot be read at all.
     """
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
@@ -62,7 +62,7 @@ def replay(
 
 
 def field_table(field: FieldFrame) -> dict[str, Any]:
-    """Return a field as JSON; numbers keep every bit."""
+    """Return a field as JSON, with numbers at full precision."""
     from skinnode.cli._contacts import contact_tables
 
     stamp = field.stamp
@@ -76,7 +76,7 @@ def field_table(field: FieldFrame) -> dict[str, Any]:
         "method": field.method,
         "displacement_m": field.displacement_m.tolist(),
         "contacts": contact_tables(field),
-        # JSON has no infinity: where nothing is known there is no deviation
+        # JSON has no infinity: an unknown value has no standard deviation
         "displacement_std_m": [
             [[v if v < float("inf") else None for v in electrode] for electrode in wire]
             for wire in field.displacement_std_m.tolist()

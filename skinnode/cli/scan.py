@@ -1,4 +1,4 @@
-"""``skinnode scan``: find the nodes on a bus."""
+"""``skinnode scan``: finds the nodes on a bus."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def scan(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Find every node on a bus, by SDO, by heartbeat, and by LSS if it has no node-ID.
+    """Find every node on a bus: by SDO, by heartbeat, and by LSS if it has no node-ID.
 
-    With --hand it scans every bus of the hand. It changes nothing in any node and takes two seconds a bus.
+    With --hand it scans every bus of the hand. It changes nothing in any node and takes two seconds per bus.
     Exit status 0 if nodes were found and none has a fault; 1 if none was found, two share a node-ID, or a
-    node of --hand is missing or is another device; 2 if it could not run.
+    node of --hand is missing or is a different device; 2 if it could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress
@@ -72,7 +72,7 @@ def _faults(found: Discovery, place: Place) -> list[str]:
             faults.append(f"patch {patch.name!r}: node {patch.node_id} is {node.state} and {answer}")
         elif not node.is_patch:
             faults.append(
-                f"patch {patch.name!r}: node {patch.node_id} is another device ({node.name or 'unnamed'})"
+                f"patch {patch.name!r}: node {patch.node_id} is a different device ({node.name or 'unnamed'})"
             )
         elif patch.serial not in (None, node.serial):
             faults.append(
@@ -80,12 +80,12 @@ def _faults(found: Discovery, place: Place) -> list[str]:
                 f"not {patch.serial}"
             )
     if not found.nodes and not found.unconfigured:
-        faults.insert(0, "nobody answered: cable, termination, supply, bit rate?")
+        faults.insert(0, "no node answered; check cable, termination, supply and bit rate")
     return faults
 
 
 def _as_json(scans: list[tuple[Place, Discovery]], faults: list[str]) -> dict[str, object]:
-    """Return the scans as JSON, in the same shape for one bus and for several: each node names its bus."""
+    """Return the scans as JSON; same shape for one bus as for several: each node names its bus."""
     from dataclasses import asdict
 
     first = scans[0][0].bus

@@ -1,4 +1,4 @@
-"""``skinnode tare [PATCH…]``: make the present resistances of patches their baseline."""
+"""``skinnode tare [PATCH…]``: makes the present resistances of patches their baseline."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def tare(
     """Make the present resistances the baseline R0 of patches. Do not touch the skin meanwhile.
 
     Taring works by SDO, with or without a host on the bus: a running host reads the new baselines and
-    continues. A patch loses its baseline at power-off unless it is stored (0x1010). A patch whose baseline is
-    in a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if one was not, 2 if it
-    could not run.
+    continues. A patch loses its baseline at power-off unless it is stored (0x1010). A patch whose baseline
+    comes from a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if one was not,
+    2 if it could not run.
     """
     from skinnode.cli._bus import find_buses, node_among
     from skinnode.cli._console import print_json, progress

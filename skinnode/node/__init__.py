@@ -1,4 +1,4 @@
-"""A patch as a CANopen device (CiA 301), and the thread that drives patches on a bus."""
+"""A patch as a CANopen device (CiA 301), and the thread that runs patches on a bus."""
 
 from skinnode.canopen.lss import NOT_CONFIGURED
 from skinnode.canopen.nmt import NmtState

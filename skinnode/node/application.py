@@ -1,4 +1,4 @@
-"""The interface between a CANopen device and its application: the patch, or anything else."""
+"""Interface between a CANopen device and its application, for example a patch."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """The purpose of a device. Its objects are in the dictionary from the start."""
+    """Application of a device. Its objects are in the dictionary from the start."""
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` has something to do, ns."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         ...
 
     def power_on(self, t_ns: int) -> None:
-        """Start, before the boot-up message. A reset does not call this."""
+        """Start the application, before the boot-up message. A reset does not call this method."""
         ...
 
     def reset(self) -> None:
-        """Reset, after the objects have got their defaults."""
+        """Reset the application, after its objects have been set to their defaults."""
         ...
 
     def enter(self, *, operational: bool) -> None:
-        """Follow a change of the NMT state."""
+        """Handle a change of the NMT state."""
         ...
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Handle a SYNC in OPERATIONAL. ``turns``: numbers of the synchronous TPDOs that are due."""
+        """Handle a SYNC in OPERATIONAL. ``turns``: numbers of the synchronous TPDOs now due."""
         ...
 
     def on_timer(self, t_ns: int) -> None:
@@ -43,14 +43,14 @@ class Application(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ApplicationServices:
-    """The services of a device that its application uses."""
+    """Services that a device provides to its application."""
 
     store: ObjectStore
     """Object dictionary."""
     storage: Storage
     """Values that survive a power cycle."""
     tpdos: TpdoEngine
-    """Transmitter of PDOs."""
+    """TPDO transmitter."""
     emcy: EmcyProducer
     """Emergency producer."""
     now: Clock

@@ -1,11 +1,11 @@
-"""Time in a node: a number that the caller passes in, ns of the caller's monotonic clock."""
+"""Time in a node, which the caller passes in as nanoseconds of its own monotonic clock."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 NO_DEADLINE_NS: Final = 1 << 63
-"""Time later than any other: there is nothing to wait for."""
+"""Deadline later than any other, ns, which means that nothing is scheduled."""
 
 Clock = Callable[[], int]
 """Returns the time of the event being handled, ns."""
@@ -13,31 +13,31 @@ Clock = Callable[[], int]
 
 @dataclass(frozen=True, slots=True)
 class Pacing:
-    """How closely a node's thread keeps to its timers: precision against processor time."""
+    """Timer precision of a node's thread, traded against processor time."""
 
     slack_ns: int
-    """Maximum lateness of a timer, ns, so that one wake-up serves several. Frames are always served at once.
-    """
+    """Maximum lateness of a timer, ns, which lets one wake-up serve several timers. Frames are always served
+    immediately."""
     catch_up_ns: int
-    """Lateness for which the pace of chunks compensates, ns; 0 for a strict inhibit time. See
+    """Maximum lateness that the chunk pacing makes up for, ns; 0 for a strict inhibit time. See
     :mod:`skinnode.node.patch.scan_stream`."""
 
 
 EXACT: Final = Pacing(slack_ns=0, catch_up_ns=100_000)
-"""Pacing of a board: the thread wakes for every chunk.
+"""Pacing of a board, whose thread wakes for every chunk.
 
-The distance of two chunks is at most one unit (100 µs) shorter than the inhibit time, so that only later
-wake-ups lengthen a scan.
+The interval between two chunks is at most one unit (100 µs) shorter than the inhibit time, so only wake-ups
+later than that lengthen a scan.
 """
 
 THRIFTY: Final = Pacing(slack_ns=2_000_000, catch_up_ns=50_000_000)
 """Pacing of many nodes on one machine.
 
-Four nodes at 0.6 ms a chunk, 12.5 scans/s, take 13 % of a core of a small machine if the thread wakes for
-every chunk, and 7 % with 2 ms of slack; the bus then sees bursts of three frames a node.
+Four nodes at 0.6 ms per chunk and 12.5 scans/s use 13 % of one core of a small machine if the thread wakes
+for every chunk, and 7 % with 2 ms of slack. Each node then sends bursts of three frames.
 
-A kernel with 100 timer ticks a second wakes a thread 10 to 20 ms late, and a busy machine later still. At
-10 ms of catching up, nodes in a User Mode Linux guest skipped a third of their scans at 10 scans/s and kept
-reporting an overrun (0x8110); at 50 ms they skip none. The mean pace is unchanged; a thread that was held up
-for 50 ms sends 50 ms of chunks in one burst.
+A kernel with 100 timer ticks per second wakes a thread 10 to 20 ms late, and a busy machine wakes it later
+still. With ``catch_up_ns`` at 10 ms, nodes in a User Mode Linux guest skipped a third of their scans at
+10 scans/s and kept reporting an overrun (0x8110). At 50 ms they skip no scan. The mean pace is unchanged, but
+a thread that was delayed by 50 ms sends 50 ms of chunks in one burst.
 """

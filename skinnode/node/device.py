@@ -1,8 +1,9 @@
-"""A CANopen device: the communication of CiA 301 around an application.
+"""CANopen device: the CiA 301 communication services around an application.
 
-Synchronous and deterministic: it has no thread and reads no clock. The caller gives it frames and times, and
-asks when to call again: :class:`~skinnode.node.runner.NodeRunner` on a bus, a test with plain numbers. No
-received frame makes it raise; an error of the application or of ``send`` goes to the caller.
+The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes in frames
+and times and asks when to call again. On a bus the caller is :class:`~skinnode.node.runner.NodeRunner`; a
+test passes plain numbers. No received frame raises an exception, but an exception from the application or
+from ``send`` propagates to the caller.
 """
 
 from __future__ import annotations
@@ -35,23 +36,23 @@ from skinnode.node.time_of_day import TimeConsumer
 from skinnode.transport.bus_state import BusState
 
 HARDWARE_VERSION: Final = "none"
-"""Value of 0x1009: a node in software has no board."""
+"""Value of 0x1009 for a software node, which has no board."""
 
 Handler = Callable[[bytes, int], None]
 """Takes the payload of a frame and the time in ns at which it was received."""
 
 
 class CanopenDevice:
-    """One node. It is silent until :meth:`power_on`.
+    """A CANopen node. It sends nothing until :meth:`power_on`.
 
     Args:
         node_id: 1 to 127, or 255 to wait for a node-ID. A node-ID that LSS stored in the memory takes
             precedence.
         objects: its object dictionary.
-        application: called once, with the services of the device, to make the application.
-        send: called with COB-ID and payload of each frame that the node sends, in order.
+        application: called once, with the device's services, to create the application.
+        send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
-        memory: keeps values over a power cycle; None if nothing is kept, and 0x1010 says so.
+        memory: keeps values across a power cycle; None if nothing is kept, which 0x1010 then indicates.
         kind: sizes and layout of the patch, which the memory must match; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
@@ -108,10 +109,10 @@ class CanopenDevice:
     # --- events
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, send the boot-up message and enter PRE-OPERATIONAL; or wait for a node-ID.
+        """Start the application, then boot into PRE-OPERATIONAL or, without a node-ID, wait for one.
 
         Args:
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         self._now_ns = t_ns
         self._storage.load()
@@ -123,7 +124,7 @@ class CanopenDevice:
         self._reset(EVERYTHING, t_ns)
 
     def power_off(self) -> None:
-        """Stop sending at once."""
+        """Stop sending immediately."""
         self._enter(NmtState.INITIALISING, self._now_ns)
         self._bit_rate_change.cancel()
         self._handlers = {}
@@ -140,7 +141,7 @@ class CanopenDevice:
         if self._bit_rate_change.silent(t_ns):
             return
         self._now_ns = t_ns
-        # Before a node has booted, it has no handler, or the LSS handler alone.
+        # A node that has not booted has no handlers, or only the LSS handler.
         if not remote and (handler := self._handlers.get(can_id)) is not None:
             handler(data, t_ns)
         elif self.nmt_state is NmtState.INITIALISING:
@@ -155,11 +156,11 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change of the CAN controller's state.
 
-        Bus-off is reported once the bus is back; error behaviour (0x1029) does not wait for that.
+        EMCY reports bus-off once the bus has recovered; the error behaviour (0x1029) applies immediately.
 
         Args:
             state: state of the controller.
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         was, self._bus_state = self._bus_state, state
         if self.nmt_state is NmtState.INITIALISING or state is was:
@@ -173,7 +174,7 @@ class CanopenDevice:
         self._report_passive(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`on_timer` is to be called, ns; None while there is nothing to wait for."""
+        """Return the time at which :meth:`on_timer` must be called next, ns; None if nothing is scheduled."""
         if self._bit_rate_change.deadline_ns != NO_DEADLINE_NS:
             return self._bit_rate_change.deadline_ns
         if self.nmt_state is NmtState.INITIALISING:
@@ -193,15 +194,15 @@ class CanopenDevice:
     def silent_from_ns(self) -> int:
         """Time from which :meth:`on_timer` reports a master or a monitored node as silent, ns.
 
-        The caller delivers all frames received before that time first.
+        The caller must first deliver all frames received before that time.
         """
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Do everything that is due. Calls that are too early or too frequent do no harm.
+        """Perform all actions that are due. Calls that are too early or too frequent do no harm.
 
         Args:
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         if self._bit_rate_change.silent(t_ns) or self.nmt_state is NmtState.INITIALISING:
             return
@@ -223,7 +224,7 @@ class CanopenDevice:
 
     @property
     def nmt_state(self) -> NmtState:
-        """Present NMT state."""
+        """Current NMT state."""
         return self._nmt.state
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
@@ -239,7 +240,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Initialise and boot with the node-ID that LSS has set; without one, wait for it."""
+        """Initialise and boot with the node-ID set by LSS, or wait for one if there is none."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -267,7 +268,7 @@ class CanopenDevice:
         self._nmt.enter(state, t_ns)
 
     def _entered(self, state: NmtState, before: NmtState, t_ns: int) -> None:
-        self._emcy.allow(state.communicates, t_ns)  # first: errors that end now may have to wait
+        self._emcy.allow(state.communicates, t_ns)  # first, because errors cleared below may have to wait
         if not state.communicates:
             self._sdo.reset()
         if state is NmtState.OPERATIONAL:
@@ -303,7 +304,7 @@ class CanopenDevice:
             self._synchronise(data, t_ns)
 
     def _synchronise(self, sync: bytes, t_ns: int) -> None:
-        """Apply the RPDOs received before the SYNC, let the application sample, and send the samples."""
+        """Apply the RPDOs received before the SYNC, have the application sample, and send the samples."""
         if self.nmt_state is not NmtState.OPERATIONAL:
             return
         counter = sync[0] if sync else None
@@ -342,7 +343,7 @@ class CanopenDevice:
     # --- object dictionary
 
     def _describe(self, serial: int) -> None:
-        """Set the objects whose values belong to this device alone."""
+        """Set the objects whose values are specific to this device."""
         self._store.put(od.IDENTITY, od.IDENTITY_SERIAL, serial)
         self._store.put(od.HARDWARE_VERSION, 0, HARDWARE_VERSION)
         self._store.put(od.SOFTWARE_VERSION, 0, importlib.metadata.version("skinnode"))
@@ -358,7 +359,7 @@ class CanopenDevice:
         self._reload()
 
     def _reload(self) -> None:
-        """Listen to the COB-IDs that the object dictionary names, except those of RPDOs."""
+        """Register handlers for the COB-IDs in the object dictionary, except RPDO COB-IDs."""
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time

@@ -20,22 +20,22 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum messages kept while inhibit time, a stopped node or the bus delays them; the oldest are dropped."""
+"""Maximum messages queued while the inhibit time, a stopped node or the bus delays them; drops the oldest."""
 _RESERVED_BIT: Final = 1 << 30
 
 
 class EmcyProducer:
-    """Keeps the present errors and sends messages when they come and go.
+    """Producer that tracks active errors and sends a message when an error occurs or ends.
 
     Args:
         store: object dictionary.
-        send: called with COB-ID and payload of each message.
+        send: called with the COB-ID and payload of each message.
     """
 
     def __init__(self, store: ObjectStore, send: Callable[[int, bytes], None]) -> None:
         self._store, self._send = store, send
         self._present: dict[tuple[EmcyCode, int], bytes] = {}
-        self._history: deque[int] = deque(maxlen=od.ERROR_FIELD_LENGTH)  # the newest first
+        self._history: deque[int] = deque(maxlen=od.ERROR_FIELD_LENGTH)  # newest first
         self._waiting: deque[bytes] = deque()
         self._lost = 0  # dropped messages that have not been reported yet
         self._sent_ns = -NO_DEADLINE_NS
@@ -44,7 +44,7 @@ class EmcyProducer:
 
     @property
     def register(self) -> int:
-        """Value of the error register: bit 0 is set while any error is present."""
+        """Value of the error register; bit 0 is set while any error is active."""
         bits = 0
         for code, _ in self._present:
             bits |= code.register_bit | 1
@@ -52,54 +52,54 @@ class EmcyProducer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which a waiting message may be sent, ns."""
+        """Time at which the next queued message may be sent, ns."""
         return self._free_ns if self._waiting and self._allowed else NO_DEADLINE_NS
 
     def report_once(self, code: EmcyCode, detail: bytes, t_ns: int) -> None:
-        """Report an error that is over at once: one message for the error and one for its end.
+        """Report a momentary error with two messages, one for the error and one for its end.
 
         Args:
             code: error code.
             detail: up to five manufacturer-specific bytes.
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         self._send_error(code, self.register | code.register_bit | 1, detail, t_ns)
         self._send_end(code, t_ns)
 
     def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """Report an error that lasts until :meth:`clear`; again only if ``detail`` has changed.
+        """Report an error that lasts until :meth:`clear`; repeat calls send only if ``detail`` has changed.
 
         Args:
             code: error code.
             detail: up to five manufacturer-specific bytes.
-            t_ns: present time, ns.
-            who: distinguishes errors of one code that come and go independently.
+            t_ns: current time, ns.
+            who: distinguishes errors that share a code but occur and end independently.
         """
         if self._present.get((code, who)) != detail:
             self._present[code, who] = detail
             self._send_error(code, self.register, detail, t_ns)
 
     def clear(self, code: EmcyCode, t_ns: int, who: int = 0) -> None:
-        """Report that a lasting error is over, if it was present.
+        """Report the end of a lasting error, if it was active.
 
         Args:
             code: error code.
-            t_ns: present time, ns.
+            t_ns: current time, ns.
             who: as in :meth:`report`.
         """
         if self._present.pop((code, who), None) is not None:
             self._send_end(code, t_ns)
 
     def allow(self, allowed: bool, t_ns: int) -> None:
-        """Let messages out, or make them wait, as the state of the node demands."""
+        """Allow or hold back messages, as the node's NMT state requires."""
         self._allowed = allowed
         self._try(t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the messages that may be sent. A message that the bus refuses is sent later."""
+        """Send the messages that are allowed now. A message that the bus refuses stays queued."""
         cob_id = self._store.integer(od.COB_ID_EMCY) & COB_ID_MASK
         while self._waiting and self._allowed and t_ns >= self._free_ns:
-            if self._lost:  # older than all waiting messages
+            if self._lost:  # the dropped messages are older than all queued messages
                 self._send(cob_id, self._loss())
                 self._lost = 0
             else:
@@ -108,7 +108,7 @@ class EmcyProducer:
             self._sent_ns = t_ns
 
     def reset(self) -> None:
-        """Forget all errors and messages, as after power-on."""
+        """Discard all errors and messages, as after power-on."""
         self._present.clear()
         self._history.clear()
         self._waiting.clear()
@@ -119,11 +119,11 @@ class EmcyProducer:
         self._queue(_message(code, register, detail), t_ns)
 
     def _send_end(self, code: EmcyCode, t_ns: int) -> None:
-        """Queue the message that ends an error; the register holds the remaining errors."""
+        """Queue the message that ends an error; its register byte shows the remaining errors."""
         self._queue(_message(EmcyCode.RESET, self.register, code.to_bytes(2, "little")), t_ns)
 
     def _remember(self, code: EmcyCode, detail: bytes) -> None:
-        # The upper half of an entry is manufacturer-specific: the first two bytes of the detail.
+        # The manufacturer-specific upper half of an entry holds the first two bytes of the detail.
         self._history.appendleft(code | int.from_bytes(detail[:2], "little") << 16)
 
     def _queue(self, message: bytes, t_ns: int) -> None:
@@ -136,22 +136,22 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send at once if the bus accepts it; otherwise the next timer event does.
+        """Send immediately if the bus accepts the message; otherwise leave it to the next timer event.
 
-        The caller has more to do because of its error than to report it, so a refusal is not raised.
+        A refusal by the bus is not raised, because the caller still has to handle the error it reports.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """Return the message that reports dropped messages. Bytes 0 and 1 count lost scans, here 0."""
+        """Return the message that reports dropped messages. Detail bytes 0 and 1 count lost scans, here 0."""
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
         return _message(EmcyCode.CAN_OVERRUN, self.register | EmcyCode.CAN_OVERRUN.register_bit | 1, detail)
 
     @property
     def _free_ns(self) -> int:
-        """Time from which the inhibit time allows another message, ns."""
+        """Earliest time at which the inhibit time allows another message, ns."""
         return self._sent_ns + self._store.integer(od.EMCY_INHIBIT_TIME) * 100_000
 
     # --- object dictionary
@@ -170,7 +170,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return the count at sub-index 0, then the errors, the newest first."""
+        """Return the count for sub-index 0, otherwise an error; sub-index 1 is the newest error."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):
@@ -183,7 +183,7 @@ class EmcyProducer:
         check_cob_id(value, self._store.integer(od.COB_ID_EMCY))
 
     def _on_cob_id(self) -> None:
-        if not self._exists:  # messages that were never due are not sent later
+        if not self._exists:  # messages queued before EMCY was switched off must not be sent later
             self._waiting.clear()
             self._lost = 0
 

@@ -1,7 +1,7 @@
-"""Error control: boot-up, heartbeat, node guarding, heartbeats of other nodes (CiA 301 v4.2, 7.2.8.3).
+"""Error control: boot-up, heartbeat producer and consumer, node guarding (CiA 301 v4.2, 7.2.8.3).
 
-A node sends heartbeats or is guarded, never both: with a producer heartbeat time (0x1017) it ignores
-guarding.
+A node sends heartbeats or is guarded, never both: a node with a nonzero producer heartbeat time (0x1017)
+ignores guarding requests.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
 """Number of own heartbeat periods without a frame after which another node with this node-ID counts as gone.
-The same master usually configured it, and one of its heartbeats may be lost."""
+The same master usually configured both nodes, and one heartbeat may be lost."""
 _RIVAL_NS: Final = 750_000_000
-"""Time in ns after which the other node counts as gone if this node sends no heartbeats: three default
-periods."""
+"""Time after which the other node counts as gone if this node sends no heartbeats, ns; three default periods.
+"""
 
 
 class ErrorControl:
-    """The error control services of a node.
+    """Error control services of a node.
 
     Args:
         services: the shared parts of the node.
-        listen: called when :meth:`handlers` has changed.
+        listen: called when the result of :meth:`handlers` has changed.
         failed: called with the time in ns of a heartbeat event or life guarding event.
     """
 
@@ -46,7 +46,7 @@ class ErrorControl:
         listen: Callable[[], None],
         failed: Callable[[int], None],
     ) -> None:
-        self._cob_id = 0  # known when there is a node-ID
+        self._cob_id = 0  # set once there is a node-ID
         store, emcy, now = services.store, services.emcy, services.now
         self._store, self._emcy, self._now = store, emcy, now
         self._rejected, self._send = services.rejected, services.send
@@ -63,7 +63,7 @@ class ErrorControl:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` has something to do, ns."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         boot_up_ns = NO_DEADLINE_NS if self._booted_ns is None else self._booted_ns
         return min(boot_up_ns, self._producer.deadline_ns, self.silent_from_ns, self._rival_until_ns)
 
@@ -73,7 +73,7 @@ class ErrorControl:
         return min(self._guarding.deadline_ns, self._consumer.deadline_ns)
 
     def handlers(self) -> dict[int, Handler]:
-        """Return the handlers of data frames, by COB-ID."""
+        """Return the handlers for data frames, by COB-ID."""
         handlers: dict[int, Handler] = {
             od.heartbeat_cob_id(node_id): functools.partial(self._on_heartbeat, node_id)
             for node_id in self._consumer.node_ids
@@ -82,10 +82,10 @@ class ErrorControl:
         return handlers
 
     def reset(self, node_id: int) -> None:
-        """Reset: the node is not guarded, and no other node has been heard.
+        """Reset to the state in which the node is not guarded and no heartbeat has been received.
 
         Args:
-            node_id: the node-ID from now on.
+            node_id: the new node-ID.
         """
         self._cob_id = od.heartbeat_cob_id(node_id)
         self._rival_until_ns = NO_DEADLINE_NS
@@ -93,19 +93,19 @@ class ErrorControl:
         self._consumer.reset()
 
     def boot_up(self, t_ns: int) -> None:
-        """Send the boot-up message as soon as the bus accepts it; heartbeats follow if 0x1017 says so."""
+        """Send the boot-up message as soon as the bus accepts it; heartbeats follow if 0x1017 is nonzero."""
         self._producer.boot_up(self._store.integer(od.HEARTBEAT_PRODUCER), t_ns)
         self._booted_ns = t_ns
         with contextlib.suppress(BusError):
             self._send_boot_up()
 
     def on_request(self, state: NmtState, t_ns: int) -> None:
-        """Answer a remote frame that asks for the state."""
+        """Answer a remote frame that requests the NMT state."""
         if not self._producer.period_ns:
             self._send(self._cob_id, self._guarding.answer(state, t_ns))
 
     def on_timer(self, state: NmtState, t_ns: int) -> None:
-        """Do everything that is due at ``t_ns``."""
+        """Perform all actions due at ``t_ns``."""
         self._send_boot_up()
         if self._producer.beat(t_ns):
             self._send(self._cob_id, bytes((state,)))
@@ -121,9 +121,9 @@ class ErrorControl:
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Report another node with this node-ID once, and clear that after three silent heartbeat periods.
+        """Report another node with this node-ID once, and clear the error after three silent periods.
 
-        Every frame is counted. The node takes no other action: that is up to the operator.
+        Every such frame is counted. Further action is up to the operator.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)

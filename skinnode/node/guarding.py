@@ -13,7 +13,7 @@ from skinnode.node.object_dictionary import ObjectStore
 
 
 class Guarding:
-    """Answers a master that asks for the state, and detects when it stops asking.
+    """Guarding slave, which answers the master's state requests and detects when they stop.
 
     Args:
         store: object dictionary.
@@ -26,7 +26,7 @@ class Guarding:
         self._toggle = 0
         self._guarded = False  # from the first request on
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the life time is over, ns."""
+        """Time at which the life time expires, ns."""
 
     def reset(self) -> None:
         """Reset the toggle bit and end guarding. Only *reset communication* resets the toggle bit."""
@@ -35,7 +35,7 @@ class Guarding:
         self.deadline_ns = NO_DEADLINE_NS
 
     def answer(self, state: NmtState, t_ns: int) -> bytes:
-        """Return the answer to a remote frame with the COB-ID of error control, and restart the life time.
+        """Return the answer to a remote frame on the error control COB-ID, and restart the life time.
 
         Args:
             state: state of the node.
@@ -48,9 +48,9 @@ class Guarding:
         return answer
 
     def on_written(self, t_ns: int) -> None:
-        """Take over a new guard time or life time factor.
+        """Apply a new guard time or life time factor.
 
-        A running life time restarts. Without a life time there is no life guarding error.
+        A running life time restarts. If the new life time is 0, a life guarding error is cleared.
         """
         if self._guarded or not self._life_ns:
             self._start(t_ns)
@@ -62,7 +62,7 @@ class Guarding:
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Report a life guarding event if the life time is over: once, until the master asks again."""
+        """Report a life guarding event if the life time has expired, only once until the next request."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS

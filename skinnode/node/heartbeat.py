@@ -15,11 +15,11 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second byte of an emergency's detail if the monitored node was not silent but restarted."""
+"""Second detail byte of an emergency that reports a restart of the monitored node, not silence."""
 
 
 class HeartbeatProducer:
-    """Computes when the next heartbeat is due, without drift unless one is late by a period or more."""
+    """Schedule of the heartbeats, without drift unless a heartbeat is late by a period or more."""
 
     def __init__(self) -> None:
         self.period_ns = 0
@@ -28,7 +28,7 @@ class HeartbeatProducer:
         """Time at which the next heartbeat is due, ns."""
 
     def boot_up(self, period_ms: int, t_ns: int) -> None:
-        """Take the boot-up message as the first heartbeat.
+        """Start the schedule, with the boot-up message as the first heartbeat.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -38,17 +38,17 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Send a heartbeat at once and then every period, so that no consumer waits longer than before.
+        """Change the period and make a heartbeat due immediately, so that no consumer waits any longer.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         self.period_ns = period_ms * 1_000_000
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
 
     def beat(self, t_ns: int) -> bool:
-        """Return whether a heartbeat is due at ``t_ns``, and plan the next if so."""
+        """Return whether a heartbeat is due at ``t_ns``, and if so schedule the next one."""
         if t_ns < self.deadline_ns:
             return False
         self.deadline_ns += self.period_ns
@@ -66,7 +66,7 @@ class _Monitored:
 
 
 class HeartbeatConsumer:
-    """Monitors the nodes of object 0x1016.
+    """Consumer that monitors the nodes listed in object 0x1016.
 
     Args:
         store: object dictionary.
@@ -78,7 +78,7 @@ class HeartbeatConsumer:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._monitored: dict[int, _Monitored] = {}
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which the next heartbeat is missed, ns."""
+        """Time at which the next heartbeat counts as missed, ns."""
         store.guard(od.HEARTBEAT_CONSUMER, self._guard)
 
     @property
@@ -87,12 +87,12 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Take over 0x1016 after a reset: no node has been heard yet."""
+        """Apply 0x1016 after a reset, when no heartbeat has been received yet."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Take over a write to 0x1016: monitoring of a changed entry restarts."""
+        """Apply a write to 0x1016, which restarts the monitoring of a changed entry."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -109,12 +109,12 @@ class HeartbeatConsumer:
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
         """Handle a heartbeat or boot-up message of a monitored node.
 
-        A boot-up message does not start monitoring, because heartbeats need not follow; after a heartbeat it
-        shows that the node restarted.
+        A boot-up message does not start monitoring, because heartbeats need not follow. A boot-up message
+        after a heartbeat shows that the node has restarted.
 
         Args:
             node_id: node-ID of the monitored node.
-            state: the state it sent.
+            state: NMT state in the message.
             t_ns: when it was received, ns.
         """
         item = self._monitored[node_id]
@@ -127,7 +127,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report heartbeats that are missed at ``t_ns``: once, until the node is heard again."""
+        """Report each node whose heartbeat is missing at ``t_ns``, once until its next heartbeat."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():
@@ -143,7 +143,7 @@ class HeartbeatConsumer:
         )
 
     def _guard(self, subindex: int, value: int) -> None:
-        """Refuse an entry that monitors a node twice. An entry without time or valid node-ID is not used."""
+        """Refuse a second entry for the same node; an entry without a time or valid node-ID has no effect."""
         if value >> 24:
             raise Refused(AbortCode.INVALID_VALUE)
         node_id, time_ms = value >> 16, value & 0xFFFF

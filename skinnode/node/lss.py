@@ -1,8 +1,8 @@
-"""LSS slave (CiA 305 v3.0): sets node-ID and bit rate, and answers the search for nodes.
+"""LSS slave (CiA 305 v3.0): sets the node-ID and bit rate, and answers searches for nodes.
 
-Takes and returns bytes, without bus or clock. Callbacks store the configuration and change the bit rate;
-:attr:`LssSlave.may_boot` shows whether the node must boot. Requests are served in every NMT state, and a node
-without a node-ID serves nothing else.
+The slave takes and returns bytes, without a bus or clock. Callbacks store the configuration and change the
+bit rate; :attr:`LssSlave.may_boot` shows whether the node must boot. LSS requests are served in every NMT
+state. A node without a node-ID serves only LSS.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from skinnode.node.clock import NO_DEADLINE_NS
 _CIA_301_TABLE: Final = 0
 
 _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
-"""Error codes of the configuration services; the meaning of 1 depends on the service."""
+"""Error codes in responses of the configuration services; the meaning of 1 depends on the service."""
 
 
-# Part of the address that each frame of *switch selective* and *identify* concerns, and the comparison.
+# Address part that each frame of *switch selective* and *identify* refers to, and the comparison.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -46,16 +46,16 @@ _FIRST_QUESTIONS: Final = (LssCommand.SELECT_VENDOR, LssCommand.IDENTIFY_VENDOR)
 
 
 class LssSlave:
-    """One slave.
+    """LSS slave of one node.
 
     Args:
-        address: its identity.
+        address: LSS address (identity) of the slave.
         node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
-        bit_rates_bps: bit rates that it can be set to, bit/s; empty if it cannot change its bit rate.
-        bit_rate_bps: bit rate configured before, bit/s; None if there is none.
-        store: keeps the pending node-ID and bit rate over a power cycle, and raises OSError if that fails;
-            None if nothing can be kept.
-        activate: begins the change to the pending bit rate; takes it and the delay in ms, see
+        bit_rates_bps: supported bit rates, bit/s; empty if the slave cannot change its bit rate.
+        bit_rate_bps: previously configured bit rate, bit/s; None if there is none.
+        store: saves the pending node-ID and bit rate across a power cycle and raises OSError on failure;
+            None if nothing can be saved.
+        activate: starts the change to the pending bit rate, given that bit rate and the delay in ms; see
             :meth:`on_request`.
     """
 
@@ -73,61 +73,61 @@ class LssSlave:
         self._bit_rates_bps = frozenset(bit_rates_bps)
         self._store, self._activate = store, activate
         self.state = LssState.WAITING
-        """Present LSS state."""
+        """Current LSS state."""
         self.node_id = node_id
         """Active node-ID."""
         self.pending_node_id = node_id
-        """Node-ID from the next reset of communication on."""
+        """Node-ID that takes effect at the next *reset communication*."""
         self._persistent_node_id = node_id
         self.pending_bit_rate_bps = bit_rate_bps
-        """Bit rate from the next activation on, bit/s; None to keep the present one."""
+        """Bit rate that takes effect at the next activation, bit/s; None to keep the current bit rate."""
         self._next_question = 0
         self._scan_part = 0
 
     @property
     def configured(self) -> bool:
-        """Whether there is a node-ID; without one a node serves LSS only."""
+        """Whether the node has a node-ID; without one it serves only LSS."""
         return self.node_id != NOT_CONFIGURED
 
     @property
     def may_boot(self) -> bool:
-        """Whether a node without a node-ID has got one and left LSS configuration state: it must boot."""
+        """Whether the node must boot: it has received its first node-ID and left LSS configuration."""
         return (
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
 
     def reset_node(self) -> None:
-        """Copy the persistent node-ID to the pending node-ID, as at NMT *reset node*.
+        """Copy the persistent node-ID to the pending node-ID, as required at NMT *reset node*.
 
         A pending node-ID that was never stored is lost. Call :meth:`reset_communication` afterwards.
 
-        Two public stacks that follow CiA 305 agree: c-open copies the persistent to the pending node-ID in
-        the NMT sub-state *reset application* and the pending to the active node-ID in *reset communication*
-        (src/co_nmt.c); CANopenNode initialises the pending node-ID from non-volatile memory after reset node
-        and does not change it at reset communication (305/CO_LSSslave.h).
+        Two public CiA 305 stacks do the same. c-open copies the persistent node-ID to the pending node-ID in
+        the NMT sub-state *reset application*, and the pending node-ID to the active node-ID in *reset
+        communication* (src/co_nmt.c). CANopenNode initialises the pending node-ID from non-volatile memory
+        after *reset node* and does not change it at *reset communication* (305/CO_LSSslave.h).
         """
         self.pending_node_id = self._persistent_node_id
 
     def reset_communication(self) -> None:
-        """Copy the pending node-ID to the active node-ID, as at NMT *reset communication*."""
+        """Copy the pending node-ID to the active node-ID, as required at NMT *reset communication*."""
         self.node_id = self.pending_node_id
         self._enter(LssState.WAITING)
         self._scan_part = 0
 
     def on_request(self, data: bytes) -> bytes | None:
-        """Serve a frame of the master.
+        """Serve a frame from the LSS master.
 
-        A frame that does not have 8 bytes, belongs to another protocol or does not fit the present state is
-        ignored, as the standard demands: it may be meant for other slaves.
+        A frame that does not have 8 bytes, belongs to another protocol or does not fit the current state is
+        ignored, as the standard requires, because it may be meant for other slaves.
 
-        After *activate bit timing* the node stops sending at once, changes its bit rate after one delay, and
-        may send again after another: all other nodes have changed by then.
+        After *activate bit timing* the node stops sending immediately, changes its bit rate after one delay,
+        and may send again after a second delay, when all other nodes have changed their bit rates.
 
         Args:
             data: the payload.
 
         Returns:
-            The answer, if there is one.
+            The response; None if there is none.
         """
         if len(data) != 8:
             return None
@@ -160,7 +160,7 @@ class LssSlave:
         self._next_question = 0
 
     def _agrees(self, command: int, value: int) -> bool:
-        """Return whether the address agrees with this question and with all before it, asked in order."""
+        """Return whether the address matches this frame and all earlier frames of an ordered sequence."""
         part, holds = _QUESTIONS[command]
         in_turn = command in _FIRST_QUESTIONS or command == self._next_question
         agreed = in_turn and holds(self._address[part], value)
@@ -168,9 +168,9 @@ class LssSlave:
         return agreed
 
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
-        """Answer whether the address agrees with ``value`` from ``bit`` upwards.
+        """Return the response if the address matches ``value`` in bits ``bit`` and above.
 
-        No answer means no, so that many slaves can be asked at once.
+        A slave that does not match stays silent, so one request can address many slaves.
         """
         if bit == RESET_SCAN:
             self._scan_part = 0
@@ -180,7 +180,7 @@ class LssSlave:
             if (self._address[part] ^ value) >> bit:
                 return None
             self._scan_part = next_part
-            if bit == 0 and next_part < part:  # all four parts agree: this slave is found
+            if bit == 0 and next_part < part:  # all four parts match, so this slave is found
                 self._enter(LssState.CONFIGURATION)
         return _frame(LssCommand.IDENTIFIED)
 
@@ -222,7 +222,7 @@ class LssSlave:
 
 
 class BitRateChange:
-    """The two delays of *activate bit timing*, before and after the change of the bit rate.
+    """Bit rate change of *activate bit timing*, with a delay before it and a delay after it.
 
     Args:
         set_bit_rate: changes the bit rate (bit/s); None if the node cannot change it.
@@ -233,14 +233,14 @@ class BitRateChange:
         self._bit_rate_bps: int | None = None
         self._change_ns = self._over_ns = NO_DEADLINE_NS
         self.deadline_ns = NO_DEADLINE_NS
-        """Time of the next call of :meth:`silent`, ns."""
+        """Time at which :meth:`silent` must be called next, ns."""
 
     def begin(self, bit_rate_bps: int | None, delay_ms: int, t_ns: int) -> None:
-        """Begin the change.
+        """Start the change.
 
         Args:
-            bit_rate_bps: new bit rate, bit/s; None to keep the present one.
-            delay_ms: the delay of the request, ms.
+            bit_rate_bps: new bit rate, bit/s; None to keep the current bit rate.
+            delay_ms: delay given in the request, ms.
             t_ns: when the request was received, ns.
         """
         self._bit_rate_bps = bit_rate_bps
@@ -248,7 +248,7 @@ class BitRateChange:
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Return whether the node must neither send nor receive. Changes the bit rate when it is time."""
+        """Change the bit rate if that is due, and return whether the node must neither send nor receive."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:

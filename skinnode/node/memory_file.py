@@ -1,4 +1,4 @@
-"""The memory of a node in a file: JSON with a checksum, replaced atomically."""
+"""Memory of a node in a JSON file with a checksum, replaced atomically."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum bytes that are read of a file: 512 PDOs and the largest baseline take less than a tenth of it."""
+"""Maximum bytes read from a file; 512 PDOs and the largest baseline need less than a tenth of this."""
 
 
 class FileMemory:
-    """A human-readable file: JSON with a checksum.
+    """Memory in a human-readable JSON file with a checksum.
 
-    Saving waits for the medium for some milliseconds, in which the node, and any other node on its thread,
-    does nothing else.
+    Saving waits some milliseconds for the storage medium. In that time the node, and every other node on its
+    thread, does nothing else.
 
-    A memory owns the file exclusively, from :meth:`claim` or the first :meth:`save` to :meth:`close`, the end
-    of a ``with`` block or the end of the object. The claim is a kernel lock on a file beside it, which is
-    released when the process ends, even if it is killed.
+    A memory owns the file exclusively from :meth:`claim` or the first :meth:`save` until :meth:`close`, the
+    end of a ``with`` block or the deletion of the object. The claim is a kernel lock on a lock file beside
+    the memory file, and is released when the process ends, even if the process is killed.
 
-    The file is replaced atomically (written under a temporary name, flushed to the medium, renamed), so that
-    a killed process or a power failure at any moment leaves the old content or the new. It is readable by its
-    owner only (mode 0600), and a symbolic link in its place is refused. A file that is damaged or belongs to
-    another patch is not overwritten but renamed, to a name that ends in ``.unused-`` and a digest of its
+    The file is replaced atomically (written under a temporary name, flushed to the medium, renamed), so a
+    killed process or a power failure leaves either the old content or the new. The file is readable only by
+    its owner (mode 0600), and a symbolic link in its place is refused. A file that is damaged or belongs to
+    another patch is not overwritten; it is renamed to a name that ends in ``.unused-`` and a digest of its
     bytes.
 
     Args:
@@ -75,7 +75,7 @@ class FileMemory:
         self.close()
 
     def load(self) -> Kept | None:
-        """Return the saved content; None if there is no file.
+        """Return the saved content; None if the file does not exist.
 
         Raises:
             MemoryFault: if the file cannot be read or has no usable content.
@@ -90,14 +90,14 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content of the file; on return it is on the medium.
+        """Replace the content of the file; it is on the storage medium on return.
 
         Args:
             kept: the new content.
 
         Raises:
             FileInUse: if another memory owns the file.
-            OSError: if the file cannot be written; it then has its old content.
+            OSError: if the file cannot be written; it then still has its old content.
         """
         self.claim()
         beside = create_beside(self.path, pack(kept), durable=True)
@@ -137,7 +137,7 @@ class FileMemory:
 
 
 def pack(kept: Kept) -> bytes:
-    """Return the text of a file with the content ``kept``."""
+    """Return the bytes of a file with the content ``kept``."""
     content = {
         "patch": kept.patch,
         "node_id": kept.node_id,
@@ -157,7 +157,7 @@ def unpack(data: bytes) -> Kept:
         data: the bytes of the file.
 
     Raises:
-        MemoryFault: if :func:`pack` cannot have written the file.
+        MemoryFault: if :func:`pack` could not have written the file.
     """
     try:
         document = json.loads(data)

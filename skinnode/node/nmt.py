@@ -1,4 +1,4 @@
-"""NMT slave: the state of a node and the commands that change it (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
+"""NMT slave: a node's state and the commands that change it (CiA 301 v4.2, 7.2.8 and 7.3.2)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.node.rejected import Rejected, RejectedFrames
 
 
 class NmtSlave:
-    """The NMT state machine of a node.
+    """NMT state machine of a node.
 
     Args:
         store: object dictionary; 0x1029 holds the error behaviour.
@@ -27,10 +27,10 @@ class NmtSlave:
     ) -> None:
         self._store, self._rejected, self._entered = store, rejected, entered
         self.state = NmtState.INITIALISING
-        """Present state."""
+        """Current state."""
 
     def command(self, data: bytes, node_id: int) -> NmtCommand | None:
-        """Return the command of a frame on COB-ID 0, None if it is malformed or for another node.
+        """Return the command in a frame on COB-ID 0; None if the frame is malformed or for another node.
 
         Args:
             data: the payload.
@@ -43,7 +43,7 @@ class NmtSlave:
             return None
 
     def obey(self, command: NmtCommand, t_ns: int) -> None:
-        """Enter the state of a command other than a reset."""
+        """Enter the state that a command other than a reset requests."""
         self.enter(AFTER_COMMAND[command], t_ns)
 
     def enter(self, state: NmtState, t_ns: int) -> None:
@@ -53,9 +53,9 @@ class NmtSlave:
             self._entered(state, before, t_ns)
 
     def on_communication_error(self, t_ns: int) -> None:
-        """Act on a lost heartbeat, lost guarding or bus-off as 0x1029 says.
+        """Change the state after a heartbeat, guarding or bus-off failure as 0x1029 specifies.
 
-        0: OPERATIONAL becomes PRE-OPERATIONAL; 1: no change; 2: STOPPED.
+        0: change from OPERATIONAL to PRE-OPERATIONAL; 1: no change; 2: enter STOPPED.
         """
         behaviour = self._store.integer(od.ERROR_BEHAVIOUR, 1)
         if behaviour == 2:

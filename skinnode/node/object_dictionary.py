@@ -1,10 +1,10 @@
-"""The object dictionary of a running node: declarations and values.
+"""Object dictionary of a running node: declarations and values.
 
-Declarations come from :mod:`skinnode.protocol.objects`, from which the EDS files are generated too. Values
-are the bytes that travel (little-endian), so that an SDO answer and a PDO are slices and a joined list. An
-object can be computed when it is read (:meth:`ObjectStore.bind`), refuse a value (:meth:`ObjectStore.guard`)
-or act on an accepted value (:meth:`ObjectStore.watch`); a DOMAIN can be stored elsewhere
-(:meth:`ObjectStore.bind_domain`). A refused write changes nothing.
+Declarations come from :mod:`skinnode.protocol.objects`, which is also the source of the EDS files. Values are
+stored as the bytes sent on the bus (little-endian), so an SDO response is a slice of a value and a PDO is a
+concatenation of values. An object can be computed when it is read (:meth:`ObjectStore.bind`), refuse a value
+(:meth:`ObjectStore.guard`) or trigger an action after a write (:meth:`ObjectStore.watch`). A DOMAIN can be
+stored elsewhere (:meth:`ObjectStore.bind_domain`). A refused write changes nothing.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.canopen.dictionary import DataType, Entry, Object, Value
 
 MAX_BYTES: Final = 1 << 16
-"""Maximum length of a value without a limit of its own, bytes."""
+"""Maximum length of a value whose type has no fixed size, bytes."""
 
 Reader = Callable[[int], bytes]
-"""Takes a sub-index and returns the value; may raise Refused."""
+"""Callback that takes a sub-index and returns the value; may raise Refused."""
 Guard = Callable[[int, int], None]
-"""Takes sub-index and proposed value (the bit pattern of a REAL32); may raise Refused."""
+"""Callback that takes a sub-index and the proposed value (bit pattern for REAL32); may raise Refused."""
 Watcher = Callable[[int], None]
-"""Takes the sub-index that has just been written."""
+"""Callback that takes the sub-index that has just been written."""
 ChangeWatcher = Callable[[int, int], None]
-"""Takes index and sub-index of a parameter whose value has changed."""
+"""Callback that takes the index and sub-index of a parameter whose value has changed."""
 DomainWriter = Callable[[bytes], None]
-"""Takes a whole value; may raise Refused, and then changes nothing."""
+"""Callback that takes a complete value; may raise Refused, and then changes nothing."""
 
 
 class Lengths(NamedTuple):
-    """The lengths of a value that a client may write to an object, bytes."""
+    """Range of lengths of a value that a client may write to an object, bytes."""
 
     least: int
     """Minimum length, bytes."""
@@ -40,31 +40,31 @@ class Lengths(NamedTuple):
     """Maximum length, bytes."""
 
     def check(self, length: int) -> None:
-        """Check the length of a whole value.
+        """Check the length of a complete value.
 
         Raises:
-            Refused: if the object does not take it.
+            Refused: if the object does not accept a value of that length.
         """
         self.check_not_above(length)
         if length < self.least:
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check the length of the first part of a value.
+        """Check the length of a value's first part.
 
         Raises:
-            Refused: if it is too long already.
+            Refused: if that part alone is too long.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
 
 
 def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
-    """Return the bytes of a value as they are sent.
+    """Return the bytes of a value as sent on the bus.
 
     Args:
         entry: declaration of the object.
-        value: its value; bytes are returned unchanged.
+        value: the value; bytes are returned unchanged.
 
     Raises:
         OverflowError: if the integer type cannot hold the value.
@@ -80,21 +80,21 @@ def to_bytes(entry: Entry, value: Value | bytes) -> bytes:
 
 
 class ObjectStore:
-    """The values of all objects of one node.
+    """Values of all objects of one node.
 
-    ``read`` and ``write`` are accesses of a client and raise :class:`~skinnode.canopen.abort.Refused`;
-    ``raw``, ``integer`` and ``put`` are accesses of the node to objects that exist.
+    ``read`` and ``write`` are client accesses and may raise :class:`~skinnode.canopen.abort.Refused`.
+    ``raw``, ``integer`` and ``put`` are accesses by the node itself, to objects that must exist.
 
     Args:
         objects: the declarations.
-        node_id: added to COB-IDs by default.
+        node_id: node-ID added to the default COB-IDs.
     """
 
     def __init__(self, objects: Iterable[Object], node_id: int) -> None:
         self._entries = {(e.index, e.subindex): e for item in objects for e in item.entries}
         self._indices = {index for index, _ in self._entries}
         self.node_id = node_id
-        """Node-ID that is added to COB-IDs by default; see :meth:`renumber`."""
+        """Node-ID added to the default COB-IDs; see :meth:`renumber`."""
         self._values = {key: self._at_start(entry) for key, entry in self._entries.items()}
         self._readers: dict[tuple[int, int], Reader] = {}
         self._guards: dict[int, Guard] = {}
@@ -107,12 +107,12 @@ class ObjectStore:
         return bytes(entry.data_type.bits // 8) if value is None else to_bytes(entry, value)
 
     def bind(self, index: int, reader: Reader, *, count: bool = False) -> None:
-        """Compute the sub-objects of an object when they are read.
+        """Register a function that computes the sub-objects of an object when they are read.
 
         Args:
-            index: the object.
+            index: index of the object.
             reader: returns the value of a sub-index.
-            count: whether to compute sub-index 0 of an array or record too.
+            count: whether sub-index 0 of an array or record is computed too.
         """
         whole = count or (index, 1) not in self._entries
         for key in self._entries:
@@ -120,10 +120,10 @@ class ObjectStore:
                 self._readers[key] = reader
 
     def bind_domain(self, index: int, length: int, reader: Reader, writer: DomainWriter) -> None:
-        """Store the value of a writable DOMAIN elsewhere.
+        """Register functions that read and write the value of a DOMAIN stored elsewhere.
 
         Args:
-            index: the object.
+            index: index of the object.
             length: length of every value, bytes.
             reader: returns the value.
             writer: takes the value.
@@ -132,15 +132,15 @@ class ObjectStore:
         self._domains[index] = Lengths(length, length), writer
 
     def guard(self, index: int, guard: Guard) -> None:
-        """Let ``guard`` refuse values written to ``index``."""
+        """Register ``guard``, which may refuse values written to ``index``."""
         self._guards[index] = guard
 
     def watch(self, index: int, watcher: Watcher) -> None:
-        """Call ``watcher`` after ``index`` was written."""
+        """Register ``watcher``, which is called after each write to ``index``."""
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Call ``watcher`` after a client has changed a parameter: a writable object that is not computed."""
+        """Register ``watcher``, called after a client changes a parameter (writable and not computed)."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:
@@ -159,7 +159,7 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the lengths of a value that a client may write.
+        """Return the range of lengths that a client may write.
 
         Raises:
             Refused: if the object does not exist or is read-only.
@@ -183,10 +183,10 @@ class ObjectStore:
         return self.raw(index, subindex)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write an object for a client: check declaration and guard, store, then call the watcher.
+        """Write an object for a client: check the declaration and guard, store, then call the watcher.
 
         Raises:
-            Refused: if the value is not allowed; nothing has changed then.
+            Refused: if the value is not allowed; the object is then unchanged.
         """
         self.lengths(index, subindex).check(len(data))
         if index in self._domains:
@@ -212,12 +212,12 @@ class ObjectStore:
             guard(subindex, value)
 
     def raw(self, index: int, subindex: int) -> bytes:
-        """Return the bytes of an object, computed if it is bound."""
+        """Return the bytes of an object, computed if the object is bound."""
         reader = self._readers.get((index, subindex))
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the bytes that a client has written, even if reading computes others."""
+        """Return the bytes that a client has written, even if a read of the object computes others."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:
@@ -225,18 +225,18 @@ class ObjectStore:
         return int.from_bytes(self._values[index, subindex], "little")
 
     def put(self, index: int, subindex: int, value: Value | bytes) -> None:
-        """Set an object from within the node, without guard or watcher."""
+        """Set an object from within the node, without calling the guard or watcher."""
         self._values[index, subindex] = to_bytes(self._entries[index, subindex], value)
 
     def restore(self, first: int, last: int) -> None:
-        """Give the writable objects from index ``first`` to ``last`` their default values."""
+        """Reset the writable objects from index ``first`` to ``last`` to their defaults."""
         for key in self._writable(first, last):
             self._values[key] = self._at_start(self._entries[key])
 
     def not_at_default(self, first: int, last: int) -> dict[tuple[int, int], bytes]:
         """Return the parameters from index ``first`` to ``last`` that differ from their defaults.
 
-        Computed objects are not parameters.
+        Computed objects are not parameters and are left out.
         """
         return {
             key: self._values[key]
@@ -252,7 +252,7 @@ class ObjectStore:
     def renumber(self, node_id: int) -> None:
         """Change the node-ID.
 
-        Read-only COB-IDs follow at once, writable COB-IDs with the next :meth:`restore`.
+        Read-only COB-IDs change immediately, writable COB-IDs at the next :meth:`restore`.
         """
         self.node_id = node_id
         for key, entry in self._entries.items():

@@ -1,4 +1,4 @@
-"""Counters of malformed frames, which a node ignores because the standard defines no answer (0x2040)."""
+"""Counters (0x2040) of malformed frames, which a node ignores because the standard defines no response."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _MOST: Final = 0xFFFF_FFFF
 
 
 class Rejected(IntEnum):
-    """Reason for a rejection; the value is the sub-index of object 0x2040."""
+    """Reason for rejecting a frame; the value is the sub-index of object 0x2040."""
 
     NMT = 1
     """Not two bytes, or an unknown command for this node."""
     SYNC = 2
-    """Longer or shorter than 0x1019 demands."""
+    """Longer or shorter than 0x1019 requires."""
     TIME = 3
     """Not six bytes, or not a time of day."""
     HEARTBEAT = 4
@@ -27,11 +27,11 @@ class Rejected(IntEnum):
     RPDO = 6
     """Shorter than the mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """A boot-up or heartbeat with this node's own node-ID: another node has it too."""
+    """A boot-up message or heartbeat with this node's own node-ID, so another node has the same node-ID."""
 
 
 class RejectedFrames:
-    """Object 0x2040: counts from power-on or *reset node*, and stops at its maximum.
+    """Counters of object 0x2040, which start at power-on or *reset node* and saturate at their maximum.
 
     Args:
         store: object dictionary.
@@ -46,7 +46,7 @@ class RejectedFrames:
         self._counts[kind] = min(self._counts[kind] + 1, _MOST)
 
     def counted(self, kind: Rejected) -> int:
-        """Return the number of frames so far."""
+        """Return the number of frames counted so far."""
         return self._counts[kind]
 
     def reset(self) -> None:

@@ -1,4 +1,4 @@
-"""Runs nodes on a bus: one thread for all nodes that share a port."""
+"""Runner of nodes on a bus, with one thread for all nodes that share a port."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 _IDLE_S: Final = 0.1
-"""Longest wait for a frame, s; also the longest delay before the thread ends."""
+"""Maximum wait for a frame, s; also the maximum delay before the thread ends."""
 
 _RETRY_S: Final = 0.02
-"""Pause after a bus error, s: a full queue has drained by then."""
+"""Pause after a bus error, s; a full queue drains within this time."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum frames served before a node counts as silent: half a second of a full bus at 1 Mbit/s."""
+"""Maximum frames served before a node is reported silent; half a second of a full bus at 1 Mbit/s."""
 
 OFF_AFTER_S: Final = 0.1
-"""Time without any success after which the nodes take the bus as off, s; a full queue drains sooner."""
+"""Time without any success after which the nodes treat the bus as off, s; a full queue drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""Time of nothing but failures after which the interface is opened again, s: it may have been replugged."""
+"""Time without any success after which the interface is reopened, s, in case it was replugged."""
 
 
 class NodeRunner:
-    """Powers nodes on and runs them until :meth:`stop`.
+    """Runner that powers nodes on and runs them until :meth:`stop`.
 
-    A runner runs once, and does not end because of bus errors. Its thread owns the nodes from :meth:`start`
-    to :meth:`stop`; other threads may read their counters only. The port stays open. Timers are as exact as
-    the most exact of the nodes demands.
+    A runner can be started once. Bus errors do not end it. Its thread owns the nodes from :meth:`start` to
+    :meth:`stop`; other threads may only read the nodes' counters. The port stays open afterwards. Timers are
+    as precise as the most precise of the nodes requires.
 
     Args:
         port: the port that all nodes share.
-        nodes: the nodes; several may have no node-ID yet.
+        nodes: the nodes, any number of which may still lack a node-ID.
 
     Raises:
         ValueError: if there are no nodes, or two have the same node-ID.
@@ -59,12 +59,12 @@ class NodeRunner:
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
         self._slack_ns = min(node.pacing.slack_ns for node in self.nodes)
         self.bus_errors = 0
-        """Number of bus errors that the nodes survived."""
+        """Number of bus errors so far."""
         self.bus_error = ""
-        """First error of the latest series, in one line."""
+        """First error of the latest run of errors, in one line."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        self._sent_before = 0  # frames sent when the bus went off: one more, and it is back
+        self._sent_before = 0  # frames sent when the bus went off; one more shows that it has recovered
         self._powered, self._stopping = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
@@ -75,7 +75,7 @@ class NodeRunner:
         return self._error is not None
 
     def start(self) -> None:
-        """Power the nodes on in their order, and return when they have their node-IDs.
+        """Power the nodes on in order, and return once each has its node-ID.
 
         :meth:`stop` raises an error of the thread.
         """
@@ -83,10 +83,10 @@ class NodeRunner:
         self._powered.wait()
 
     def stop(self) -> None:
-        """End and join the thread and power the nodes off. Does nothing when called again.
+        """Stop and join the thread, which powers the nodes off. Further calls have no effect.
 
         Raises:
-            BaseException: the error that ended the thread before.
+            BaseException: the error that ended the thread earlier.
         """
         if self._stopping.is_set():
             return
@@ -106,7 +106,7 @@ class NodeRunner:
         try:
             self.stop()
         except Exception:
-            if error is None:  # otherwise the first error is being raised already
+            if error is None:  # otherwise the original error is already being raised
                 raise
 
     def _run(self) -> None:
@@ -131,7 +131,7 @@ class NodeRunner:
             try:
                 self._turn()
             except BusError as error:
-                # A frame that could not be sent is lost, as on any bus; the nodes continue.
+                # A frame that could not be sent is lost, as on any bus, and the nodes continue.
                 self.bus_errors += 1
                 now_s = time.monotonic()
                 if failing_since_s is None:
@@ -154,7 +154,7 @@ class NodeRunner:
         self._bus_state = state
         now_ns = time.monotonic_ns()
         for node in self.nodes:
-            with contextlib.suppress(BusError):  # the emergency waits in the node
+            with contextlib.suppress(BusError):  # the emergency stays queued in the node
                 node.on_bus(state, now_ns)
 
     def _on_error_frame(self, frame: Frame) -> None:
@@ -162,12 +162,12 @@ class NodeRunner:
             state = bus_state(frame)
             if state is not None:
                 self._set_bus_state(state)
-                self._sent_before = 1 << 63  # frames queued for a controller that is off are not sent
+                self._sent_before = 1 << 63  # frames queued for a bus-off controller are not sent
 
     def _turn(self) -> None:
-        """Serve all timers and at most one frame; return when there is something to do, or after a while."""
+        """Serve all timers and at most one frame; return when a timer is due, or after a limited wait."""
         nodes, clock = self.nodes, time.monotonic_ns
-        # One time for all nodes, so that nodes that started together share one wake-up of the thread.
+        # All nodes get the same time, so that nodes started together share one wake-up of the thread.
         now_ns, first_ns = clock(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None
@@ -191,7 +191,7 @@ class NodeRunner:
     def _catch_up(self, now_ns: int) -> BusError | None:
         """Serve the frames received before ``now_ns``.
 
-        A heartbeat received in time is not missed, even if this thread was held up.
+        This keeps a heartbeat received in time from counting as missed if this thread was delayed.
         """
         failure: BusError | None = None
         for _ in range(_CATCH_UP_FRAMES):
@@ -204,7 +204,7 @@ class NodeRunner:
         return failure
 
     def _serve(self, frame: Frame) -> BusError | None:
-        """Give a frame to all nodes. An error of one node is returned after the others have been served."""
+        """Give a frame to all nodes, and return a bus error of a node once all have been served."""
         failure: BusError | None = None
         if frame.error:
             self._on_error_frame(frame)

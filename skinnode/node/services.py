@@ -1,4 +1,4 @@
-"""What every CiA service of a node shares: object dictionary, emergencies, counters, sender and clock."""
+"""Parts shared by all CiA services of a node: object dictionary, emergencies, counters, sender and clock."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.rejected import RejectedFrames
 
 Send = Callable[[int, bytes], None]
-"""Takes COB-ID and payload of a frame."""
+"""Callback that sends a frame, given its COB-ID and payload."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeServices:
-    """The parts of a node that its services use."""
+    """Parts of a node that its services share."""
 
     store: ObjectStore
     """Object dictionary."""

@@ -1,7 +1,7 @@
 """Store parameters (0x1010), restore defaults (0x1011) and verify configuration (0x1020) of CiA 301 v4.2.
 
-Also keeps the baseline and the LSS configuration. A *parameter* is an object that a client can write and read
-back: neither a command nor a computed object.
+The module also saves the baseline and the LSS configuration. A *parameter* is an object that a client can
+write and read back, so neither a command nor a computed object.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class Storage:
-    """The values that a node keeps, and the objects that control them.
+    """Values that a node keeps, and the objects that control saving and restoring.
 
-    Reports a value that could not be kept or restored by EMCY 0x6300, whose first manufacturer-specific byte
-    is a :class:`~skinnode.node.memory.Fault`.
+    A value that could not be saved or restored is reported by EMCY 0x6300, whose first manufacturer-specific
+    byte is a :class:`~skinnode.node.memory.Fault`.
 
     Args:
         services: the shared parts of the node.
-        memory: None for a node that keeps nothing: 0x1010 and 0x1011 then read 0 and refuse writes (CiA 301).
-        patch: see :class:`~skinnode.node.memory.Kept`.
+        memory: the memory; if None, 0x1010 and 0x1011 read 0 and refuse writes (CiA 301).
+        patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """
 
     def __init__(self, services: NodeServices, memory: Memory | None, patch: str) -> None:
@@ -51,10 +51,10 @@ class Storage:
         self._lasting: dict[Fault, bytes] = {}
         self._kept = Kept(patch)
         self.problem = ""
-        """Last problem with the memory, in one line; empty if there was none."""
+        """Latest problem with the memory, in one line; empty if there was no problem."""
         self.baseline_ohm: Callable[[], Rows] = tuple
-        """Returns the present R0, ohm; set by the application."""
-        able = int(memory is not None).to_bytes(4, "little")  # 1: saves, restores, on command
+        """Function that returns the current R0, ohm; set by the application."""
+        able = int(memory is not None).to_bytes(4, "little")  # 1: saves and restores on command
         for index, signature, command in (
             (od.STORE, od.STORE_SIGNATURE, self._save),
             (od.RESTORE, od.RESTORE_SIGNATURE, self._forget),
@@ -74,7 +74,7 @@ class Storage:
         return self._memory is not None
 
     def load(self) -> None:
-        """Load the memory at power-on. A memory without usable content counts as empty."""
+        """Load the memory at power-on. A memory without usable content is treated as empty."""
         patch = self._kept.patch
         self._kept, self._unreported, self._lasting, self.problem = Kept(patch), [], {}, ""
         try:
@@ -88,13 +88,13 @@ class Storage:
             self._kept = kept
 
     def note(self, fault: Fault, index: int = 0, subindex: int = 0, why: str = "") -> None:
-        """Note a fault that :meth:`report` reports.
+        """Record a fault for :meth:`report`.
 
         Args:
-            fault: its kind.
+            fault: kind of the fault.
             index: index of a refused parameter.
             subindex: sub-index of a refused parameter.
-            why: the reason, in one line; by default that the parameter is not allowed.
+            why: the reason, in one line; if empty, the reason is that the parameter is not allowed.
         """
         self.problem = why or f"0x{index:04X}:{subindex} as stored is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
@@ -104,10 +104,10 @@ class Storage:
             self._lasting[fault] = detail
 
     def report(self, t_ns: int) -> None:
-        """Report the faults since the last call as emergencies.
+        """Send emergencies for the faults recorded since the last call.
 
-        A fault of the whole memory stays in the error register, even across resets, until the memory is
-        reliable again.
+        A fault of the whole memory stays active in the error register, even across resets, until the memory
+        is reliable again.
         """
         for fault, detail in self._lasting.items():
             self._emcy.report(EmcyCode.DATA_SET, detail, t_ns, fault)
@@ -116,10 +116,10 @@ class Storage:
             self._emcy.report_once(EmcyCode.DATA_SET, detail, t_ns)
 
     def restore(self, first: int, last: int) -> None:
-        """Give the objects from index ``first`` to ``last`` their power-on values.
+        """Set the objects from index ``first`` to ``last`` to their power-on values.
 
-        A saved value passes the checks of any write. An object without one, or whose saved value is no longer
-        allowed, gets its default.
+        A saved value passes the same checks as a client's write. An object without a saved value, or whose
+        saved value is no longer allowed, is set to its default.
         """
         self._store.restore(first, last)
         values: dict[Key, bytes] = {}
@@ -132,10 +132,10 @@ class Storage:
         for index, subindex in write_configuration(self._store, values):
             self.note(Fault.REFUSED, index, subindex)
         if self._present(*APPLICATION) != self._kept.application.values:
-            self._clear_verification()  # only a part of the verified configuration was restored
+            self._clear_verification()  # only part of the verified configuration was restored
 
     def keep_baseline(self) -> None:
-        """Save the baseline alone, if there is a memory."""
+        """Save only the baseline, if there is a memory."""
         if self._memory is None:
             return
         try:
@@ -144,14 +144,14 @@ class Storage:
             self.note(Fault.NOT_SAVED, why=f"baseline not saved: {error}")
 
     def keep_lss(self, node_id: int, bit_rate_bps: int | None) -> None:
-        """Save the configuration of LSS.
+        """Save the LSS configuration.
 
         Args:
             node_id: 1 to 127, or 255 for no node-ID.
-            bit_rate_bps: bit rate, bit/s; None for the present one.
+            bit_rate_bps: bit rate, bit/s; None to keep the current bit rate.
 
         Raises:
-            OSError: if that fails.
+            OSError: if saving fails.
         """
         self._keep(replace(self._kept, node_id=node_id, bit_rate_bps=bit_rate_bps))
 
@@ -162,7 +162,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """Clear the faults: the memory is reliable again."""
+        """Clear faults, because the memory is reliable again."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -177,7 +177,8 @@ class Storage:
                 self._keep(command(subindex))
             except OSError:
                 raise Refused(AbortCode.HARDWARE) from None
-            # Saved on command, unlike a baseline: the user knows the present parameters.
+            # Unlike an automatic save of the baseline, a save on command shows that the user has accepted
+            # the current parameters, so these faults end.
             self._settle(Fault.UNREADABLE, Fault.DAMAGED, Fault.FOREIGN)
 
         return guard
@@ -190,12 +191,12 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # 0x1020 verifies the configuration as a whole: it is kept with all of it, or not at all.
+        # 0x1020 verifies the configuration as a whole, so it is saved only if all of that is saved.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 
     def _forget(self, subindex: int) -> Kept:
-        """Make the defaults valid from the next reset on."""
+        """Return the content without the saved parameters, so that the defaults apply from the next reset."""
         kept = _unverified(self._kept)
         if subindex in (_ALL, _COMMUNICATION_ONLY):
             kept = replace(kept, communication=Parameters())
@@ -208,7 +209,7 @@ class Storage:
             self._clear_verification()
 
     def _clear_verification(self) -> None:
-        """Mark the present configuration as not verified."""
+        """Mark the current configuration as not verified."""
         for subindex in (od.VERIFY_DATE, od.VERIFY_TIME):
             self._store.put(od.VERIFY_CONFIGURATION, subindex, 0)
 

@@ -28,7 +28,7 @@ _DO_NOT_CARE_BIT: Final = 1 << 31
 
 
 class SyncWindow:
-    """The time after a SYNC within which synchronous PDOs are valid (0x1007, µs; 0 for no limit)."""
+    """Time window after a SYNC within which synchronous PDOs are valid (0x1007, µs; 0 for no limit)."""
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
         self._store, self._emcy = store, emcy
@@ -40,24 +40,24 @@ class SyncWindow:
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Forget the last SYNC and any missed TPDO, because the node entered another NMT state."""
+        """Discard the last SYNC and all missed TPDOs, because the node has entered another NMT state."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
 
     def is_open(self, t_ns: int) -> bool:
-        """Return whether synchronous PDOs are valid at ``t_ns``. Before the first SYNC they are."""
+        """Return whether synchronous PDOs are valid at ``t_ns``; before the first SYNC they always are."""
         length_us = self._store.integer(od.SYNC_WINDOW)
         return not length_us or self._sync_ns is None or t_ns - self._sync_ns <= length_us * 1000
 
     def lets_out(self, number: int, t_ns: int) -> bool:
-        """Return whether a synchronous TPDO may be sent; if not, the caller discards it.
+        """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
 
-        An emergency reports a discarded TPDO once, until it is in time again.
+        An emergency reports a discarded TPDO once, and again only after a TPDO sent in time.
 
         Args:
             number: number of the TPDO, counted from 0.
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         if self.is_open(t_ns):
             self._clear(number, t_ns)
@@ -73,10 +73,10 @@ class SyncWindow:
 
 
 class Sync:
-    """Consumes SYNC messages, checks their length, and produces them if 0x1005 says so.
+    """SYNC consumer that checks message lengths, and producer if 0x1005 enables production.
 
-    A device that produces SYNC obeys its own, so the caller treats a SYNC that :meth:`on_timer` returns like
-    one that :meth:`accept` accepts.
+    A device that produces SYNC also acts on it, so the caller treats a SYNC returned by :meth:`on_timer` like
+    a SYNC accepted by :meth:`accept`.
 
     Args:
         services: the shared parts of the node.
@@ -95,7 +95,7 @@ class Sync:
         self.cob_id = od.SYNC_COB_ID
         """COB-ID of SYNC messages."""
         self.deadline_ns = NO_DEADLINE_NS
-        """Time at which a SYNC is to be sent, ns."""
+        """Time at which the next SYNC is due, ns."""
         store.guard(od.COB_ID_SYNC, self._guard_cob_id)
         store.guard(od.CYCLE_PERIOD, _guard_period)
         store.guard(od.SYNC_COUNTER_OVERFLOW, self._guard_overflow)
@@ -109,18 +109,18 @@ class Sync:
         return bool(self._store.integer(od.COB_ID_SYNC) & PRODUCER_BIT)
 
     def reload(self) -> None:
-        """Take over written or reset objects.
+        """Apply written or reset objects.
 
-        The next SYNC of a producer comes one period later; the first one has counter 1.
+        A producer sends its next SYNC one period later, and its first SYNC has counter 1.
         """
         self.cob_id = self._store.integer(od.COB_ID_SYNC) & COB_ID_MASK
         self._start()
 
     def enter(self, *, communicates: bool) -> None:
-        """Follow a change of the NMT state.
+        """Handle a change of the NMT state.
 
-        SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL; the counter restarts at 1 on entry
-        from another state.
+        SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The counter restarts at 1 when the
+        node enters these from another state.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -134,7 +134,7 @@ class Sync:
         self.deadline_ns = self._now() + self._period_ns if runs else NO_DEADLINE_NS
 
     def on_timer(self, t_ns: int) -> bytes | None:
-        """Send the SYNC that is due, and return it. Without drift; missed SYNCs are not sent later."""
+        """Send and return the SYNC if it is due. The schedule does not drift; missed SYNCs are skipped."""
         if t_ns < self.deadline_ns:
             return None
         self.deadline_ns += (t_ns - self.deadline_ns) // self._period_ns * self._period_ns + self._period_ns
@@ -146,9 +146,9 @@ class Sync:
         return message
 
     def accept(self, message: bytes, t_ns: int) -> bool:
-        """Return whether a SYNC has the length that 0x1019 demands.
+        """Return whether a SYNC has the length that 0x1019 requires.
 
-        Another length is reported once, until it changes.
+        A wrong length is reported once, and again if the length changes.
 
         Args:
             message: the payload.

@@ -1,7 +1,7 @@
 """TIME consumer: the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A device has no real-time clock. It keeps the last time received and when that was on its own clock, so that
-object 0x2022 gives the time of day at any moment, and a scan's device time can be dated.
+A device has no real-time clock. It keeps the last time received and its own clock's time of reception. From
+these, object 0x2022 gives the current time of day, and the device time of a scan can be converted to a date.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _MS_MASK: Final = (1 << 28) - 1
 
 
 class TimeConsumer:
-    """The time of day from TIME messages.
+    """Consumer of TIME messages, which provides the time of day.
 
     Args:
         store: object dictionary.
-        now: time of the event being handled, ns.
+        now: returns the time of the event being handled, ns.
     """
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
@@ -46,14 +46,14 @@ class TimeConsumer:
         return word & COB_ID_MASK if word & _CONSUMES else None
 
     def on_time(self, data: bytes, t_ns: int) -> bool:
-        """Take a TIME message.
+        """Process a TIME message.
 
         Args:
             data: the payload.
             t_ns: when it was received, ns.
 
         Returns:
-            False, without any change, if the payload is not a time of day.
+            False if the payload is not a time of day; the stored time is then unchanged.
         """
         if len(data) != _FORMAT.size:
             return False
@@ -66,7 +66,7 @@ class TimeConsumer:
         return True
 
     def reset(self) -> None:
-        """Forget the time, as after a reset."""
+        """Discard the time, as after a reset."""
         self._received_ms = self._received_ns = self._messages = 0
 
     def _read(self, subindex: int) -> bytes:
@@ -84,7 +84,7 @@ class TimeConsumer:
                 return (self._received_ns // 1000 & 0xFFFF_FFFF).to_bytes(4, "little")
 
     def _guard(self, _: int, value: int) -> None:
-        """Refuse to produce TIME, and a new COB-ID while the node consumes TIME."""
+        """Refuse TIME production, and a new COB-ID while the node consumes TIME."""
         current = self._store.integer(od.COB_ID_TIME)
         if value & _PRODUCES:
             raise Refused(AbortCode.INVALID_VALUE)

@@ -1,4 +1,4 @@
-"""Timers by key, served in the order of their times without a look at all of them."""
+"""Timers by key, served in order of time without a search of all timers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """One time for each key. Setting, moving and taking cost O(log n), amortised."""
+    """Heap with one time per key. Setting, moving and taking a time cost O(log n), amortised."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}
@@ -17,18 +17,18 @@ class Timers:
 
     @property
     def deadline_ns(self) -> int:
-        """Earliest time, ns; NO_DEADLINE_NS if there is none."""
+        """Earliest time, ns; NO_DEADLINE_NS if no time is set."""
         heap, due = self._heap, self._due
         while heap and due.get(heap[0][1]) != heap[0][0]:
             heapq.heappop(heap)
         return heap[0][0] if heap else NO_DEADLINE_NS
 
     def set(self, key: int, t_ns: int) -> None:
-        """Set the time of a key in place of any earlier one.
+        """Set or replace the time of a key.
 
         Args:
             key: any number.
-            t_ns: its time, ns; NO_DEADLINE_NS to cancel it.
+            t_ns: time, ns; NO_DEADLINE_NS cancels the time of the key.
         """
         if t_ns == NO_DEADLINE_NS:
             self._due.pop(key, None)
@@ -45,9 +45,9 @@ class Timers:
         self._heap.clear()
 
     def take(self, t_ns: int) -> Iterator[int]:
-        """Yield the keys that are due at ``t_ns``, the earliest first.
+        """Yield the keys that are due at ``t_ns``, earliest first.
 
-        Each key is removed when it is yielded, so an exception in between loses no other key. A key that is
+        Each key is removed when it is yielded, so an exception in the caller's loop loses no other key. A key
         set again to a time that has passed is yielded again.
         """
         while self.deadline_ns <= t_ns:

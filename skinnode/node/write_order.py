@@ -1,4 +1,4 @@
-"""Writing a stored configuration in an order that the rules of CiA 301 allow."""
+"""Write order of a stored configuration that satisfies the rules of CiA 301."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ Key = tuple[int, int]
 
 _PDO_END: Final = 0x1C00
 _LATE: Final = (od.CYCLE_PERIOD, od.COB_ID_SYNC, od.VERIFY_CONFIGURATION)
-"""Objects written last, in this order: the SYNC counter may not change while there is a cycle period, the
-producer starts when both are set, and any change clears 0x1020."""
+"""Objects written last, in this order. The SYNC counter overflow cannot change while a cycle period is set,
+the producer starts once both objects are set, and any change clears 0x1020."""
 
 
 def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list[Key]:
-    """Write values over the defaults.
+    """Overwrite the defaults with the given values.
 
-    A PDO is switched off, mapped, given its parameters and switched on; EMCY is switched off before it gets
-    another COB-ID.
+    A PDO is switched off, mapped, given its parameters and switched on again. EMCY is switched off before its
+    COB-ID changes.
 
     Args:
         store: object dictionary, with its defaults.
-        values: index and sub-index to the bytes of the value.
+        values: bytes of each value, by index and sub-index.
 
     Returns:
-        Index and sub-index of each value that is not allowed; it stays at its default, and of a mapping all
-        entries do.
+        Index and sub-index of each value that is not allowed. That object keeps its default; if it is a
+        mapping entry, the whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]
     pdos = {index & ~od.PDO_MAPPING_OFFSET for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
     defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
-    for pdo, default in defaults.items():  # all of them first: one may use the default COB-ID of another
+    for pdo, default in defaults.items():  # all PDOs first, because a value may use another's default
         _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
     for pdo, default in defaults.items():
         refused += _write_pdo(store, known, pdo, default)

@@ -1,4 +1,4 @@
-"""From the analogue port to codes: sampling, tare, and the choice of the chunks to be sent."""
+"""Acquisition of codes from the analogue port: sampling, tare, and selection of the chunks to send."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16
-"""Number of readings averaged into a baseline: its noise, a quarter of a reading's, adds 3 % to that of R/R0.
-"""
+"""Readings averaged into a baseline; its noise is a quarter of a reading's and adds 3 % to that of R/R0."""
 
 
 class Acquisition:
-    """Reads a source and keeps the last codes and the baseline.
+    """Acquisition, which reads a source and keeps the last codes and the baseline.
 
     Args:
         profile: sizes of the patch.
-        source: its analogue port.
+        source: analogue port of the patch.
         scale: the mapping of R/R0 to codes.
-        baseline_ohm: (U, K) R0 to begin with, ohm; None if there is none yet.
+        baseline_ohm: (U, K) initial R0, ohm; None if there is no baseline yet.
 
     Raises:
         ValueError: if the baseline has another shape or a negative value.
@@ -45,9 +44,9 @@ class Acquisition:
         if (given < 0).any():
             raise ValueError(f"baseline_ohm: got {given.min()}, must not be negative")
         self.baseline_ohm: NDArray[np.float32] = given.astype(np.float32)
-        """(U, K) R0 as the object dictionary keeps it, ohm; 0 where there is none."""
+        """(U, K) R0 as stored in the object dictionary, ohm; 0 where there is no R0."""
         self.codes: Codes = np.full(shape, scale.open, dtype=np.uint32)
-        """(U, K) codes of the last scan; all open before the first."""
+        """(U, K) codes of the last scan; all open before the first scan."""
         self.faults = WireFaults.none(profile)
         """Wire faults of the last scan."""
         self._sent: Codes | None = None  # codes that the host holds, chunk by chunk; None if unknown
@@ -57,26 +56,26 @@ class Acquisition:
         """Return (U, K) resistances at ``t_ns``, ohm.
 
         Raises:
-            SourceFailed: if the source gives no reading.
+            SourceFailed: if the source returns no valid reading.
         """
         return read_source(self._source, (self.profile.rows, self.profile.columns), t_ns)
 
     def sample(self, t_ns: int, readings: int = 1) -> None:
-        """Take a scan: the codes of the mean of some readings.
+        """Take a scan by encoding the mean of one or more readings.
 
         Args:
-            t_ns: present time, ns.
+            t_ns: current time, ns.
             readings: number of readings.
 
         Raises:
-            SourceFailed: if the source gives no reading.
+            SourceFailed: if the source returns no valid reading.
         """
         resistance = self._total(t_ns, readings)
         self.codes = encode(resistance / readings, self.baseline_ohm, self.scale)
         self.faults = find_faults(self.codes, self.scale)
 
     def _total(self, t_ns: int, readings: int) -> Float:
-        """Return the sum of some readings; NaN, which counts as open, where infinities cancel."""
+        """Return the sum of the readings; NaN, which counts as open, where infinities cancel."""
         total = self.read(t_ns)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(readings - 1):
@@ -84,14 +83,14 @@ class Acquisition:
         return total
 
     def tare(self, t_ns: int, readings: int = TARE_READS) -> None:
-        """Make the present resistances the baseline. Crossings without a resistance keep their R0.
+        """Make the current resistances the baseline. Crossings without a valid resistance keep their R0.
 
         Args:
-            t_ns: present time, ns.
-            readings: number of readings that are averaged.
+            t_ns: current time, ns.
+            readings: number of readings averaged.
 
         Raises:
-            SourceFailed: if the source gives no reading.
+            SourceFailed: if the source returns no valid reading.
         """
         with np.errstate(
             over="ignore", under="ignore"
@@ -103,7 +102,7 @@ class Acquisition:
         self.forget_sent()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0, ohm. The node then no longer tares by itself, so the client must set the others too."""
+        """Set one R0, ohm. The node then no longer tares by itself, so the client must set every other R0."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.forget_sent()
@@ -116,18 +115,18 @@ class Acquisition:
 
     @property
     def sent(self) -> Codes:
-        """(U, K) codes sent last of every chunk, if :meth:`changed_chunks` selects the chunks."""
+        """(U, K) codes sent last in each chunk, if :meth:`changed_chunks` selects the chunks."""
         return self.codes if self._sent is None else self._sent
 
     def forget_sent(self) -> None:
-        """Make the next scan a full one: no receiver is known to hold the codes sent before."""
+        """Make the next scan a full scan, because the receiver may not hold the codes sent before."""
         self._sent = None
 
     def changed_chunks(self, threshold: int, full_every: int) -> list[int] | None:
-        """Return the indices of the chunks to be sent, and count them as sent.
+        """Return the indices of the chunks to send, and record them as sent.
 
-        A chunk is sent if one of its codes moved by more than the threshold since it was sent, or became or
-        ceased to be a reserved code.
+        A chunk is selected if, since it was last sent, one of its codes has changed by more than the
+        threshold, or has become or ceased to be a reserved code.
 
         Args:
             threshold: threshold, codes.

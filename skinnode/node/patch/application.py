@@ -1,4 +1,4 @@
-"""The patch as an application: takes scans at SYNC, by its own timer or on command; tares; tests itself.
+"""Patch application, which takes scans at SYNC, by its own timer or on command, tares, and tests itself.
 
 :mod:`skinnode.node.patch.objects` binds the manufacturer objects (0x2000 to 0x2301). The CANopen
 communication around the application is in :mod:`skinnode.node.device`.
@@ -35,14 +35,14 @@ from skinnode.protocol.summary import SummaryFlag
 
 
 class PatchApplication:
-    """The scans of one patch; an :class:`~skinnode.node.application.Application`.
+    """Application of one patch, as defined by :class:`~skinnode.node.application.Application`.
 
     Args:
         layout: electrodes of the patch.
         serial: serial number (0x2000:11), u32.
-        acquisition: its codes and baseline.
+        acquisition: codes and baseline of the patch.
         services: the services of the device.
-        pacing: how closely its chunks keep to their pace.
+        pacing: timer precision, which determines how closely chunks keep their pace.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class PatchApplication:
         unknown = np.full((profile.rows, profile.columns), acquisition.scale.open, dtype=np.uint32)
         first_chunk = pack_scan(unknown, 0, profile)[0]
         self.stream = ScanStream(services.store, services.tpdos, first_chunk, pacing.catch_up_ns)
-        """Scans on their way to the bus."""
+        """Sender of the scans."""
         self._storage = services.storage
         self._storage.baseline_ohm = lambda: tuple(map(tuple, acquisition.baseline_ohm.tolist()))
         self._operational = False
@@ -68,15 +68,15 @@ class PatchApplication:
         self._period_ns = 0
         self._wire_faults = WireFaultReporter(profile, services.emcy)
         self.source = SourceMonitor(services.emcy, acquisition.forget_sent)
-        """Failures of the source."""
+        """Monitor of source failures."""
         self._late = False
         self._baseline_changed = False
         self._test = SELF_TEST_NEVER_RUN
         self.overruns = 0
-        """Number of scans skipped because two others were still to be sent."""
+        """Number of scans skipped because two earlier scans had not been sent yet."""
         self.slow_overruns = 0
         """Number of overruns caused by a slow computer or bus, not by a scan period that is too short."""
-        self._scan_ns = NO_DEADLINE_NS  # time of the next scan of the node's own timer
+        self._scan_ns = NO_DEADLINE_NS  # time of the next scan triggered by the node's own timer
         describe(services.store, layout, acquisition.scale, serial)
         self._connect()
 
@@ -84,14 +84,14 @@ class PatchApplication:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` has a scan to take or to send, ns."""
+        """Time at which :meth:`on_timer` must next take or send a scan, ns."""
         return min(self._scan_ns, self.stream.deadline_ns)
 
     def power_on(self, t_ns: int) -> None:
-        """Take the baseline from the memory, or tare if there is none.
+        """Load the baseline from the memory, or tare if it holds none.
 
         Args:
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         remembered = self._remembered()
         if remembered is not None:
@@ -102,14 +102,14 @@ class PatchApplication:
                 self._storage.keep_baseline()
 
     def reset(self) -> None:
-        """Reset: number scans from the start, and report present faults again."""
+        """Restart the scan numbers, and report current faults again."""
         self._counter, self._late = -1, False
         self._wire_faults.reset()
         self._test = SELF_TEST_NEVER_RUN
         self.source.reset(self._now())
 
     def enter(self, *, operational: bool) -> None:
-        """Follow a change of the NMT state."""
+        """Handle a change of the NMT state."""
         self._operational = operational
         if operational:
             self._acquisition.forget_sent()
@@ -122,7 +122,7 @@ class PatchApplication:
         """Take a scan at a SYNC in OPERATIONAL, unless the node scans by its own timer.
 
         Args:
-            counter: the SYNC counter, None without one.
+            counter: the SYNC counter; None if SYNC carries none.
             turns: numbers of the synchronous TPDOs that are due.
             t_ns: when the SYNC was received, ns.
         """
@@ -147,7 +147,7 @@ class PatchApplication:
             return None
         try:
             values = np.array(rows, dtype=np.float32)
-        except ValueError:  # rows of several lengths
+        except ValueError:  # rows of different lengths
             values = np.full((), np.nan, np.float32)
         shape = self._profile.rows, self._profile.columns
         if values.shape == shape and np.isfinite(values).all() and (values >= 0).all():
@@ -156,13 +156,13 @@ class PatchApplication:
         return None
 
     def _new_baseline(self) -> None:
-        """Save a new whole baseline, measured or written, without a command."""
+        """Save a complete new baseline, measured or written, without a save command."""
         self._mark_baseline()
         self._storage.keep_baseline()
         self._storage.report(self._now())
 
     def _mark_baseline(self) -> None:
-        """Let the next summary announce that the baseline has changed."""
+        """Have the next summary announce that the baseline has changed."""
         self._baseline_changed = True
 
     # --- scans
@@ -171,7 +171,7 @@ class PatchApplication:
         return self._counter + 1 & 0xFF
 
     def _scan(self, counter: int, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan now and queue it; skip and count it if another scan waits already."""
+        """Take a scan now and queue it, or count it as skipped if another scan is already waiting."""
         self._counter = counter
         if self.stream.full:
             self.overruns += 1
@@ -193,15 +193,15 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report that an overrun is over: there is room for the next scan, or none is due."""
+        """Report the end of an overrun, because the next scan has room or no scan is due."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 
     def _sample(self, counter: int, t_ns: int) -> tuple[list[bytes], SummaryFlag, Codes]:
         """Take a scan.
 
-        Returns its chunks to be sent, its flags, and the (U, K) codes that a receiver of all chunks then
-        holds. Raises SourceFailed if the source gives no reading.
+        Returns the chunks to send, the summary flags, and the (U, K) codes that a receiver of all chunks then
+        holds. Raises SourceFailed if the source returns no valid reading.
         """
         store, acquisition = self._store, self._acquisition
         if not acquisition.tared:  # the source failed at power-on
@@ -249,7 +249,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If SYNC numbers the scans, a receiver would take this scan for the next one.
+                # If SYNC numbers the scans, a receiver would mistake this scan for the next SYNC's scan.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

@@ -1,4 +1,4 @@
-"""Finds a source by name, so that a user can plug one into a node without a change to this project."""
+"""Lookup of sources by name, so that a user can add a source to a node without changing this project."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ def load(reference: str, option: str) -> Any:
 
     Args:
         reference: ``MODULE:NAME``.
-        option: named in the error.
+        option: option name shown in the error.
 
     Raises:
-        ConfigError: if the module cannot be imported, or does not have the name.
+        ConfigError: if the module cannot be imported or does not contain the name.
     """
     module, _, name = reference.partition(":")
     try:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (Exception, SystemExit) as error:  # a module can raise anything when it is imported
+    except (Exception, SystemExit) as error:  # importing a module can raise anything
         raise ConfigError(option, reference, f"MODULE:NAME that can be imported ({_line(error)})") from error
     return found
 
 
 def make_source(name: str, layout: PatchLayout, option: str = "source") -> ResistanceSource:
-    """Make a source for a patch, and read it once, so that a faulty one is found before a node is on the bus.
+    """Create a source for a patch, and read it once to detect faults before the node is on the bus.
 
     Args:
         name: name of an entry point, or ``MODULE:NAME``, of a class or function that takes the layout and
             returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
         layout: the electrodes of the patch.
-        option: named in the error.
+        option: option name shown in the error.
 
     Raises:
-        ConfigError: if there is no such source, or it does not work.
+        ConfigError: if the source does not exist or does not work.
     """
     points = registered()
     if ":" in name:

@@ -1,4 +1,4 @@
-"""The manufacturer objects of a running patch (0x2000 to 0x2301): where their values come from and go to."""
+"""Bindings of a running patch's manufacturer objects (0x2000 to 0x2301) to the values behind them."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def bind_scan(store: ObjectStore, acquisition: Acquisition, stream: ScanStream) 
 
     Args:
         store: object dictionary.
-        acquisition: gives codes and wire faults.
-        stream: gives the last chunk and summary.
+        acquisition: provides codes and wire faults.
+        stream: provides the last chunk and summary.
     """
     chunk, summary = fields_of(store, od.CHUNK), fields_of(store, od.SUMMARY)
     store.bind(od.CHUNK, lambda sub: stream.chunk[chunk[sub]])
@@ -58,11 +58,11 @@ def bind_scan(store: ObjectStore, acquisition: Acquisition, stream: ScanStream) 
 def bind_baseline(
     store: ObjectStore, acquisition: Acquisition, changed: Callable[[], None], replaced: Callable[[], None]
 ) -> None:
-    """Bind the objects of the baseline.
+    """Bind the baseline objects.
 
     Args:
         store: object dictionary.
-        acquisition: keeps the baseline.
+        acquisition: holds the baseline.
         changed: called after a client has written one value.
         replaced: called after a client has written the whole baseline.
     """
@@ -88,7 +88,7 @@ def fields_of(store: ObjectStore, index: int) -> dict[int, slice]:
 
     Args:
         store: object dictionary.
-        index: the record.
+        index: index of the record.
     """
     fields, at = {}, 0
     for subindex in range(1, store.integer(index) + 1):

@@ -24,21 +24,21 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):
-    """One patch. The node is silent until :meth:`power_on`.
+    """CANopen node of one patch. It sends nothing until :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to get a node-ID by LSS. A node-ID that LSS stored in the memory takes
+        node_id: 1 to 127, or 255 to receive a node-ID by LSS. A node-ID that LSS stored in the memory takes
             precedence.
-        layout: its electrodes; decides the sizes of the object dictionary.
-        source: its analogue port, read once per scan.
-        send: called with COB-ID and payload of each frame that the node sends, in order.
-        profile: its wire format. Default: that of the layout, with codes of 16 bits.
+        layout: electrodes of the patch, which determine the sizes of the object dictionary.
+        source: analogue port of the patch, read once per scan.
+        send: called with the COB-ID and payload of each frame that the node sends, in order.
+        profile: wire format of the patch; by default the layout's format with 16-bit codes.
         serial: serial number (0x1018:4 and 0x2000:11), u32.
-        baseline_ohm: (U, K) R0 to begin with, ohm; None to tare at the first power-on. A baseline in the
-            memory takes precedence.
+        baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
+            takes precedence.
         pacing: :data:`~skinnode.node.clock.EXACT` for a board, THRIFTY if many nodes share a machine.
-        memory: keeps configuration, baseline and node-ID over a power cycle; None if nothing is kept, and
-            0x1010 says so.
+        memory: keeps configuration, baseline and node-ID across a power cycle; None if nothing is kept,
+            which 0x1010 then indicates.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
     Raises:
@@ -82,7 +82,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def scans_sent(self) -> int:
-        """Number of scans sent to their end since construction."""
+        """Number of scans sent completely since construction."""
         return self._patch.stream.scans_sent
 
     @property
@@ -92,7 +92,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def source_error(self) -> str:
-        """Last failure of the source, in one line; empty before the first."""
+        """Last failure of the source, in one line; empty before the first failure."""
         return self._patch.source.error
 
     @property
@@ -102,12 +102,12 @@ class PatchNode(CanopenDevice):
 
     @property
     def memory_problem(self) -> str:
-        """Last problem with the memory, in one line; empty if there was none."""
+        """Latest problem with the memory, in one line; empty if there was no problem."""
         return self._storage.problem
 
     @property
     def overruns(self) -> int:
-        """Number of scans skipped because two others were still to be sent."""
+        """Number of scans skipped because two earlier scans had not been sent yet."""
         return self._patch.overruns
 
     @property

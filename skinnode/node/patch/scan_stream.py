@@ -1,25 +1,25 @@
-"""Sends scans: chunks, paced by the inhibit time of the TPDO that carries them, then the summary.
+"""Scan stream, which sends each scan as chunks paced by their TPDO's inhibit time, then as a summary.
 
 The TPDO whose first object is 0x2010 carries the chunks of a scan if it is event-driven or was due at the
 SYNC that started the scan. TPDOs whose first object is 0x2011 carry the summary after the chunks:
-event-driven TPDOs at once, synchronous TPDOs at once if they were due at that SYNC, otherwise at the next
-SYNC at which they are due. Event-driven TPDOs of other objects are sent after the chunks too.
+event-driven TPDOs immediately, synchronous TPDOs immediately if they were due at that SYNC, otherwise at the
+next SYNC at which they are due. Event-driven TPDOs of other objects are also sent after the chunks.
 
-Pacing. The inhibit time of the standard is a shortest distance. A thread of a general-purpose system wakes
-late, and with a strict shortest distance a scan would outgrow its SYNC period. Lateness of up to
+Pacing. The standard defines the inhibit time as a minimum interval. A thread of a general-purpose system
+wakes late, and with a strict minimum interval a scan would exceed its SYNC period. Lateness of up to
 ``catch_up_ns`` is therefore compensated, if necessary with several frames at once, and the mean rate is never
-exceeded (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the shortest distance is strict.
+exceeded (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum interval is strict.
 
-The node knows the time of a SYNC, and sampling takes a while after it. So the node asks for a timer event
-right after the first chunk of a scan, which gives the present time; the second chunk keeps its distance from
-that.
+The node knows the time of a SYNC, but not how long sampling then takes. It therefore requests a timer event
+right after the first chunk of a scan. This event supplies the current time, from which the interval to the
+second chunk is measured.
 
-Synchronous TPDOs keep to the synchronous window (0x1007): chunks and a summary that are not sent when it
-closes are discarded. The window does not apply to event-driven TPDOs.
+Synchronous TPDOs obey the synchronous window (0x1007): chunks and a summary not sent before the window closes
+are discarded. The window does not apply to event-driven TPDOs.
 
-A scan that is offered while another is being sent waits for its end; one scan can wait. Chunks of two scans
-are never interleaved. A scan that has begun is sent as a whole unless the node leaves OPERATIONAL, which
-omits its summary, or its chunk TPDO is disabled, which its summary shows.
+A scan offered while another is being sent waits until that scan ends; only one scan can wait. Chunks of two
+scans are never interleaved. A scan that has begun is sent completely unless the node leaves OPERATIONAL,
+which omits its summary, or its chunk TPDO is disabled, which its summary shows.
 """
 
 from __future__ import annotations
@@ -36,34 +36,34 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Share of the sending time that may be lost before chunks count as delayed; thread jitter stays below it."""
+"""Fraction of the sending time lost above which chunks count as delayed; thread jitter stays below this."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutgoingScan:
-    """A scan ready to be sent."""
+    """Scan that is ready to be sent."""
 
     counter: int
     """Scan counter, u8."""
     chunks: list[bytes]
-    """Payloads of the chunks to be sent, in order."""
+    """Payloads of the chunks to send, in order."""
     flags: int
     """Bits of :class:`~skinnode.protocol.summary.SummaryFlag`."""
     device_time_us: int
     """Clock of the node, µs; wraps at 2³²."""
     check_of_codes: int | None = None
-    """CRC over the codes that a receiver holds after this scan; None for a summary without a check."""
+    """CRC of the codes that a receiver holds after this scan; None for a summary without a check."""
     turns: frozenset[int] = frozenset()
     """Numbers of the synchronous TPDOs that were due at the SYNC that started the scan."""
 
 
 class ScanStream:
-    """Sends the scans of a patch through its TPDOs.
+    """Sender of a patch's scans through its TPDOs.
 
     Args:
         store: object dictionary.
         tpdos: the TPDOs of the node.
-        chunk: the chunk record (0x2010) until the first chunk is sent.
+        chunk: value of the chunk record (0x2010) until the first chunk is sent.
         catch_up_ns: maximum lateness that is compensated, ns.
     """
 
@@ -74,29 +74,29 @@ class ScanStream:
         self._next_scan: OutgoingScan | None = None
         self._unsent: deque[bytes] = deque()
         self._carrier: Tpdo | None = None  # carries the chunks of the scan being sent
-        self._verbatim = False  # whether it carries the record unchanged
+        self._verbatim = False  # whether the carrier maps the whole record unchanged
         self._chunks_sent = 0
         self._just_begun = False
-        self._busy_ns = 0  # start of the present run of scans without a pause
+        self._busy_ns = 0  # start of the current run of scans without a pause
         self._paced_ns = 0  # sum of the inhibit times since then
         self.chunk = chunk
         """Chunk record sent last."""
         self.summary = bytes(12)
         """Summary record (0x2011) of the last scan."""
         self.scans_sent = 0
-        """Number of scans sent to their end."""
+        """Number of scans sent completely."""
         tpdos.claim(od.CHUNK, self)
         tpdos.claim(od.SUMMARY, self)
 
     @property
     def full(self) -> bool:
-        """Whether a scan is being sent and another waits already."""
+        """Whether a scan is being sent and another is already waiting."""
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
         """Return whether scans take longer than their inhibit times require.
 
-        The node's thread then gets too little processor time, or the bus refuses frames.
+        If so, the node's thread gets too little processor time, or the bus refuses frames.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns
@@ -104,7 +104,7 @@ class ScanStream:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` has something to do, ns."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         if self._scan is None:
             return NO_DEADLINE_NS
         return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
@@ -112,7 +112,7 @@ class ScanStream:
     # --- as the owner of TPDOs
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether chunks of a scan are being sent through a TPDO."""
+        """Return whether a TPDO is currently carrying the chunks of a scan."""
         return tpdo is self._carrier
 
     def on_reload(self, tpdo: Tpdo) -> None:
@@ -128,22 +128,22 @@ class ScanStream:
     # --- events
 
     def stop(self) -> None:
-        """End a scan in progress without a summary: the node has left OPERATIONAL."""
+        """End a scan in progress without a summary, because the node has left OPERATIONAL."""
         self._unsent.clear()
         self._scan = self._next_scan = self._carrier = None
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """Send summaries that waited for a SYNC that starts no scan."""
+        """Send waiting summaries at a SYNC that starts no scan."""
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.waiting and tpdo.number in turns:
                 self._tpdos.transmit(tpdo, t_ns)
 
     def offer(self, scan: OutgoingScan, t_ns: int) -> None:
-        """Send a scan, at once or after the one being sent. Must not be called while :attr:`full`.
+        """Send a scan, immediately or after the current scan. Must not be called while :attr:`full`.
 
         Args:
             scan: the scan.
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         if self._scan is None:
             self._busy_ns, self._paced_ns = t_ns, 0
@@ -179,14 +179,14 @@ class ScanStream:
                 self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # a pause earns no burst
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # a pause does not allow a burst
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:
         return [(each.index, each.subindex) for each in tpdo.parameters.mapping] == self._whole_record
 
     def _stream(self, t_ns: int) -> bool:
-        """Send the chunks that the pace allows; return whether all have been sent."""
+        """Send the chunks that the pace allows, and return whether all chunks have been sent."""
         unsent, carrier = self._unsent, self._carrier
         if carrier is None:
             return True
@@ -200,7 +200,7 @@ class ScanStream:
             carrier.ready_ns = max(carrier.ready_ns, earliest_ns) + inhibit_ns
             self._paced_ns += inhibit_ns
             tpdos.emit(carrier, self.chunk if self._verbatim else tpdos.payload(carrier))
-            self._chunks_sent += 1  # only now: the bus may refuse the chunk
+            self._chunks_sent += 1  # counted only now, because the bus may refuse the chunk
         return not unsent
 
     def _end(self, scan: OutgoingScan, t_ns: int) -> None:

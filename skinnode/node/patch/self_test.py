@@ -1,7 +1,7 @@
-"""The self-test (0x2021:3): checks a patch by reading its source several times.
+"""Self-test (0x2021:3), which checks a patch by reading its source several times.
 
-A node in software has no board to test, so it tests its source. The skin must not be touched meanwhile, or
-the noise is that of the touch.
+A software node has no board to test, so it tests its source. The skin must not be touched during the test, or
+the touch would be measured as noise.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from skinnode.protocol.codes import CodeScale, encode
 from skinnode.protocol.self_test import SelfTest, SelfTestFault
 
 READINGS: Final = 16
-"""Number of readings, as many as a tare takes.
+"""Number of readings, the same as for a tare.
 
-The standard deviation of a crossing is then known to 18 % (1/√30), that of a patch of 300 crossings to 1 %.
+The standard deviation is then known to 18 % (1/√30) for one crossing and to 1 % for a patch of 300 crossings.
 """
 
 NOISE_LIMIT: Final = 1e-3
-"""Relative noise of a reading above which the test fails: a hundred times that for which the solver's
+"""Relative noise of a reading above which the test fails; a hundred times the noise at which the solver's
 accuracy is specified."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # for numbers that no converter gives
+@np.errstate(over="ignore", invalid="ignore")  # for values that no converter returns
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
     """Test a patch.
 
@@ -38,7 +38,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
         scale: the mapping of R/R0 to codes.
 
     Returns:
-        The findings.
+        Result of the test.
     """
     readings: list[Float] = []
     for _ in range(READINGS):

@@ -1,4 +1,4 @@
-"""Failures of a source: counted, and reported by EMCY 0xFF00."""
+"""Monitor that counts source failures and reports them by EMCY 0xFF00."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skinnode.node.patch.source import SourceFailed, SourceFault
 
 
 class SourceMonitor:
-    """Counts and reports the failures of a source.
+    """Monitor of a source's failures.
 
     Args:
         emcy: emergency producer.
@@ -25,26 +25,26 @@ class SourceMonitor:
         self.failures = 0
         """Number of readings, tares and self-tests that failed."""
         self.error = ""
-        """Last failure, in one line; empty before the first."""
+        """Last failure, in one line; empty before the first failure."""
 
     def reset(self, t_ns: int) -> None:
-        """Report a present failure again, after a reset."""
+        """Report a current failure again after a reset."""
         if self._fault is not None:
             self._report(self._fault, t_ns)
 
     @contextlib.contextmanager
     def watch(self, t_ns: int) -> Iterator[None]:
-        """Report a failure in the block, which then goes on to the caller, or the end of one.
+        """Report a source failure in the ``with`` block and re-raise it, or report the end of a failure.
 
         Args:
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         try:
             yield
         except SourceFailed as failure:
             self.failures += 1
             self.error = str(failure)
-            if failure.fault is not self._fault:  # once, not with every scan
+            if failure.fault is not self._fault:  # report once, not at every scan
                 self._report(failure.fault, t_ns)
             self._on_failure()
             raise

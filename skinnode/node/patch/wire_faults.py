@@ -1,4 +1,4 @@
-"""Open and shorted wires: found in the codes of a scan and reported by EMCY 0x5000."""
+"""Open and shorted wires, found in the codes of a scan and reported by EMCY 0x5000."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class WireFaults:
-    """Wires without a usable crossing."""
+    """Wires that have no usable crossing."""
 
     upper_open: Mask
     """(U,) upper wires that are open."""
@@ -58,7 +58,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
 
 class WireFaultReporter:
-    """Reports new wire faults, and their end.
+    """Reporter of new wire faults and of the end of faults.
 
     Args:
         profile: sizes of the patch.
@@ -70,17 +70,17 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Forget what was reported, after a reset."""
+        """Discard the reported faults after a reset."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
-        """Send one message for new faults: kind and number of the first, and the number of all faulty wires.
+        """Send one message with the kind and number of the first new fault and the count of faulty wires.
 
         A pulled connector is one event, so it causes one message.
 
         Args:
-            faults: present faults.
-            t_ns: present time, ns.
+            faults: current faults.
+            t_ns: current time, ns.
         """
         reported, self._reported = self._reported, faults
         if not faults.any:

@@ -1,6 +1,6 @@
-"""PDO parameters: which values a client may write, and what they mean (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
+"""PDO parameters: values allowed in writes, and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-Where the standard does not define the abort code, CANopenNode's is used.
+Where the standard does not define an abort code, the abort code of CANopenNode is used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ COB_ID_MASK: Final = 0x7FF
 SYNC_CYCLIC_MAX: Final = 240
 """Highest synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types on remote request only: sampled at SYNC, and sampled on request."""
+"""Transmission types sent only on remote request: sampled at SYNC (252), and sampled on request (253)."""
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 
@@ -48,10 +48,10 @@ def check_cob_id(value: int, current: int) -> None:
 
     Args:
         value: the COB-ID.
-        current: the present COB-ID.
+        current: the current COB-ID.
 
     Raises:
-        Refused: if no configurable service may use it, or if it changes while it is in use.
+        Refused: if no configurable service may use the new COB-ID, or if it differs while the old is in use.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
@@ -64,7 +64,7 @@ def check_cob_id(value: int, current: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """An object in a PDO. An object at the index of a data type is a dummy: bytes without meaning."""
+    """Object mapped into a PDO. An object at the index of a data type is a dummy, whose bytes are ignored."""
 
     index: int
     subindex: int
@@ -74,10 +74,10 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """A PDO as its two records describe it. Times are in ns; 0 means not used."""
+    """PDO parameters from the two records of a PDO. Times are in ns; 0 means not used."""
 
     enabled: bool
-    """Whether the PDO exists and maps anything."""
+    """Whether the PDO is valid and maps at least one object."""
     cob_id: int
     """Its 11-bit CAN-ID."""
     answers_rtr: bool
@@ -94,23 +94,23 @@ class PdoParameters:
 
     @property
     def event_driven(self) -> bool:
-        """Whether an event triggers it."""
+        """Whether an event triggers the PDO."""
         return self.kind in EVENT_TYPES
 
     @property
     def synchronous(self) -> bool:
-        """Whether SYNC triggers it. A PDO that is sampled at SYNC but sent on request does not count."""
+        """Whether SYNC triggers the PDO; false if it is sampled at SYNC but sent on request."""
         return self.kind <= SYNC_CYCLIC_MAX
 
 
 class PdoRecords:
-    """The communication record and the mapping record of one PDO: guards writes and reads the parameters.
+    """Communication and mapping records of one PDO, with guarded writes.
 
     Args:
         store: object dictionary.
         parameter: index of the communication record.
         mapping: index of the mapping record.
-        transmits: whether it is a TPDO.
+        transmits: whether the PDO is a TPDO.
         taken: returns whether another PDO uses a CAN-ID; None if several PDOs may share one.
     """
 
@@ -126,13 +126,13 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # Maximum bytes of a PDO, which is the number of entries: the smallest object is a byte.
+        # Maximum bytes of a PDO, equal to the number of entries, because the smallest object is one byte.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)
 
     def _word(self, subindex: int) -> int:
-        """Return a communication parameter; 0 if this PDO does not have it."""
+        """Return a communication parameter; 0 if this PDO does not have that parameter."""
         has = self._store.has(self._parameter, subindex)
         return self._store.integer(self._parameter, subindex) if has else 0
 
@@ -141,7 +141,7 @@ class PdoRecords:
         return not self._word(od.PDO_COB_ID) & INVALID_BIT
 
     def read(self) -> PdoParameters:
-        """Return the present parameters."""
+        """Return the current parameters."""
         store = self._store
         count = store.integer(self._mapping, 0)
         words = [store.integer(self._mapping, sub) for sub in range(1, count + 1)]
@@ -185,7 +185,7 @@ class PdoRecords:
             raise Refused(AbortCode.UNSUPPORTED_ACCESS)
         if not subindex:
             self._check_mapping(value)
-        elif value:  # an entry may be 0, but must not be counted then
+        elif value:  # an entry may be 0 as long as sub-index 0 does not count it
             self._mapped_bytes(value)
 
     def _check_mapping(self, count: int) -> None:
@@ -196,7 +196,7 @@ class PdoRecords:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Bytes of the object a mapping entry names."""
+        """Return the bytes of the object that a mapping entry names."""
         index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if not self._transmits and not subindex and index in od.DUMMY_BITS:
             allowed, size = True, od.DUMMY_BITS[index]

@@ -1,9 +1,9 @@
-"""RPDOs: writes received PDOs into the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
+"""RPDO engine, which writes received PDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
 At each SYNC, types 0 to 240 apply the last PDO received within the synchronous window (0x1007); types 254 and
-255 apply a PDO at once. Bytes beyond the mapping are ignored, and a PDO that is too short is not applied;
-both are reported by EMCY once, until the length is right again. An event timer monitors its RPDO in
-OPERATIONAL, from the first PDO received.
+255 apply a PDO immediately. Bytes beyond the mapping are ignored, and a PDO that is too short is not applied.
+EMCY reports each of these errors once, until the length is right again. In OPERATIONAL, an event timer
+monitors its RPDO from the first PDO received.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from skinnode.node.timers import Timers
 
 
 class _Rpdo:
-    """One RPDO: its parameters and its present error."""
+    """RPDO with its parameters and its current error."""
 
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.wrong: EmcyCode | None = None
-        """Reported error in the length of the last PDO."""
+        """Length error reported for the last PDO; None if its length was right."""
         self.parameters = records.read()
         self.fields = self._fields()
 
     def reload(self) -> None:
-        """Take over written parameters."""
+        """Apply written parameters."""
         self.parameters = self._records.read()
         self.fields = self._fields()
 
     def _fields(self) -> list[tuple[int, int, int, int]]:
-        """Return index, sub-index, first byte and byte after the last, of each mapped object but dummies."""
+        """Return index, sub-index, first byte and exclusive end of each mapped object except dummies."""
         at, fields = 0, []
         for each in self.parameters.mapping:
             if each.index not in od.DUMMY_BITS:
@@ -64,7 +64,7 @@ class RpdoEngine:
         self._operational = False
         self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
-        self._pending: dict[int, bytes] = {}  # synchronous RPDOs received, until the next SYNC
+        self._pending: dict[int, bytes] = {}  # synchronous RPDOs received since the last SYNC
         # Numbers of the RPDOs with a lasting error.
         self._short: set[int] = set()
         self._late: set[int] = set()
@@ -79,13 +79,13 @@ class RpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which a monitored RPDO is late, ns."""
+        """Time at which the next monitored RPDO counts as late, ns."""
         return self._timers.deadline_ns
 
     # --- parameters
 
     def restore(self) -> None:
-        """Take over all parameters and forget all errors, after a reset."""
+        """Apply all parameters and clear all errors after a reset."""
         self._by_cob_id.clear()
         self._pending.clear()
         self._timers.clear()
@@ -114,9 +114,9 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """Follow a change of the NMT state: drop received PDOs, and stop monitoring.
+        """Handle a change of the NMT state by dropping received PDOs and stopping the monitoring.
 
-        Deadlines are monitored in OPERATIONAL only (CiA 301 v4.2, 7.5.2.33), so no RPDO is late any more.
+        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so no RPDO stays late.
         """
         self._operational = operational
         self._pending.clear()
@@ -128,8 +128,8 @@ class RpdoEngine:
         """Handle a frame that may be an RPDO, or several RPDOs that share the COB-ID.
 
         Args:
-            cob_id: its identifier.
-            data: its payload.
+            cob_id: identifier of the frame.
+            data: payload of the frame.
             t_ns: when it was received, ns.
         """
         if self._operational:
@@ -153,7 +153,7 @@ class RpdoEngine:
         wrong = None
         if len(data) < parameters.size:
             wrong = EmcyCode.PDO_NOT_PROCESSED
-        elif len(data) > fd_length(parameters.size):  # for a classic frame the mapped length itself
+        elif len(data) > fd_length(parameters.size):  # equals the mapped length for a classic frame
             wrong = EmcyCode.PDO_LENGTH_EXCEEDED
         self._set_wrong(rpdo, wrong, data, t_ns)
         if wrong is EmcyCode.PDO_NOT_PROCESSED:
@@ -168,7 +168,7 @@ class RpdoEngine:
             self._pending[rpdo.number] = data
 
     def _execute(self, rpdo: _Rpdo, data: bytes) -> None:
-        """Write the mapped objects. A refusal concerns its object alone: process data are not answered."""
+        """Write the mapped objects. A refused object does not affect the others; a PDO has no response."""
         for index, subindex, start, end in rpdo.fields:
             with contextlib.suppress(Refused):
                 self._store.write(index, subindex, data[start:end])
@@ -176,7 +176,7 @@ class RpdoEngine:
     # --- errors
 
     def _set_wrong(self, rpdo: _Rpdo, wrong: EmcyCode | None, data: bytes, t_ns: int) -> None:
-        """Report a new error in the length, and the end of an error."""
+        """Report a new length error, or the end of a length error."""
         if wrong is rpdo.wrong:
             return
         rpdo.wrong = wrong

@@ -1,21 +1,21 @@
-"""TPDOs: transmits mapped objects when the object dictionary demands it (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
+"""TPDO engine, which transmits objects as the PDO parameters require (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
 
 =========  =======================================================================================
 type       sent
 =========  =======================================================================================
-0          after a SYNC, if the values differ from those sent last
-1 to 240   after every n-th SYNC, counted from the SYNC start value if there is one
+0          after a SYNC, if the values have changed since the last transmission
+1 to 240   after every n-th SYNC, counted from the SYNC start value if one is set
 252        on a remote frame, with the values of the last SYNC; not before the first SYNC
 253        on a remote frame
 254, 255   on an event (:meth:`TpdoEngine.trigger`), when the event timer elapses, and on a remote frame;
            never before the inhibit time has passed
 =========  =======================================================================================
 
-If the application has *claimed* the first object of a TPDO, the application sends it where a SYNC or an event
-would; the engine still counts its SYNCs and serves its remote frames and event timer.
+If the application has *claimed* the first object of a TPDO, the application sends that TPDO when a SYNC or an
+event would. The engine still counts SYNCs for it and serves its remote frames and event timer.
 
-The cost of a SYNC grows with the number of enabled TPDOs that listen to it, that of a timer event with the
-number of due TPDOs; other TPDOs cost nothing.
+The cost of a SYNC grows with the number of enabled TPDOs that respond to SYNC, and the cost of a timer event
+with the number of due TPDOs. Other TPDOs cost nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from skinnode.node.timers import Timers
 
 
 class Tpdo:
-    """One TPDO: its parameters and the times at which it may be sent.
+    """TPDO with its parameters and the times at which it may be sent.
 
     Args:
         number: number of the TPDO, counted from 0.
@@ -44,15 +44,15 @@ class Tpdo:
     def __init__(self, number: int, records: PdoRecords) -> None:
         self.number, self._records = number, records
         self.ready_ns = 0
-        """Time from which the inhibit time allows the next transmission, ns."""
+        """Earliest time at which the inhibit time allows the next transmission, ns."""
         self.timer_ns = NO_DEADLINE_NS
         """Time at which the event timer elapses, ns."""
         self.waiting = False
-        """Whether there are values to send that SYNC or inhibit time still delay."""
+        """Whether values are waiting for a SYNC or for the end of the inhibit time."""
         self.last: bytes | None = None
         """Payload sent last; for type 252 the payload sampled last."""
         self.owner: Owner | None = None
-        """The part of the application that sends it, if any."""
+        """Part of the application that sends the TPDO; None if the engine sends it."""
         self._in_step = False
         self._syncs = 0
         self.parameters = records.read()
@@ -65,12 +65,12 @@ class Tpdo:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which there is something to send, ns."""
+        """Time at which the TPDO must be served next, ns."""
         held = self.waiting and self.parameters.event_driven
         return min(self.timer_ns, self.ready_ns) if held else self.timer_ns
 
     def reload(self, t_ns: int) -> None:
-        """Take over written parameters at ``t_ns``."""
+        """Apply parameters written at ``t_ns``."""
         old, new = self.parameters, self._records.read()
         self.parameters = new
         if (old.enabled, old.kind, old.sync_start) != (new.enabled, new.kind, new.sync_start):
@@ -79,7 +79,7 @@ class Tpdo:
             self.start_timer(t_ns)
 
     def start(self, t_ns: int) -> None:
-        """Start in OPERATIONAL, without a history."""
+        """Start in OPERATIONAL, with the history cleared."""
         self.waiting, self.last, self._in_step, self._syncs = False, None, False, 0
         self.start_timer(t_ns)
 
@@ -99,7 +99,7 @@ class Tpdo:
         """Count a SYNC.
 
         Args:
-            counter: the SYNC counter, None without one.
+            counter: the SYNC counter; None if SYNC carries none.
 
         Returns:
             Whether this synchronous TPDO is due.
@@ -118,14 +118,14 @@ class Tpdo:
 
 
 class Owner(Protocol):
-    """A part of the application that sends the TPDOs of objects that it has claimed."""
+    """Part of the application that sends the TPDOs of the objects it has claimed."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether it is about to send this TPDO anyway."""
+        """Return whether the owner is about to send this TPDO anyway."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
-        """Follow a change of parameters of one of its TPDOs, or its loss."""
+        """Handle a parameter change or the loss of one of the owner's TPDOs."""
         ...
 
 
@@ -142,7 +142,7 @@ class TpdoEngine:
         store = services.store
         self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Window in which synchronous TPDOs may be sent; TPDOs without an owner are sent right after SYNC."""
+        """Window for synchronous TPDOs; the engine sends TPDOs without an owner right after SYNC."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
@@ -162,22 +162,22 @@ class TpdoEngine:
 
     @property
     def deadline_ns(self) -> int:
-        """When :meth:`on_timer` has something to do."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
         return self._timers.deadline_ns
 
     def claim(self, index: int, owner: Owner) -> None:
-        """Let ``owner`` send the TPDOs whose first object has this index."""
+        """Register ``owner`` as the sender of the TPDOs whose first object has this index."""
         self._claims[index] = owner
         self.restore()
 
     def owned(self, index: int) -> list[Tpdo]:
-        """Return the enabled TPDOs that are claimed with ``index``."""
+        """Return the enabled, claimed TPDOs whose first object has this index."""
         return [tpdo for tpdo in map(self._tpdos.__getitem__, self._owned) if tpdo.first_index == index]
 
     # --- parameters
 
     def restore(self) -> None:
-        """Take over all parameters, after a reset."""
+        """Apply all parameters after a reset."""
         for number in range(len(self._tpdos)):
             self._reload(number)
 
@@ -204,7 +204,7 @@ class TpdoEngine:
         self._plan(tpdo)
 
     def _taken(self, cob_id: int) -> bool:
-        # From the store, not from the parameters taken over, which lag behind while the store is restored.
+        # Read the store, because the applied parameters lag behind while the store is being restored.
         numbers = range(od.TPDO1_PARAMETER, od.TPDO1_PARAMETER + len(self._tpdos))
         words = [self._store.integer(index, od.PDO_COB_ID) for index in numbers]
         return any(not word & INVALID_BIT and word & COB_ID_MASK == cob_id for word in words)
@@ -212,14 +212,14 @@ class TpdoEngine:
     # --- events
 
     def start(self, t_ns: int) -> None:
-        """Start transmission: the node has entered OPERATIONAL."""
+        """Start transmission when the node has entered OPERATIONAL."""
         self._running = True
         for tpdo in self._tpdos:
             tpdo.start(t_ns)
             self._plan(tpdo)
 
     def stop(self) -> None:
-        """Stop transmission: the node has left OPERATIONAL."""
+        """Stop transmission when the node has left OPERATIONAL."""
         self._running = False
         self._timers.clear()
 
@@ -227,7 +227,7 @@ class TpdoEngine:
         """Count a SYNC for all TPDOs.
 
         Args:
-            counter: the SYNC counter, None without one.
+            counter: the SYNC counter; None if SYNC carries none.
 
         Returns:
             Numbers of the synchronous TPDOs that are due.
@@ -238,7 +238,7 @@ class TpdoEngine:
         )
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """Send the TPDOs that are due and sample those of type 252.
+        """Send the TPDOs that are due and sample the TPDOs of type 252.
 
         Called after the application has handled the SYNC.
 
@@ -295,12 +295,12 @@ class TpdoEngine:
     # --- sending
 
     def payload(self, tpdo: Tpdo) -> bytes:
-        """Return the present values of the mapped objects."""
+        """Return the current values of the mapped objects."""
         raw = self._store.raw
         return b"".join([raw(each.index, each.subindex) for each in tpdo.parameters.mapping])
 
     def emit(self, tpdo: Tpdo, payload: bytes) -> None:
-        """Send a payload at once; the owner of the TPDO has checked the time."""
+        """Send a payload immediately; the owner of the TPDO has already checked the time."""
         self._send(tpdo.parameters.cob_id, payload)
 
     def transmit(self, tpdo: Tpdo, t_ns: int) -> None:
@@ -317,20 +317,20 @@ class TpdoEngine:
             self._plan(tpdo)
 
     def _transmit(self, tpdo: Tpdo, payload: bytes, t_ns: int, *, timer: bool = True) -> None:
-        """Send a payload; ``timer``: restart the event timer."""
+        """Send a payload, and restart the event timer if ``timer`` is true."""
         tpdo.last, tpdo.waiting = payload, False
         tpdo.ready_ns = t_ns + tpdo.parameters.inhibit_ns
         if timer:
             tpdo.start_timer(t_ns)
         self._plan(tpdo)
-        self._send(tpdo.parameters.cob_id, payload)  # last: a bus may refuse it
+        self._send(tpdo.parameters.cob_id, payload)  # last, because the bus may refuse the frame
 
     def _plan(self, tpdo: Tpdo) -> None:
         self._timers.set(tpdo.number, tpdo.deadline_ns if self._running else NO_DEADLINE_NS)
 
 
 def _keep(numbers: list[int], number: int, wanted: bool) -> None:
-    """Add ``number`` to the ascending list, or remove it."""
+    """Add ``number`` to the ascending list or remove it, depending on ``wanted``."""
     at = bisect_left(numbers, number)
     there = at < len(numbers) and numbers[at] == number
     if wanted and not there:

@@ -1,4 +1,4 @@
-"""Service data objects: ``server`` answers requests and runs segmented transfers, ``block`` block transfers.
+"""Service data objects (SDO): ``server`` runs expedited and segmented transfers, ``block`` block transfers.
 
-``transfer`` holds what all transfers share: channel, time-out, and the value that a download collects.
+``transfer`` holds the parts shared by all transfers: channel, time-out, and the value of a download.
 """

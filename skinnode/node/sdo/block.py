@@ -1,8 +1,8 @@
 """SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
 
 CAN delivers a frame twice if the last bit of its end of frame is disturbed (ISO 11898-1), and a frame does
-not show its block: a repeated acknowledgement, taken for that of the next block, would skip segments. A frame
-equal to the previous one is therefore ignored unless the protocol gives a reason for a repetition.
+not identify its block. A repeated acknowledgement taken for the next block's would therefore skip segments.
+For this reason a frame equal to the previous frame is ignored unless the protocol allows a repetition there.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from skinnode.errors import BusError
 from skinnode.node.sdo.transfer import MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 SEGMENT_NS: Final = 500_000
-"""Shortest mean time between two segments, ns.
+"""Minimum mean time between two segments, ns.
 
-PDOs may take 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this takes 2000, so that the
+PDOs may use 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this pace uses 2000, so the
 transmit queue, which PDOs share, does not fill. A block takes 64 ms, or 100 ms if the thread wakes late;
-clients wait at least 300 ms (canopen library) for a frame. Doubled for the rest of a transfer whenever the
-bus refuses a segment, as slower buses do.
+clients wait at least 300 ms (canopen library) for a frame. Each time the bus refuses a segment, as slower
+buses do, the time is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Longest mean time between two segments, ns: a quarter of a bus of 125 kbit/s. If the bus refuses even that,
-the pace is not the cause."""
+"""Maximum mean time between two segments, ns: a quarter of a 125 kbit/s bus. If the bus refuses segments even
+at this pace, the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum segments sent in one timer event, to compensate for a thread that wakes late (2 ms by default).
+"""Maximum segments sent per timer event, to compensate for a thread that wakes late (2 ms by default).
 
 The transmit queue of a Linux CAN interface holds 10 frames, and a delayed thread may handle two events in a
 row.
 """
 TWICE_NS: Final = 3_000_000
-"""Maximum distance of the two deliveries of one frame, ns: two of the longest frames at 125 kbit/s and an
+"""Maximum time between the two deliveries of one frame, ns: two maximum-length frames at 125 kbit/s and an
 error frame.
 
-A client that means a second acknowledgement has received more segments in between.
+A client that sends a genuine second acknowledgement has received more segments in between.
 """
 
 _LAST: Final = 0x80
@@ -49,7 +49,7 @@ _FIVE_ZEROS: Final = bytes(5)
 
 
 class _Client(IntEnum):
-    """Sub-commands of a client in a block upload: the lowest two bits."""
+    """Client sub-commands in a block upload (the lowest two bits)."""
 
     END = 1
     ACKNOWLEDGE = 2
@@ -57,29 +57,29 @@ class _Client(IntEnum):
 
 
 class _Upload(Enum):
-    """What a block upload waits for."""
+    """Event that a block upload waits for."""
 
     START = auto()
     TIME = auto()
-    """The time of the next segment."""
+    """The time at which the next segment is due."""
     ACKNOWLEDGEMENT = auto()
     END = auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """The value of a block upload, and what the client asked for."""
+    """Value of a block upload, and the options that the client requested."""
 
     data: bytes
     """The value."""
     block_size: int
-    """Segments of a block until the client asks for another number."""
+    """Segments per block until the client requests another number."""
     crc: bool
     """Whether the client offers a CRC."""
 
 
 class BlockUpload(Transfer):
-    """A block upload. Sends the answer to the initiate request itself.
+    """Block upload, which sends the response to the initiate request itself.
 
     Args:
         channel: the server channel.
@@ -95,14 +95,14 @@ class BlockUpload(Transfer):
         super().__init__(channel, target, t_ns)
         data, crc = upload.data, upload.crc
         self._data, self._crc = data, crc
-        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value takes a segment too
+        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value also takes a segment
         self._block_size = _checked(upload.block_size)
-        self._first = 0  # segments before the present block
-        self._sent = 0  # segments of the present block
+        self._first = 0  # segments before the current block
+        self._sent = 0  # segments of the current block
         self._pace_ns = SEGMENT_NS
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
-        # Both sides must offer a CRC. Some clients expect one they did not ask for if the server offers it.
+        # Both sides must offer a CRC. Some clients expect a CRC they did not request if the server offers it.
         channel.send(MULTIPLEXER_U32.pack(0xC2 | crc << 2, target.index, target.subindex, len(data)))
 
     def wants(self, request: bytes) -> bool:
@@ -127,7 +127,7 @@ class BlockUpload(Transfer):
         return False
 
     def on_timer(self, t_ns: int) -> None:
-        """Send the segments that are due at ``t_ns``, or abort if the client has paused for too long."""
+        """Send the segments that are due at ``t_ns``, or abort if the client has been silent for too long."""
         if self._waits_for is not _Upload.TIME:
             super().on_timer(t_ns)
         due_ns = max(self.deadline_ns, t_ns - (SEGMENTS_AT_ONCE - 1) * self._pace_ns)
@@ -174,20 +174,20 @@ class BlockUpload(Transfer):
 
 
 class BlockDownload(Transfer):
-    """A block download. Sends the answer to the initiate request itself.
+    """Block download, which sends the response to the initiate request itself.
 
-    Each block is acknowledged at its end, with the number of the last segment before a gap; a client that
-    does not reach the end of a block runs into the time-out.
+    Each block is acknowledged at its end with the number of the last segment before a gap. A client that does
+    not reach the end of a block runs into the time-out.
 
     Args:
         channel: the server channel.
         target: the object.
-        announced: size that the client announced, bytes; None if it did not.
+        announced: size announced by the client, bytes; None if it announced no size.
         t_ns: when the initiate request was received, ns.
         crc: whether the client offers a CRC.
 
     Raises:
-        Refused: if the object cannot be written, or cannot have that size.
+        Refused: if the object is not writable or does not accept that size.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class BlockDownload(Transfer):
         super().__init__(channel, target, t_ns)
         self._incoming = Incoming(channel.store, target, announced)
         self._crc = crc
-        self._received = 0  # segments of the present block without a gap
+        self._received = 0  # segments of the current block received without a gap
         self._last: bytes | None = (
             None  # the last segment of the transfer; the end request says how much of it is data
         )
@@ -204,12 +204,12 @@ class BlockDownload(Transfer):
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
 
     def wants(self, request: bytes) -> bool:
-        """Return whether a frame belongs to the transfer: during a block every frame is a segment."""
+        """Return whether a frame belongs to the transfer; during a block every frame is a segment."""
         return self._last is None or _is_end(request) or request == self._previous
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
         """Handle a frame that belongs to the transfer; return whether the transfer is over."""
-        if self._last is not None and _is_end(request):  # the last segment may have the same bytes
+        if self._last is not None and _is_end(request):  # first: the previous frame may be equal
             self._end(request, self._last)
             return True
         if request == self._previous:

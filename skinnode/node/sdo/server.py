@@ -1,7 +1,7 @@
-"""SDO server (CiA 301 v4.2, 7.2.4.3): initiates transfers, and runs expedited and segmented transfers.
+"""SDO server (CiA 301 v4.2, 7.2.4.3): starts all transfers, and runs expedited and segmented transfers.
 
-Block transfer is in :mod:`skinnode.node.sdo.block`. The canopen library's server does not abort an unknown
-first command and has neither time-out nor block transfer, so it is not used.
+Block transfer is in :mod:`skinnode.node.sdo.block`. The canopen library's SDO server is not used, because it
+does not abort an unknown first command and has neither a time-out nor block transfer.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Longest pause of a client before its transfer is aborted, ns. CiA 301 does not define it."""
+"""Maximum client pause before its transfer is aborted, ns; CiA 301 does not define this time."""
 
 _TOGGLE: Final = 0x10
 
 
 class _Client(IntEnum):
-    """Client command specifiers: the top three bits of a request."""
+    """Client command specifiers (the top three bits of a request)."""
 
     DOWNLOAD_SEGMENT = 0
     DOWNLOAD = 1
@@ -35,19 +35,19 @@ class _Client(IntEnum):
 
 
 _NAMELESS: Final = (0, 3, 5, 6)
-"""Command specifiers of requests that continue a transfer and name no object."""
+"""Command specifiers of requests that continue a transfer and do not name an object."""
 
 
 class SdoServer:
-    """One channel to the object dictionary, for one transfer at a time.
+    """SDO server with one channel to the object dictionary, for one transfer at a time.
 
-    A new initiate request ends an unfinished transfer, because its client has given up. An error that
-    ``send`` raises goes to the caller, and the next call continues from there.
+    A new initiate request ends an unfinished transfer, because its client has given up. An error raised by
+    ``send`` propagates to the caller, and the next call continues the transfer.
 
     Args:
         store: object dictionary.
-        send: takes the eight bytes of an answer.
-        timeout_ns: longest pause of the client, ns.
+        send: called with the eight bytes of each response.
+        timeout_ns: maximum client pause, ns.
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class SdoServer:
 
     @property
     def deadline_ns(self) -> int:
-        """Time at which :meth:`on_timer` has something to send, ns: segments of a block, or an abort."""
+        """Time at which :meth:`on_timer` must next send block segments or an abort, ns."""
         return self._transfer.deadline_ns if self._transfer is not None else NO_DEADLINE_NS
 
     def reset(self) -> None:
-        """Drop a transfer in progress, without an abort."""
+        """Drop a transfer in progress without sending an abort."""
         self._transfer = None
 
     def on_timer(self, t_ns: int) -> None:
-        """Continue a block, or abort the transfer of a silent client, at ``t_ns``."""
+        """At ``t_ns``, continue a block upload, or abort the transfer of a silent client."""
         transfer = self._transfer
         if transfer is not None and t_ns >= transfer.deadline_ns:
             try:
@@ -75,7 +75,7 @@ class SdoServer:
                 self._abort(transfer.target, refused.code)
 
     def on_request(self, request: bytes, t_ns: int) -> None:
-        """Handle a request of the client. An abort gets no answer.
+        """Handle a client request. An abort gets no response.
 
         Args:
             request: eight bytes.
@@ -128,7 +128,7 @@ class SdoServer:
 
     def _start_upload(self, target: Target, data: bytes, t_ns: int) -> None:
         size = len(data)
-        if 1 <= size <= 4:  # an expedited answer cannot distinguish an empty value from four bytes
+        if 1 <= size <= 4:  # an expedited response cannot distinguish 0 from 4 bytes
             head = MULTIPLEXER.pack(0x43 | (4 - size) << 2, target.index, target.subindex)
             self._channel.send(head + data.ljust(4, b"\0"))
         else:
@@ -150,7 +150,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # Without a size, the length of the object decides; a longer object takes all four bytes.
+        # Without a size in the request, the length of the object applies; a longer object takes four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])
@@ -158,7 +158,7 @@ class SdoServer:
 
 
 class _Upload(Transfer):
-    """A segmented upload: seven bytes a request."""
+    """Segmented upload, seven bytes per request."""
 
     def __init__(self, channel: Channel, target: Target, data: bytes, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)
@@ -184,7 +184,7 @@ class _Upload(Transfer):
 
 
 class _Download(Transfer):
-    """A segmented download: seven bytes a request."""
+    """Segmented download, seven bytes per request."""
 
     def __init__(self, channel: Channel, target: Target, announced: int | None, t_ns: int) -> None:
         super().__init__(channel, target, t_ns)

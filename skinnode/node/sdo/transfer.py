@@ -1,4 +1,4 @@
-"""What all SDO transfers share: a channel, a time-out, and the value that a download collects."""
+"""Parts shared by all SDO transfers: channel, time-out, and the value collected by a download."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from skinnode.canopen.abort import AbortCode, Refused
 from skinnode.node.object_dictionary import ObjectStore
 
 MULTIPLEXER: Final = struct.Struct("<BHB")
-"""Command, index, sub-index: the head of an initiate request and of its answer."""
+"""Command, index and sub-index, which begin an initiate request and its response."""
 MULTIPLEXER_U32: Final = struct.Struct("<BHBI")
-"""The same head with four more bytes: a size, or an abort code."""
+"""Command, index, sub-index, and four more bytes that hold a size or an abort code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,23 +24,23 @@ class Channel:
     store: ObjectStore
     """Object dictionary."""
     send: Callable[[bytes], None]
-    """Takes the eight bytes of an answer."""
+    """Function called with the eight bytes of each response."""
     timeout_ns: int
-    """Longest pause of the client, ns."""
+    """Maximum client pause, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The object of a transfer."""
+    """Object that a transfer reads or writes."""
 
     index: int
-    """Its index."""
+    """Index of the object."""
     subindex: int
-    """Its sub-index."""
+    """Sub-index of the object."""
 
 
 class Transfer(ABC):
-    """A transfer of more than one request. Raises Refused to abort.
+    """Transfer of more than one request, which raises Refused to abort.
 
     Args:
         channel: the server channel.
@@ -53,7 +53,7 @@ class Transfer(ABC):
         self.target = target
         """The object."""
         self.deadline_ns = t_ns + channel.timeout_ns
-        """Time at which :meth:`on_timer` has something to do, ns."""
+        """Time at which :meth:`on_timer` must be called next, ns."""
 
     @abstractmethod
     def wants(self, request: bytes) -> bool:
@@ -64,10 +64,10 @@ class Transfer(ABC):
         """Handle a frame that belongs to the transfer; return whether the transfer is over."""
 
     def on_timer(self, t_ns: int) -> None:
-        """Abort, because the client has paused for too long.
+        """Abort the transfer, because the client has been silent for too long.
 
         Raises:
-            Refused: always; a transfer with something to send overrides this.
+            Refused: always; a transfer that sends on a timer overrides this method.
         """
         raise Refused(AbortCode.TIMED_OUT)
 
@@ -76,15 +76,15 @@ class Transfer(ABC):
 
 
 class Incoming:
-    """A value during its download: collected until it is whole, then stored once.
+    """Value of a download, collected until it is complete and then stored at once.
 
     Args:
         store: object dictionary.
         target: the object.
-        announced: size that the client announced, bytes; None if it did not.
+        announced: size announced by the client, bytes; None if it announced no size.
 
     Raises:
-        Refused: if the object cannot be written, or cannot have that size.
+        Refused: if the object is not writable or does not accept that size.
     """
 
     def __init__(self, store: ObjectStore, target: Target, announced: int | None) -> None:
@@ -108,10 +108,10 @@ class Incoming:
             raise Refused(AbortCode.TOO_LONG)
 
     def store(self) -> None:
-        """Write the whole value.
+        """Write the complete value.
 
         Raises:
-            Refused: if it is too short or not allowed.
+            Refused: if the value is too short or not allowed.
         """
         if self._announced is not None and len(self.data) < self._announced:
             raise Refused(AbortCode.TOO_SHORT)

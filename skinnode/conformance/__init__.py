@@ -1,11 +1,11 @@
-"""A conformance suite for CANopen nodes: 127 cases in raw frames, for any node on any interface.
+"""Conformance suite for CANopen nodes: 127 cases built on raw frames, for any node on any interface.
 
-Data flows from ``eds_reader`` (what the device promises) and ``tester`` (frames, one case at a time) through
-``sdo`` and ``dut`` (the device under test) to the cases, and from ``run`` (each case after a reset,
-configuration put back) to ``report`` and ``html_report``.
+``eds_reader`` parses what the device claims to support, and ``tester`` sends and receives frames. ``sdo`` and
+``dut`` (the device under test) build on both and serve the cases. ``run`` resets the device before each case
+and puts its configuration back; ``report`` and ``html_report`` write the results.
 
-The suite knows a node by its EDS and by its frames. Its tester, SDO client, EDS reader and constants are its
-own on purpose: code shared with the node would repeat the node's errors.
+The suite knows a node only through its EDS and its frames. It deliberately has its own tester, SDO client,
+EDS reader and constants, because code shared with the node would share the node's errors.
 """
 
 from skinnode.conformance.case import Case, NotApplicable, Result, Verdict

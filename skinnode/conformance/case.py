@@ -1,4 +1,4 @@
-"""A conformance case and its result."""
+"""Conformance case and its result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Verdict(StrEnum):
-    """Result of a case in one word."""
+    """One-word result of a case."""
 
     PASSED = "passed"
     WARNING = "warning"
@@ -26,17 +26,17 @@ class Verdict(StrEnum):
 class NotApplicable(Exception):
     """The device does not offer what the case checks.
 
-    The text names the object, the EDS entry or the answer on the bus that shows it.
+    The text names the object, EDS entry or response that shows this.
     """
 
 
 class Warned(Exception):
-    """The device passes, but something is doubtful; the text says what."""
+    """The device passes, but something is doubtful. The text explains it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One case.
+    """One conformance case.
 
     ``run`` returns if the device passes; otherwise it raises Failed, NotApplicable or Warned.
     """
@@ -45,7 +45,7 @@ class Case:
     """Area and number: "SDO-07"."""
     title: str
     clause: str
-    """Clause of CiA 301 v4.2.0, or of the document named, that the case checks."""
+    """Clause that the case checks: of CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property
@@ -61,13 +61,13 @@ class Result:
     case: Case
     verdict: Verdict
     why: str = ""
-    """What was expected and received, what is doubtful, or why the case does not apply; empty if the
-    device passed."""
+    """Expected and received data, the doubtful point, or why the case does not apply; empty if the device
+    passed."""
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
     """The frames of the case."""
 
 
 def case(id: str, title: str, clause: str) -> Callable[[Callable[[Dut], None]], Case]:
-    """Return a decorator that makes a case of a function."""
+    """Return a decorator that turns a function into a case."""
     return lambda run: Case(id, title, clause, run)

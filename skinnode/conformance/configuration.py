@@ -16,12 +16,12 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Order of writing: the counter needs a period of 0, the producer starts last, and each write of another
-object clears the configuration date."""
+"""Write order: the counter can be written only while the period is 0, the producer starts after both, and
+0x1020 comes last because writing any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all values that can be read and written, except commands and domains."""
+    """Read all values that can be read and written, except commands and values of variable length."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -29,14 +29,14 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
         try:
             values[entry.index, entry.subindex] = dut.sdo.read(entry.index, entry.subindex)
         except Failed:
-            continue  # the OD cases report it
+            continue  # the OD cases report the failure
     return values
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Undo what was stored or restored, after a reset.
+    """Put the configuration back after a case stored or restored parameters and the node was reset.
 
-    Restores the defaults, writes the values of ``before`` that differ, and stores.
+    Restores the defaults, writes each value of ``before`` that differs, and stores the result.
 
     Args:
         dut: The device.

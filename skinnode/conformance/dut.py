@@ -59,14 +59,14 @@ class Dut:
         self.bus.send(0x000, bytes((command, self.node_id)))
 
     def reset(self, command: int = RESET_NODE) -> None:
-        """Reset the node and await its boot-up message. Raises Failed if it is missing or wrong."""
+        """Reset the node and await its boot-up message. Raises Failed if the message is missing or wrong."""
         self.bus.clear()
         self.nmt(command)
         frame = self.bus.expect(
             self.error_control_id,
             "the boot-up message",
             BOOT_S,
-            lambda frame: frame.data not in _HEARTBEATS,  # from before the reset
+            lambda frame: frame.data not in _HEARTBEATS,  # heartbeats from before the reset
         )
         self.bus.forget()
         if frame.data != b"\0":
@@ -75,8 +75,8 @@ class Dut:
     def prepare(self) -> None:
         """Reset the node and bring it to PRE-OPERATIONAL.
 
-        Case STATE-01 checks the boot-up message and whether the node starts by itself. Here a node that
-        answers is ready, and is commanded to enter PRE-OPERATIONAL.
+        A node that answers counts as ready here and is commanded to enter PRE-OPERATIONAL. Case STATE-01
+        checks the boot-up message and whether the node starts by itself.
 
         Raises:
             NodeTimeout: The node stays silent.
@@ -111,7 +111,7 @@ class Dut:
         """Start the heartbeat of the node, unless it supports only guarding.
 
         Raises:
-            NotApplicable: The node supports neither.
+            NotApplicable: The node supports neither heartbeat nor guarding.
         """
         if self.eds.find(HEARTBEAT) is not None:
             self.sdo.write_integer(HEARTBEAT, 0, period_ms, 2)
@@ -121,8 +121,8 @@ class Dut:
     def state(self, what: str) -> int:
         """Return the NMT state from a heartbeat, or from guarding if the node has no heartbeat.
 
-        The second heartbeat counts, because the first may have been under way. Call :meth:`start_heartbeat`
-        before.
+        Uses the second heartbeat, because the first may have been sent already. Call :meth:`start_heartbeat`
+        first.
         """
         if self.eds.find(HEARTBEAT) is None:
             return (self.guard(what) or 0) & 0x7F
@@ -140,7 +140,7 @@ class Dut:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Send a remote frame for the state and return the byte of the answer; None without an answer."""
+        """Request the state by a remote frame and return the response byte; None without a response."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -160,7 +160,7 @@ class Dut:
     def need_storage(self, index: int, subindex: int) -> None:
         """Raise NotApplicable if the device does not store (0x1010) or restore (0x1011) on command.
 
-        Bit 0 of the value says so (CiA 301, 7.5.2.13 and 7.5.2.14).
+        Bit 0 of the value indicates the capability (CiA 301, 7.5.2.13 and 7.5.2.14).
         """
         self.need(index, subindex)
         try:
@@ -175,18 +175,18 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Reset the node after restoring its defaults, if it restores on command."""
+        """Restore the node's defaults, if it can restore them on command, and reset it."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)
         self.reset()
 
     def store(self, subindex: int, signature: bytes = b"save") -> None:
-        """Store parameters (0x1010). They are put back after the case."""
+        """Store parameters (0x1010). The configuration is put back after the case."""
         self.stored = True
         self.sdo.write(STORE, subindex, signature)
 
     def restore(self, subindex: int) -> None:
-        """Restore default parameters (0x1011), valid from the next reset."""
+        """Restore default parameters (0x1011), which take effect at the next reset."""
         self.stored = True
         self.sdo.write(RESTORE, subindex, b"load")

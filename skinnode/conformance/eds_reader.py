@@ -25,7 +25,8 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Bytes of a value by data type (CiA 301 v4.2.0, table 44); types not listed have variable length."""
+"""Size of a value in bytes, by data type (CiA 301 v4.2.0, table 44); types not listed have variable
+length."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -63,32 +64,32 @@ class EdsEntry:
 
     @property
     def size(self) -> int:
-        """Bytes of a value; 0 if its length is variable."""
+        """Size of the value, bytes; 0 if its length is variable."""
         return SIZES.get(self.data_type, 0)
 
     @property
     def readable(self) -> bool:
-        """Whether it can be read."""
+        """Whether the value can be read."""
         return self.access in _READABLE
 
     @property
     def writable(self) -> bool:
-        """Whether it can be written."""
+        """Whether the value can be written."""
         return self.access in _WRITABLE
 
     @property
     def into_rpdo(self) -> bool:
-        """Whether an RPDO may map it: writable, and not declared as process input."""
+        """Whether an RPDO may map the entry: writable, and not declared as process input."""
         return self.mappable and self.access in ("wo", "rww", "rw")
 
     @property
     def into_tpdo(self) -> bool:
-        """Whether a TPDO may map it: readable, and not declared as process output."""
+        """Whether a TPDO may map the entry: readable, and not declared as process output."""
         return self.mappable and self.access in ("ro", "rwr", "rw", "const")
 
     @property
     def mapping(self) -> int:
-        """The entry of a PDO mapping parameter that maps it."""
+        """Value of a PDO mapping entry that maps this object."""
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def default_bytes(self, node_id: int) -> bytes | None:
@@ -98,8 +99,8 @@ class EdsEntry:
             node_id: Replaces $NODEID.
 
         Returns:
-            The bytes; a string is transferred as in the file. None if the file has no default, or none known
-            to fit the type.
+            The bytes; a string is transferred as in the file. None if the file gives no default, or none that
+            can be encoded in the type.
 
         Raises:
             ValueError: A number is malformed.
@@ -125,7 +126,7 @@ class EdsEntry:
 
 @dataclass(frozen=True, slots=True)
 class Eds:
-    """An EDS: its head, and its entries in ascending order of index and sub-index."""
+    """Parsed EDS: device information, and entries in ascending order of index and sub-index."""
 
     source: str
     """Origin of the EDS, for messages."""
@@ -168,7 +169,7 @@ def number(text: str, node_id: int = 0) -> int:
 
 
 def _hex(text: str) -> bytes | None:
-    """Return the bytes of a hexadecimal text, the form of an OCTET_STRING in CiA 306; None for other text."""
+    """Return the bytes of hexadecimal text (CiA 306 form of an OCTET_STRING); None for other text."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -176,7 +177,7 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; the source of the Eds names an encoding that is not ASCII.
+    """Read an EDS or DCF in any encoding; ``source`` of the result names the encoding unless it is ASCII.
 
     Args:
         path: The file.
@@ -230,7 +231,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
     try:
         found += _listed(sections, {index for index, _ in entries})
         dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
-    except ValueError as error:  # a word in place of a number
+    except ValueError as error:  # text in place of a number
         allowed = "numbers as in CiA 306 in the lists of objects and dummies"
         raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
@@ -245,7 +246,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
 def _entries(
     sections: Mapping[str, Mapping[str, str]], source: str
 ) -> tuple[dict[tuple[int, int], EdsEntry], list[str]]:
-    """Return the entries of all sections, and a line for each section that contradicts itself."""
+    """Return the entries of all sections, and one line per section that contradicts itself."""
     found: list[str] = []
     entries: dict[tuple[int, int], EdsEntry] = {}
     for title in sorted(sections, key=_order):
@@ -284,7 +285,7 @@ def _object(
     if compact > 254:
         found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
         compact = 0
-    if compact:  # identical sub-objects, not described one by one
+    if compact:  # identical sub-objects, not described individually
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
         for subindex in range(1, compact + 1):
@@ -311,7 +312,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield objects that are listed or described only, and lists with a wrong count."""
+    """Yield objects that are only listed or only described, and lists with a wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

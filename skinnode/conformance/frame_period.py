@@ -1,7 +1,7 @@
-"""Checks the intervals of frames against a period.
+"""Checks frame intervals against a period.
 
-A shared machine delays single frames. The mean and the median are checked: the mean because it cannot be
-undercut, the median because a few late frames do not move it.
+A busy machine delays individual frames. Both mean and median are checked: a delayed frame lengthens one
+interval and shortens the next, which hardly changes the mean, and a few late frames do not change the median.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
         frames: At least two frames.
         period_ms: Expected period.
         what: Name of the frames, for the message.
-        or_sooner: Whether events may send frames in between.
+        or_sooner: Whether events may trigger further frames in between.
     """
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms

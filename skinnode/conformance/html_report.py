@@ -1,4 +1,4 @@
-"""Writes a run as one self-contained HTML file: verdicts by area, and the frames of every case."""
+"""Writes run results as one self-contained HTML file: verdicts by area, and the frames of every case."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 
 
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
-    """Return the report; failed cases are unfolded.
+    """Return the report as HTML, with failed cases unfolded.
 
     Args:
         report: Results of the run.
@@ -85,7 +85,7 @@ def as_html(report: Report, title: str, when: datetime.datetime) -> str:
     body = [
         f"<h1>CANopen conformance: {escaped(title)}</h1>",
         f'<p class="dim">{escaped(summary_line(report))}</p>',
-        f'<p class="dim">{when:%Y-%m-%d %H:%M}; clauses are of CiA 301 v4.2.0 unless they name another</p>',
+        f'<p class="dim">{when:%Y-%m-%d %H:%M}; clauses of CiA 301 v4.2.0 unless stated otherwise</p>',
         _bar(report.results),
         f'<div class="counts">{"".join(_count(report, verdict) for verdict in Verdict)}</div>',
         *(f'<p class="verdict failed">{escaped(problem)}</p>' for problem in report.problems),

@@ -1,4 +1,4 @@
-"""PDOs of the device under test: list them, set one up, await its frames."""
+"""Lists PDOs of the device under test, sets them up and awaits their frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PAUSE_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """A PDO, named by its communication parameter (0x1400 or 0x1800 and above)."""
+    """PDO, identified by its communication parameter (0x1400 or 0x1800 and above)."""
 
     parameter: int
 
@@ -39,7 +39,7 @@ class Pdo:
 
     @property
     def transmits(self) -> bool:
-        """Whether it is a TPDO."""
+        """Whether the PDO is a TPDO."""
         return self.parameter >= 0x1800
 
     def __str__(self) -> str:
@@ -66,7 +66,7 @@ def sync(dut: Dut, counter: int | None = None) -> int:
 
 
 def disable(dut: Dut, pdo: Pdo) -> int:
-    """Disable a PDO by bit 31 of its COB-ID; return the COB-ID from before."""
+    """Disable a PDO by setting bit 31 of its COB-ID; return the previous COB-ID."""
     cob_id = dut.sdo.integer(pdo.parameter, COB_ID)
     dut.sdo.write_integer(pdo.parameter, COB_ID, cob_id | INVALID, 4)
     return cob_id
@@ -79,7 +79,7 @@ def mapped(dut: Dut, pdo: Pdo) -> list[int]:
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Return the length, bytes, of a PDO with these mapping entries."""
+    """Return the length of a PDO with these mapping entries, bytes."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 
@@ -100,7 +100,7 @@ class PdoSetup:
 def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
     """Disable the PDO, write its parameters and enable it.
 
-    Frames that the PDO sent before, as from a node that starts by itself, are discarded.
+    Discards frames that the PDO has already sent, for example on a node that starts by itself.
 
     Args:
         dut: The device.
@@ -145,7 +145,7 @@ Trial = Callable[[Dut, Pdo], None]
 
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
-    """Run ``trial`` on every TPDO that maps something, with all others disabled, each after a reset.
+    """Run ``trial`` on each TPDO that maps something, with all others disabled; reset after each trial.
 
     Raises:
         NotApplicable: No TPDO supports the trial.
@@ -173,7 +173,7 @@ def each_tpdo(dut: Dut, trial: Trial) -> None:
 
 
 def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
-    """Return the next frame of a PDO. Raises Failed if its length is not that of the mapping."""
+    """Return the next frame of a PDO. Raises Failed if its length does not match the mapping."""
     frame = dut.bus.expect(can_id, what)
     if len(frame.data) != length:
         raise Failed(f"{counted(length, 'byte')} as mapped, {what}", describe(frame))

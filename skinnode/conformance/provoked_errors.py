@@ -49,7 +49,7 @@ def short_pdo(dut: Dut) -> Frame:
 
 
 def foreign_id(dut: Dut) -> int:
-    """Return a node-ID that is not that of the device."""
+    """Return a node-ID other than the device's."""
     return 0x55 if dut.node_id != 0x55 else 0x56
 
 
@@ -60,7 +60,7 @@ def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
 
 
 def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int = 5) -> int:
-    """Send heartbeats of another node; return the time of the last one, ns."""
+    """Send heartbeats as another node; return the time of the last heartbeat, ns."""
     sent_ns = 0
     for number in range(times):
         if number:
@@ -70,10 +70,10 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
-    """Let the device miss a heartbeat or, without a consumer, its guarding.
+    """Make the device miss a heartbeat or, if it has no heartbeat consumer, a guarding request.
 
     Raises:
-        NotApplicable: The device has neither.
+        NotApplicable: The device has neither heartbeat consumer nor life guarding.
     """
     if dut.eds.find(CONSUMER, 1) is not None:
         partner = foreign_id(dut)
@@ -90,5 +90,5 @@ def lose_partner(dut: Dut, within_ms: int = 100) -> None:
 def not_before(frame: Frame, since_ns: int, least_ms: int, what: str) -> None:
     """Raise Failed if ``frame`` arrived less than ``least_ms`` after ``since_ns``."""
     elapsed_ms = (frame.t_ns - since_ns) * 1e-6
-    if elapsed_ms < least_ms - 1:  # a millisecond for the time stamps of two clocks
+    if elapsed_ms < least_ms - 1:  # 1 ms tolerance: the timestamps come from two clocks
         raise Failed(f"{what} not before {least_ms} ms", f"after {elapsed_ms:.1f} ms")

@@ -1,4 +1,4 @@
-"""Writes a run as text, JSON and JUnit XML; :mod:`skinnode.conformance.html_report` writes HTML."""
+"""Writes run results as text, JSON and JUnit XML; :mod:`skinnode.conformance.html_report` writes HTML."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def summary_line(report: Report) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the run for programs.
+    """Return the run as JSON data for programs.
 
     Frames are strings: seconds since the case began, Tx (sent by the tester) or Rx, COB-ID, length, data.
     """
@@ -68,9 +68,10 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def as_junit(report: Report) -> str:
-    """Return JUnit XML with one suite for each area.
+    """Return JUnit XML with one suite per area.
 
-    Failures carry the frames, cases that do not apply are skipped, a warning is the output of a passed test.
+    A failure contains the frames of its case. A case that does not apply counts as skipped. A warning is
+    reported as output of a passed test.
     """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}

@@ -1,4 +1,4 @@
-"""Runs cases against a node: each after a reset and bounded in time; puts the configuration back."""
+"""Runs each case after a reset and within bounded time, and puts the node's configuration back."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of successive cases without a node, after which the remaining cases are not run."""
+"""Number of successive cases in which the node stays silent before the remaining cases are not run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of a run, and what could not be put back."""
+    """Results of a run, and problems in putting the configuration back."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]
@@ -48,11 +48,11 @@ def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
     Args:
         port: The bus.
         node_id: The node.
-        eds: Its EDS. A patch of this project needs none: its EDS follows from its descriptor (0x2000).
+        eds: Its EDS. A patch of this project needs no EDS, because it follows from its descriptor (0x2000).
 
     Raises:
         NodeTimeout: No node answers.
-        ConfigError: Another device, without an EDS.
+        ConfigError: The device is not a patch of this project, and no EDS is given.
     """
     bus = Tester(port)
     Dut(bus, node_id, _NO_EDS).prepare()
@@ -81,17 +81,17 @@ def _own_eds(sdo: SdoClient) -> Eds:
             return parse_eds(eds_text(patch), f"{eds_name(patch)}, generated")
     except Failed as failure:
         raise ConfigError(
-            "--eds", "nothing", f"the device's EDS, for its identity is unknown: {failure}"
+            "--eds", "nothing", f"the device's EDS, because its identity is unknown: {failure}"
         ) from None
     raise ConfigError(
-        "--eds", "nothing", f"the EDS of the device, for product code 0x{product:08X} is not ours"
+        "--eds", "nothing", f"the device's EDS, because product code 0x{product:08X} is not a patch's"
     )
 
 
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
-    """Run ``cases`` one after the other.
+    """Run ``cases`` one after another.
 
-    Whatever the node does ends in a result. The node is left reset, with the configuration it had.
+    Any behaviour of the node leads to a result. The node is finally reset and has its original configuration.
 
     Args:
         dut: The device.
@@ -108,7 +108,7 @@ def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = l
     try:
         for case in cases:
             if silent == SILENT_CASES:
-                why = f"not run: the node has not come up for {SILENT_CASES} cases"
+                why = f"not run: the node did not come up for {SILENT_CASES} cases"
                 result = Result(case, Verdict.FAILED, why)
             else:
                 result = run_case(dut, case)
@@ -139,8 +139,8 @@ def run_case(dut: Dut, case: Case) -> Result:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:
         raise
-    except Exception as error:  # an answer that no case expects fails the case, not the run
-        verdict, why = Verdict.FAILED, f"answers that make no sense ({type(error).__name__}: {error})"
+    except Exception as error:  # an unexpected answer fails the case, not the run
+        verdict, why = Verdict.FAILED, f"unexpected answer ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 
 

@@ -1,7 +1,7 @@
 """An SDO client in raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
-Written for testing: it checks every answer byte by byte and can break the protocol on request. It shares no
-code with the server of this project.
+The client is written for testing: it checks every answer byte by byte and can violate the protocol on
+request. It shares no code with this project's server.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ MEANINGS: Final = {
 """Abort codes of CiA 301 v4.2.0, table 22."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # a longer upload would never end
+_MOST_BYTES: Final = 1 << 20  # ends an upload whose last segment never comes
 _BLOCK_SIZE: Final = 20
 
 
@@ -81,7 +81,7 @@ def crc16(data: bytes) -> int:
 
 
 def mux(index: int, subindex: int) -> bytes:
-    """Return index and sub-index as transferred."""
+    """Return the multiplexor: index and sub-index as transferred."""
     return struct.pack("<HB", index, subindex)
 
 
@@ -99,11 +99,11 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next answer, eight bytes. Raises Failed if there is none, or one of another length."""
+        """Return the next answer. Raises Failed if none arrives or its length is not eight bytes."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
-        """Send a request and return the answer, whatever it is; earlier answers are discarded."""
+        """Discard earlier answers, send a request and return its answer, which may be an abort."""
         self._bus.pending(self.answer_id)
         self.send(request)
         return self.answer(what)
@@ -124,7 +124,7 @@ class SdoClient:
         self.send(b"\x80" + mux(index, subindex) + struct.pack("<I", code))
 
     def aborts(self, request: bytes, index: int, subindex: int, codes: Collection[int], what: str) -> int:
-        """Send a request that must be aborted; return the abort code.
+        """Send a request that the device must abort; return the abort code.
 
         The abort must name the object and carry one of ``codes`` or the general error.
         """
@@ -150,7 +150,7 @@ class SdoClient:
     # --- upload
 
     def read(self, index: int, subindex: int = 0) -> bytes:
-        """Upload a value, expedited or in segments as the device chooses."""
+        """Upload a value, expedited or segmented as the device chooses."""
         what = f"read of 0x{index:04X}:{subindex:02X}"
         answer = self.served(b"\x40" + mux(index, subindex), what)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != mux(index, subindex):
@@ -190,7 +190,7 @@ class SdoClient:
             index: Index.
             subindex: Sub-index.
             crc: Whether the client asks for a CRC.
-            size: Segments of a sub-block.
+            size: Segments per sub-block.
         """
         what = f"block read of 0x{index:04X}:{subindex:02X}"
         start = bytes((0xA0 | crc << 2,)) + mux(index, subindex) + bytes((size, 0))
@@ -217,7 +217,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Return the bytes, the number of segments, and whether the last segment of all was among them."""
+        """Return the bytes, the number of segments, and whether they include the last of the transfer."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -231,7 +231,7 @@ class SdoClient:
     # --- download
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Download a value: expedited up to four bytes, in segments above."""
+        """Download a value: expedited for one to four bytes, otherwise segmented."""
         if len(data) > 4 or not data:
             self.write_segments(index, subindex, data)
             return
@@ -244,7 +244,7 @@ class SdoClient:
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:
-        """Download in segments, whatever the length."""
+        """Download in segments, even if the value would fit an expedited transfer."""
         what = f"segmented write to 0x{index:04X}:{subindex:02X}"
         start = b"\x21" + mux(index, subindex) + struct.pack("<I", len(data))
         _check(self.served(start, what), b"\x60" + mux(index, subindex) + bytes(4), what)
@@ -282,7 +282,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request of an expedited download of one to four bytes that states its size."""
+    """Return the request for an expedited download of one to four bytes, with its size indicated."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

@@ -1,4 +1,4 @@
-"""All cases in their order, and how to select some."""
+"""All cases in order, and their selection by area or id."""
 
 from __future__ import annotations
 

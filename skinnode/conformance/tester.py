@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""Maximum wait for an answer: far more than a device takes, so that a busy machine fails no case."""
+"""Maximum wait for an answer: far longer than a device needs, so that a busy machine fails no case."""
 
 QUIET_S: Final = 0.06
 """Time without a frame that counts as silence."""
@@ -24,7 +24,7 @@ _TRACE_FRAMES: Final = 400
 
 
 class Failed(Exception):
-    """The device did not do what the standard asks for."""
+    """The device did not do what the standard requires."""
 
     def __init__(self, expected: str, got: str) -> None:
         self.expected, self.got = expected, got
@@ -37,7 +37,7 @@ class TraceLine(NamedTuple):
     t_s: float
     """Time since the case began."""
     sent: bool
-    """Whether the tester sent it."""
+    """Whether the tester sent the frame."""
     can_id: int
     data: bytes
     remote: bool
@@ -66,7 +66,7 @@ class Tester:
         self._begun_ns = time.monotonic_ns()
 
     def begin(self) -> None:
-        """Begin a case: discard everything received before."""
+        """Begin a case: discard all frames received so far."""
         self.clear()
         self._trace.clear()
         self._begun_ns = time.monotonic_ns()
@@ -77,7 +77,7 @@ class Tester:
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
-        """Send a frame and return the time, ns of the monotonic clock."""
+        """Send a frame and return its monotonic time, ns."""
         now_ns = time.monotonic_ns()
         self._note(now_ns, True, can_id, data, remote)
         self._port.send(can_id, data, remote=remote)
@@ -95,7 +95,7 @@ class Tester:
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """Return the first frame of ``can_id`` that matches, from the inbox or still to come.
+        """Return the first matching frame with ``can_id``, from the inbox or still to arrive.
 
         Args:
             can_id: CAN-ID of a data frame.
@@ -103,7 +103,7 @@ class Tester:
             match: Further condition.
 
         Returns:
-            The frame; None if there is none within ``within_s``.
+            The frame; None if none arrives within ``within_s``.
         """
 
         def wanted(frame: Frame) -> bool:
@@ -126,14 +126,14 @@ class Tester:
         within_s: float = ANSWER_S,
         match: Callable[[Frame], bool] | None = None,
     ) -> Frame:
-        """Take a frame as :meth:`take` does. Raises Failed, which names ``what``, if there is none."""
+        """Take a frame as :meth:`take` does. Raises Failed, naming ``what``, if none arrives."""
         frame = self.take(can_id, within_s, match)
         if frame is None:
             raise Failed(f"{what} (0x{can_id:03X}) within {within_s:g} s", "nothing")
         return frame
 
     def listen(self, can_id: int, for_s: float) -> list[Frame]:
-        """Return all frames of ``can_id`` that arrive within ``for_s`` from now."""
+        """Return all frames with ``can_id`` that arrive within ``for_s`` from now."""
         self.pending(can_id)
         self.wait(for_s)
         return self.pending(can_id)
@@ -145,7 +145,7 @@ class Tester:
             self._receive(left_s)
 
     def pending(self, can_id: int) -> list[Frame]:
-        """Take all frames of ``can_id`` received so far out of the inbox."""
+        """Remove the frames with ``can_id`` received so far from the inbox and return them."""
         self._fetch()
         found = [frame for frame in self._inbox if frame.can_id == can_id and not frame.remote]
         for frame in found:
@@ -153,13 +153,13 @@ class Tester:
         return found
 
     def expect_silence(self, can_id: int, what: str, for_s: float = QUIET_S) -> None:
-        """Raise Failed if a frame of ``can_id`` is there or arrives within ``for_s``."""
+        """Raise Failed if a frame with ``can_id`` is in the inbox or arrives within ``for_s``."""
         frame = self.take(can_id, for_s)
         if frame is not None:
             raise Failed(f"no {what}", describe(frame))
 
     def _fetch(self) -> None:
-        for _ in range(_INBOX_FRAMES):  # a full bus is never silent
+        for _ in range(_INBOX_FRAMES):  # bounded: a fully loaded bus is never silent
             if not self._receive(0.0):
                 return
 

@@ -1,4 +1,4 @@
-"""The cases, one module for each area, in the order of the test plan."""
+"""Conformance cases, one module per area, in the order of the test plan."""
 
 from skinnode.conformance.cases import (
     eds,

@@ -1,4 +1,4 @@
-"""EDS: the data sheet, checked for contradictions and against the identity of the device."""
+"""Case EDS-01: the data sheet is consistent with itself, CiA 301 and the device's identity."""
 
 from __future__ import annotations
 

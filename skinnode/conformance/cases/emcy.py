@@ -39,7 +39,7 @@ def history(dut: Dut) -> None:
     dut.sdo.aborts(b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 without an error")
 
 
-@case("EMCY-04", "An RPDO that is too short brings an emergency message, 0x8210, its register bits set",
+@case("EMCY-04", "An RPDO that is too short triggers EMCY 0x8210 with the generic error bit set",
       "7.2.7.1, 7.2.2.5.1")  # fmt: skip
 def forced(dut: Dut) -> None:
     dut.need(_COB_ID)
@@ -49,7 +49,7 @@ def forced(dut: Dut) -> None:
     dut.bus.expect_silence(dut.emcy_id, "second emergency message for one error")
 
 
-@case("EMCY-05", "0x1001 is the register of the last emergency message, before and after", "7.5.2.2")
+@case("EMCY-05", "0x1001 equals the error register in the last emergency message", "7.5.2.2")
 def register_after(dut: Dut) -> None:
     dut.need(_COB_ID)
     frame = short_pdo(dut)

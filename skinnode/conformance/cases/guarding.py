@@ -12,7 +12,7 @@ _GUARD_MS, _FACTOR = 100, 3
 
 
 def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
-    """Raise Failed unless a remote frame is answered with this state and, unless None, this toggle bit."""
+    """Raise Failed unless the node answers a remote frame with this state and toggle bit (None: any)."""
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:
@@ -38,7 +38,7 @@ def answered(dut: Dut) -> None:
 
 @case(
     "GUARD-03",
-    "The toggle bit is 0 first, alternates, and is 0 again after reset communication",
+    "The toggle bit starts at 0, alternates, and is 0 again after reset communication",
     "7.2.8.3.2.1",
 )
 def toggle(dut: Dut) -> None:
@@ -59,7 +59,7 @@ def others(dut: Dut) -> None:
     guarded(dut, 127, 0, "after remote frames for others")
 
 
-@case("GUARD-05", "0x100C and 0x100D are written and read back", "7.5.2.11, 7.5.2.12")
+@case("GUARD-05", "0x100C and 0x100D can be written and read back", "7.5.2.11, 7.5.2.12")
 def written(dut: Dut) -> None:
     dut.need(GUARD_TIME)
     dut.need(LIFE_TIME_FACTOR)
@@ -70,7 +70,7 @@ def written(dut: Dut) -> None:
         raise Failed("0x1234 and 3 read back", f"0x{got[0]:04X} and {got[1]}")
 
 
-@case("GUARD-06", "Life guarding begins with the first remote frame and reports their end (EMCY 0x8130)",
+@case("GUARD-06", "Life guarding begins with the first remote frame; EMCY 0x8130 follows when they stop",
       "7.2.8.2.2.1, 7.5.2.12")  # fmt: skip
 def life_guarding(dut: Dut) -> None:
     dut.need(GUARD_TIME)
@@ -84,8 +84,8 @@ def life_guarding(dut: Dut) -> None:
     for _ in range(8):
         sent_ns = dut.bus.send(dut.error_control_id, remote=True)
         dut.bus.wait(0.5 * _GUARD_MS * 1e-3)
-    expect_no_emcy(dut, COMMUNICATION_LOST, "while remote frames come")
-    frame = expect_emcy(dut, COMMUNICATION_LOST, "when they end")
+    expect_no_emcy(dut, COMMUNICATION_LOST, "while remote frames arrive")
+    frame = expect_emcy(dut, COMMUNICATION_LOST, "when they stop")
     not_before(frame, sent_ns, _GUARD_MS * _FACTOR, "EMCY 0x8130")
     if dut.eds.find(0x1029, 1) is None or dut.sdo.integer(0x1029, 1) == 0:
         guarded(dut, 127, None, "after life guarding failed in OPERATIONAL")

@@ -22,7 +22,7 @@ _PERIOD_MS = 50
 _BEHAVIOUR = 0x1029
 
 
-@case("HB-01", "0x1017 is written and read back", "7.5.2.20")
+@case("HB-01", "0x1017 can be written and read back", "7.5.2.20")
 def written(dut: Dut) -> None:
     dut.need(HEARTBEAT)
     for value in (1000, 0):
@@ -31,7 +31,7 @@ def written(dut: Dut) -> None:
             raise Failed(f"0x1017:00 = {value}", str(dut.sdo.integer(HEARTBEAT)))
 
 
-@case("HB-02", f"Heartbeats come each {_PERIOD_MS} ms and carry the state", "7.2.8.3.2.2")
+@case("HB-02", f"Heartbeats arrive every {_PERIOD_MS} ms and carry the state", "7.2.8.3.2.2")
 def counted(dut: Dut) -> None:
     dut.need(HEARTBEAT)
     dut.start_heartbeat(_PERIOD_MS)
@@ -42,17 +42,19 @@ def counted(dut: Dut) -> None:
     check_period(frames, _PERIOD_MS, "a heartbeat")
 
 
-@case("HB-03", "A producer time of 0 ends the heartbeats", "7.5.2.20")
+@case("HB-03", "A producer time of 0 stops the heartbeats", "7.5.2.20")
 def ended(dut: Dut) -> None:
     dut.need(HEARTBEAT)
     dut.start_heartbeat(_PERIOD_MS)
     dut.bus.expect(dut.error_control_id, "a heartbeat")
     dut.sdo.write_integer(HEARTBEAT, 0, 0, 2)
     dut.bus.pending(dut.error_control_id)
-    dut.bus.expect_silence(dut.error_control_id, "heartbeat once ended", 3 * _PERIOD_MS * 1e-3)
+    dut.bus.expect_silence(
+        dut.error_control_id, "heartbeat after a producer time of 0", 3 * _PERIOD_MS * 1e-3
+    )
 
 
-@case("HB-04", "One node-ID in two entries of 0x1016 is refused", "7.5.2.19")
+@case("HB-04", "The same node-ID in two entries of 0x1016 is refused", "7.5.2.19")
 def twice(dut: Dut) -> None:
     dut.need(CONSUMER, 2)
     partner = foreign_id(dut)
@@ -62,7 +64,7 @@ def twice(dut: Dut) -> None:
 
 
 @case(
-    "HB-05", "Heartbeats that come in time bring no emergency message and no change of state", "7.2.8.2.2.2"
+    "HB-05", "Heartbeats that arrive in time cause no emergency message and no change of state", "7.2.8.2.2.2"
 )
 def in_time(dut: Dut) -> None:
     partner = foreign_id(dut)
@@ -74,12 +76,12 @@ def in_time(dut: Dut) -> None:
     dut.expect_state(5, "while heartbeats come in time")
 
 
-@case("HB-06", "Heartbeats that come late bring EMCY 0x8130, not before the consumer time", "7.2.8.2.2.2")
+@case("HB-06", "Late heartbeats cause EMCY 0x8130, but not before the consumer time", "7.2.8.2.2.2")
 def too_late(dut: Dut) -> None:
     partner = foreign_id(dut)
     consume(dut, partner, 100)
     dut.operational()
-    for _ in range(2):  # monitoring goes on with the next heartbeat
+    for _ in range(2):  # monitoring resumes with the next heartbeat
         sent_ns = beat(dut, partner)
         frame = expect_emcy(dut, COMMUNICATION_LOST, "when a heartbeat is late")
         not_before(frame, sent_ns, 100, "EMCY 0x8130")
@@ -87,7 +89,7 @@ def too_late(dut: Dut) -> None:
 
 @case(
     "HB-07",
-    "After reset node a first heartbeat begins monitoring; 0x1029 follows a lost one",
+    "After reset node the first heartbeat starts monitoring; 0x1029 applies when one is lost",
     "7.2.8.2.2.2, 7.5.2.32",
 )
 def after_reset(dut: Dut) -> None:

@@ -1,4 +1,4 @@
-"""HBVG 1 to 7: a device uses heartbeat or guarding, one at a time, heartbeat first (7.2.8.2.2)."""
+"""HBVG 1 to 7: a device uses either heartbeat or guarding; heartbeat has priority (7.2.8.2.2)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CLAUSE = "7.2.8.2.2"
 
 
 def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
-    """Set both. Raises NotApplicable if the device has only one of them."""
+    """Set heartbeat and guarding. Raises NotApplicable if the device supports only one of the two."""
     dut.need(HEARTBEAT)
     dut.need(GUARD_TIME)
     dut.need(LIFE_TIME_FACTOR)
@@ -24,7 +24,7 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Check that only heartbeats arrive, at their period, even if remote frames are sent between them."""
+    """Check that only heartbeats arrive, at their period, even if remote frames are sent in between."""
     frames = []
     for _ in range(8):
         frames.append(dut.bus.expect(dut.error_control_id, "a heartbeat"))
@@ -47,13 +47,13 @@ def supported(dut: Dut) -> None:
         raise Failed("heartbeat or guarding on after a reset", "both 0x1017 and 0x100C above 0")
 
 
-@case("HBVG-02", "Heartbeat off, guarding off: nothing comes by itself", _CLAUSE)
+@case("HBVG-02", "Heartbeat off, guarding off: the device sends nothing unasked", _CLAUSE)
 def both_off(dut: Dut) -> None:
     _both(dut, 0, 0)
     dut.bus.expect_silence(dut.error_control_id, "frame of error control", 3 * _PERIOD_MS * 1e-3)
 
 
-@case("HBVG-03", "Heartbeat off, guarding on: remote frames are answered, nothing else comes", _CLAUSE)
+@case("HBVG-03", "Heartbeat off, guarding on: remote frames are answered, nothing else is sent", _CLAUSE)
 def guarding_on(dut: Dut) -> None:
     _both(dut, 0, 1000)
     for number in range(4):
@@ -61,7 +61,7 @@ def guarding_on(dut: Dut) -> None:
     dut.bus.expect_silence(dut.error_control_id, "frame of error control")
 
 
-@case("HBVG-04", "Heartbeat on, guarding off: heartbeats come", _CLAUSE)
+@case("HBVG-04", "Heartbeat on, guarding off: heartbeats are sent", _CLAUSE)
 def heartbeat_on(dut: Dut) -> None:
     _both(dut, _PERIOD_MS, 0)
     _heartbeats(dut, remote=False)
@@ -73,14 +73,14 @@ def heartbeat_on_remote(dut: Dut) -> None:
     _heartbeats(dut, remote=True)
 
 
-@case("HBVG-06", "Heartbeat on, guarding on: heartbeats come", _CLAUSE)
+@case("HBVG-06", "Heartbeat on, guarding on: heartbeats are sent", _CLAUSE)
 def both_on(dut: Dut) -> None:
     _both(dut, _PERIOD_MS, 50)
     _heartbeats(dut, remote=False)
 
 
 @case(
-    "HBVG-07", "Heartbeat on, guarding on: remote frames are not answered and begin no life guarding", _CLAUSE
+    "HBVG-07", "Heartbeat on, guarding on: remote frames are not answered and start no life guarding", _CLAUSE
 )
 def both_on_remote(dut: Dut) -> None:
     _both(dut, _PERIOD_MS, 50)

@@ -1,4 +1,4 @@
-"""OD 1 to 9: every object of the EDS on the device: 1 to 6 the objects of CiA 301, 7 to 9 all above."""
+"""OD 1 to 9: every EDS object on the device; 1 to 6 for objects of CiA 301, 7 to 9 for objects above."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def _read_all(dut: Dut, entries: Iterable[EdsEntry]) -> None:
                 faults.append(f"{entry}: {abort}")
             continue
         if entry.size and len(value) != entry.size:
-            faults.append(f"{entry}: {counted(len(value), 'byte')}, its type has {entry.size}")
-    _none("every object readable, as long as its type", faults)
+            faults.append(f"{entry}: {counted(len(value), 'byte')}, its type needs {entry.size}")
+    _none("every object readable, with the length of its type", faults)
 
 
 def _none(expected: str, faults: list[str]) -> None:
@@ -64,18 +64,22 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
         raise Warned(f"its store or restore capabilities differ from the EDS: {'; '.join(doubts)}")
 
 
-@case("OD-01", "Every readable object of 0x1000 to 0x1FFF is read, as long as its type", "7.4, 7.5.2")
+@case(
+    "OD-01",
+    "Every readable object from 0x1000 to 0x1FFF can be read and has the length of its type",
+    "7.4, 7.5.2",
+)
 def read_communication(dut: Dut) -> None:
     _read_all(dut, dut.eds.between(*_COMMUNICATION))
 
 
-@case("OD-02", "Objects of 0x1000 to 0x1FFF have the defaults of the EDS", "7.5.1; CiA 306-1")
+@case("OD-02", "Objects from 0x1000 to 0x1FFF have the defaults of the EDS", "7.5.1; CiA 306-1")
 def communication_defaults(dut: Dut) -> None:
     dut.to_defaults()
     _compare_defaults(dut, dut.eds.between(*_COMMUNICATION))
 
 
-@case("OD-03", "Every ro and const object refuses to be written", "7.4.5, 7.2.4.3.17")
+@case("OD-03", "Writing any ro or const object is refused", "7.4.5, 7.2.4.3.17")
 def read_only(dut: Dut) -> None:
     for entry in dut.eds.entries.values():
         if entry.access in ("ro", "const"):
@@ -85,7 +89,7 @@ def read_only(dut: Dut) -> None:
             dut.sdo.aborts(request, entry.index, entry.subindex, READ_ONLY, f"write to {entry}")
 
 
-@case("OD-04", "Every wo object refuses to be read", "7.4.5, 7.2.4.3.17")
+@case("OD-04", "Reading any wo object is refused", "7.4.5, 7.2.4.3.17")
 def write_only(dut: Dut) -> None:
     entries = [entry for entry in dut.eds.entries.values() if entry.access == "wo"]
     if not entries:
@@ -120,7 +124,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Mappings (PDO-25), the error field (only 0) and signatures have rules of their own.
+        # Mappings (PDO-25), the error field (only 0) and signatures have their own rules.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):
@@ -133,7 +137,9 @@ def limits(dut: Dut) -> None:
         raise NotApplicable("no writable object of the EDS has a limit within its type")
 
 
-@case("OD-07", "Every readable object of 0x2000 to 0x9FFF is read, as long as its type", "7.4")
+@case(
+    "OD-07", "Every readable object from 0x2000 to 0x9FFF can be read and has the length of its type", "7.4"
+)
 def read_rest(dut: Dut) -> None:
     entries = [entry for entry in dut.eds.between(*_REST) if not entry.flags & _REFUSE_READ]
     if not entries:
@@ -142,7 +148,7 @@ def read_rest(dut: Dut) -> None:
 
 
 @case(
-    "OD-08", "Objects of 0x2000 to 0x9FFF have the defaults of the EDS (ObjFlags bit 1 not set)", "CiA 306-1"
+    "OD-08", "Objects from 0x2000 to 0x9FFF have the defaults of the EDS (ObjFlags bit 1 clear)", "CiA 306-1"
 )
 def rest_defaults(dut: Dut) -> None:
     entries = [e for e in dut.eds.between(*_REST) if e.default and not e.flags & _REFUSE_READ]
@@ -153,7 +159,9 @@ def rest_defaults(dut: Dut) -> None:
 
 
 @case(
-    "OD-09", "rw objects of 0x2000 to 0x9FFF take back the value read (ObjFlags bit 0 not set)", "CiA 306-1"
+    "OD-09",
+    "rw objects from 0x2000 to 0x9FFF accept the value read from them (ObjFlags bit 0 clear)",
+    "CiA 306-1",
 )
 def write_back(dut: Dut) -> None:
     found = False

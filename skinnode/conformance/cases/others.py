@@ -22,11 +22,11 @@ RESTRICTED = (
     range(0x6E0, 0x700),
     range(0x701, 0x800),
 )
-"""CAN-IDs of NMT, the default SDO and error control, and reserved ones."""
+"""Restricted CAN-IDs: NMT, default SDO, error control, and reserved CAN-IDs."""
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Write other values than the defaults to harmless objects; return the values before and after."""
+    """Write non-default values to harmless objects; return the values before and after."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -47,10 +47,10 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
-    """Check that a wrong signature is refused and changes nothing, neither at once nor after a reset."""
+    """Check that a wrong signature is refused and changes nothing, either at once or after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
-    # If the device accepts it, stored parameters have to be put back.
+    # If the device accepts the signature, the stored parameters must be put back.
     dut.stored = True
     for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
         request = expedited(index, subindex, signature)
@@ -70,7 +70,7 @@ def _store(dut: Dut, subindex: int) -> None:
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Check that default values are valid after the next reset, and not before it."""
+    """Check that defaults take effect at the next reset and not earlier."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)
@@ -124,7 +124,7 @@ def restore_communication(dut: Dut) -> None:
     _restore(dut, 2)
 
 
-@case("OTHER-09", "0x1020 keeps date and time over storing and reset, and is 0 once an object is written",
+@case("OTHER-09", "0x1020 keeps date and time after storing and reset, and is cleared by writing an object",
       "7.5.2.23")  # fmt: skip
 def verify(dut: Dut) -> None:
     dut.need(_VERIFY, 1)
@@ -149,7 +149,7 @@ def restricted(dut: Dut) -> None:
     found = False
     for index, subindex in _cob_ids(dut):
         found = True
-        if index == _EMCY or index >= 0x1280:  # must not change while valid
+        if index == _EMCY or index >= 0x1280:  # a valid COB-ID must not be changed
             current = dut.sdo.integer(index, subindex)
             dut.sdo.write_integer(index, subindex, current | INVALID, 4)
         for block in RESTRICTED:

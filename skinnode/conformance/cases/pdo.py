@@ -1,4 +1,4 @@
-"""PDO 1 to 20: communication parameters, and when TPDOs are sent: operational, stopped, pre-operational."""
+"""PDO 1 to 20: communication parameters, and transmission of TPDOs in each NMT state."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum wait after a SYNC for the first TPDO of a cycle, which need not come at that SYNC."""
+"""Maximum wait after a SYNC for the first TPDO of a cycle, which may follow a later SYNC."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check the COB-IDs: the first four are pre-defined, and no two valid ones are equal."""
+    """Check COB-IDs (the first four pre-defined, valid COB-IDs distinct) and transmission types."""
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -99,7 +99,7 @@ def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
     return set_up(dut, pdo, PdoSetup(253, remote=True)), payload_bytes(mapped(dut, pdo))
 
 
-@case("PDO-04", "OPERATIONAL: types 254 and 255 are sent at the event timer, no closer than the inhibit time",
+@case("PDO-04", "OPERATIONAL: types 254 and 255 are sent at the event timer, not before the inhibit time",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def event_driven(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -113,7 +113,7 @@ def event_driven(dut: Dut) -> None:
         dut.operational()
         frames = [expect_pdo(dut, can_id, length, f"{pdo} at its event timer") for _ in range(8)]
         gaps = gaps_ms(frames)
-        # One interval is short if the frame before was delayed; their mean hardly changes.
+        # A delayed frame shortens the next interval; the mean hardly changes.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             shown = ", ".join(f"{gap:.1f}" for gap in gaps)
             raise Failed(f"{pdo} no closer than its inhibit time of 40 ms", f"gaps of {shown} ms")
@@ -143,7 +143,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: types 1 and 3 are sent after each and each third SYNC, and not in between",
+@case("PDO-06", "OPERATIONAL: types 1 and 3 are sent after each or each third SYNC, and not in between",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -183,7 +183,11 @@ def _after_sync(  # noqa: PLR0913 - one PDO, one SYNC
         dut.bus.expect_silence(can_id, what)
 
 
-@case("PDO-07", "OPERATIONAL: type 0 is sent after a SYNC only, at latest for the third", "7.2.2.2, 7.5.2.37")
+@case(
+    "PDO-07",
+    "OPERATIONAL: type 0 is sent only after a SYNC, after the third at the latest",
+    "7.2.2.2, 7.5.2.37",
+)
 def acyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         length = payload_bytes(mapped(dut, pdo))
@@ -220,11 +224,11 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
     return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
-# --- STOPPED, and PRE-OPERATIONAL after OPERATIONAL: the same, and nothing is sent
+# --- STOPPED, and PRE-OPERATIONAL after OPERATIONAL: the same triggers, and nothing is sent
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:
-    """Return a trial: set up, run, enter a state in which PDOs are not served, and trigger the PDO."""
+    """Return a trial that sets up a PDO, starts the node, enters ``state`` and triggers the PDO."""
 
     def trial(dut: Dut, pdo: Pdo) -> None:
         if kind == 253:

@@ -1,4 +1,4 @@
-"""PDO 21 to 33: what PDOs map, and remapping: by the procedure, without it, and to invalid entries."""
+"""PDO 21 to 33: default mapping; remapping by the procedure, without it, and to invalid entries."""
 
 from __future__ import annotations
 
@@ -59,23 +59,23 @@ def _any_for(dut: Dut, pdo: Pdo) -> EdsEntry:
 
 
 def _clear(dut: Dut, pdo: Pdo) -> int:
-    """Disable the PDO and its mapping, the first step of the procedure; return the COB-ID from before."""
+    """Disable the PDO and its mapping, the first steps of the procedure; return the previous COB-ID."""
     cob_id = disable(dut, pdo)
     dut.sdo.write_integer(pdo.mapping, 0, 0, 1)
     return cob_id
 
 
 def _most_bytes(dut: Dut) -> int:
-    """Return the bits that a frame of the bus holds."""
+    """Return the maximum number of data bytes in a frame on the bus."""
     return 64 if dut.bus.fd else 8
 
 
 def _slots(dut: Dut, pdo: Pdo) -> int:
-    """Return the number of entries of the mapping."""
+    """Return the maximum number of mapping entries."""
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
-@case("PDO-21", "Mapped by default are objects of the EDS, mappable, of their length, and fit a frame",
+@case("PDO-21", "Default mappings name mappable objects of the EDS with their length, and fit a frame",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def default_mapping(dut: Dut) -> None:
     pdos = [*rpdos(dut), *tpdos(dut)]
@@ -104,7 +104,7 @@ def _check_mapped(dut: Dut, pdo: Pdo, subindex: int, word: int) -> None:
         raise Failed(f"{where} to name an object that may be mapped into {pdo}", str(entry))
 
 
-@case("PDO-22", "A PDO is remapped by the procedure, reads back so and is sent with its new length",
+@case("PDO-22", "A PDO can be remapped by the procedure, reads back and is sent with its new length",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def remap(dut: Dut) -> None:
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -124,7 +124,9 @@ def remap(dut: Dut) -> None:
         dut.prepare()
 
 
-@case("PDO-23", "A mapping entry is not written while the number of entries is not 0", "7.5.2.36, 7.5.2.38")
+@case(
+    "PDO-23", "A mapping entry cannot be written while the number of entries is not 0", "7.5.2.36, 7.5.2.38"
+)
 def entry_without_procedure(dut: Dut) -> None:
     tried = False
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -141,7 +143,7 @@ def entry_without_procedure(dut: Dut) -> None:
         raise NotApplicable("no PDO maps anything by default")
 
 
-@case("PDO-24", "The mapping of a valid PDO is not written", "7.5.2.36, 7.5.2.38")
+@case("PDO-24", "The mapping of a valid PDO cannot be written", "7.5.2.36, 7.5.2.38")
 def mapping_of_valid(dut: Dut) -> None:
     tried = False
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -215,7 +217,7 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 
 
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
-    """Check that the entry or, on a device that checks at the end, the number of entries is refused."""
+    """Check that the device refuses the entry or, if it checks only at the end, the number of entries."""
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"
         request = expedited(pdo.mapping, 1, word.to_bytes(4, "little"))
@@ -246,39 +248,39 @@ def _unmappable(entry: EdsEntry) -> bool:
     return not entry.mappable and entry.index >= 0x1000
 
 
-@case("PDO-27", "Process output (rww, wo) is mapped into an RPDO", "7.5.2.36; CiA 306-1")
+@case("PDO-27", "Process output (rww, wo) can be mapped into an RPDO", "7.5.2.36; CiA 306-1")
 def output_received(dut: Dut) -> None:
     _accepts(dut, rpdos(dut), _output, "mappable object with access rww or wo")
 
 
-@case("PDO-28", "Process input (rwr, ro) is not mapped into an RPDO", "7.5.2.36; CiA 306-1")
+@case("PDO-28", "Process input (rwr, ro) cannot be mapped into an RPDO", "7.5.2.36; CiA 306-1")
 def input_received(dut: Dut) -> None:
     _refuses(dut, rpdos(dut), _input, "mappable object with access rwr or ro")
 
 
-@case("PDO-29", "An object that is not mappable is not mapped into an RPDO", "7.5.2.36; CiA 306-1")
+@case("PDO-29", "An object that is not mappable cannot be mapped into an RPDO", "7.5.2.36; CiA 306-1")
 def unmappable_received(dut: Dut) -> None:
     _refuses(
         dut, rpdos(dut), lambda e: _unmappable(e) and e.writable, "writable object that cannot be mapped"
     )
 
 
-@case("PDO-30", "Process input (rwr, ro) is mapped into a TPDO", "7.5.2.38; CiA 306-1")
+@case("PDO-30", "Process input (rwr, ro) can be mapped into a TPDO", "7.5.2.38; CiA 306-1")
 def input_transmitted(dut: Dut) -> None:
     _accepts(dut, tpdos(dut), _input, "mappable object with access rwr or ro")
 
 
-@case("PDO-31", "Process output (rww, wo) is not mapped into a TPDO", "7.5.2.38; CiA 306-1")
+@case("PDO-31", "Process output (rww, wo) cannot be mapped into a TPDO", "7.5.2.38; CiA 306-1")
 def output_transmitted(dut: Dut) -> None:
     _refuses(dut, tpdos(dut), _output, "mappable object with access rww or wo")
 
 
-@case("PDO-32", "An object that is not mappable is not mapped into a TPDO", "7.5.2.38; CiA 306-1")
+@case("PDO-32", "An object that is not mappable cannot be mapped into a TPDO", "7.5.2.38; CiA 306-1")
 def unmappable_transmitted(dut: Dut) -> None:
     _refuses(dut, tpdos(dut), _unmappable, "object that cannot be mapped")
 
 
-@case("PDO-33", "A dummy entry of the EDS is mapped into an RPDO", "7.5.2.36; CiA 306-1")
+@case("PDO-33", "A dummy entry of the EDS can be mapped into an RPDO", "7.5.2.36; CiA 306-1")
 def dummy(dut: Dut) -> None:
     if not dut.eds.dummies:
         raise NotApplicable("the EDS allows no dummy entry (section DummyUsage)")

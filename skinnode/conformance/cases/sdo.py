@@ -1,4 +1,4 @@
-"""SDO 1 to 18: expedited and segmented transfer, and what a server refuses."""
+"""SDO 1 to 18: expedited and segmented transfer, and requests that a server must refuse."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ TOO_LOW = (0x0609_0030, 0x0609_0032)
 
 _DEVICE_TYPE = 0x1000
 _HARMLESS = (HEARTBEAT, 0x1015, 0x1006, 0x1007, GUARD_TIME)
-"""Objects of CiA 301 that accept any value and have no effect for a while."""
+"""Objects of CiA 301 that accept any value and have no immediate effect."""
 _SPECIAL = (0x1003, 0x1010, 0x1011, 0x1020, 0x1F50, 0x1F51)
-"""Objects that accept commands, or only some values."""
+"""Objects that accept only commands or particular values."""
 _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that fits. Raises NotApplicable, which names what is missing."""
+    """Return the first entry that fits. Raises NotApplicable, naming what is missing."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -65,10 +65,12 @@ def read_expedited(dut: Dut) -> None:
     entry = dut.need(_DEVICE_TYPE)
     default = entry.default_bytes(dut.node_id)
     if default is not None and answer[4:] != default:
-        raise Failed(f"{default.hex(' ').upper()} as the EDS says", answer[4:].hex(" ").upper())
+        raise Failed(f"{default.hex(' ').upper()} as in the EDS", answer[4:].hex(" ").upper())
 
 
-@case("SDO-02", "An object of 0x1000 to 0x1FFF is written expedited and read back", "7.2.4.3.3, 7.2.4.3.6")
+@case(
+    "SDO-02", "An object from 0x1000 to 0x1FFF can be written expedited and read back", "7.2.4.3.3, 7.2.4.3.6"
+)
 def write_expedited(dut: Dut) -> None:
     entries = [found for index in _HARMLESS if (found := dut.eds.find(index)) is not None]
     entry = first(entries, lambda e: e.readable and e.writable, "plain rw object from 0x1000 to 0x1FFF")
@@ -98,18 +100,18 @@ def no_subindex(dut: Dut) -> None:
     dut.sdo.aborts(b"\x40" + mux(_DEVICE_TYPE, 1), _DEVICE_TYPE, 1, NO_SUBINDEX, "read of 0x1000:01")
 
 
-@case("SDO-06", "An object that does not exist is refused, read and written", "7.2.4.3.17")
+@case("SDO-06", "Reading and writing an object that does not exist is refused", "7.2.4.3.17")
 def no_object(dut: Dut) -> None:
     index = next(i for i in (0x1004, 0x1013, 0x1FFF) if not dut.eds.has(i))
     dut.sdo.aborts(b"\x40" + mux(index, 0), index, 0, NO_OBJECT, f"read of 0x{index:04X}:00")
     dut.sdo.aborts(expedited(index, 0, bytes(4)), index, 0, NO_OBJECT, f"write to 0x{index:04X}:00")
 
 
-@case("SDO-07", "An unknown command specifier is refused, and the server goes on", "7.2.4.3.17")
+@case("SDO-07", "An unknown command specifier is refused, and the server keeps working", "7.2.4.3.17")
 def unknown_command(dut: Dut) -> None:
     what = "command specifier 7"
     answer = dut.sdo.ask(b"\xe0" + mux(_DEVICE_TYPE, 0), what)
-    # The standard does not say which object such an abort names.
+    # The standard does not specify which object this abort names.
     index, subindex = struct.unpack("<HB", answer[1:4])
     dut.sdo.check_abort(answer, index, subindex, UNKNOWN_COMMAND, what)
     dut.sdo.read(_DEVICE_TYPE)
@@ -126,7 +128,11 @@ def _writable_of(dut: Dut, *sizes: int) -> EdsEntry:
     )
 
 
-@case("SDO-08", "Four bytes to an object of one or two are refused; its value stays", "7.2.4.3.17")
+@case(
+    "SDO-08",
+    "Writing four bytes to an object of one or two bytes is refused; its value is unchanged",
+    "7.2.4.3.17",
+)
 def too_long(dut: Dut) -> None:
     entry = _writable_of(dut, 1, 2)
     before = dut.sdo.read(entry.index, entry.subindex)
@@ -135,7 +141,11 @@ def too_long(dut: Dut) -> None:
     _unchanged(dut, entry, before)
 
 
-@case("SDO-09", "One byte to an object of two or four is refused; its value stays", "7.2.4.3.17")
+@case(
+    "SDO-09",
+    "Writing one byte to an object of two or four bytes is refused; its value is unchanged",
+    "7.2.4.3.17",
+)
 def too_short(dut: Dut) -> None:
     entry = _writable_of(dut, 2, 4)
     before = dut.sdo.read(entry.index, entry.subindex)
@@ -160,7 +170,7 @@ def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
         return None
 
 
-@case("SDO-10", "A value above the high limit of the EDS is refused; the value stays", "7.2.4.3.17")
+@case("SDO-10", "A value above the high limit of the EDS is refused; the old value is kept", "7.2.4.3.17")
 def too_high(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),
@@ -174,7 +184,7 @@ def too_high(dut: Dut) -> None:
     _unchanged(dut, entry, before)
 
 
-@case("SDO-11", "A value below the low limit of the EDS is refused; the value stays", "7.2.4.3.17")
+@case("SDO-11", "A value below the low limit of the EDS is refused; the old value is kept", "7.2.4.3.17")
 def too_low(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),
@@ -198,7 +208,9 @@ def default_sdo(dut: Dut) -> None:
 
 
 @case(
-    "SDO-13", "0x1000 is read by whatever transfer the server chooses, its length as announced", "7.2.4.3.5"
+    "SDO-13",
+    "0x1000 can be read by the transfer that the server chooses, with the announced length",
+    "7.2.4.3.5",
 )
 def read_short(dut: Dut) -> None:
     value = dut.sdo.read(_DEVICE_TYPE)
@@ -214,17 +226,19 @@ def _write_segmented(dut: Dut, index: int) -> None:
     check(dut, index, 0, 2)
 
 
-@case("SDO-14", "0x100C is written in segments and read back", "7.2.4.3.3, 7.2.4.3.4")
+@case("SDO-14", "0x100C can be written in segments and read back", "7.2.4.3.3, 7.2.4.3.4")
 def write_guard_time(dut: Dut) -> None:
     _write_segmented(dut, GUARD_TIME)
 
 
-@case("SDO-15", "0x1017 is written in segments and read back", "7.2.4.3.3, 7.2.4.3.4")
+@case("SDO-15", "0x1017 can be written in segments and read back", "7.2.4.3.3, 7.2.4.3.4")
 def write_heartbeat(dut: Dut) -> None:
     _write_segmented(dut, HEARTBEAT)
 
 
-@case("SDO-16", "An object of more than four bytes is read in segments, its length announced", "7.2.4.3.6")
+@case(
+    "SDO-16", "An object of more than four bytes is read in segments, with its length announced", "7.2.4.3.6"
+)
 def read_announced(dut: Dut) -> None:
     entry, value = long_object(dut)
     what = f"read of {entry}"
@@ -236,12 +250,12 @@ def read_announced(dut: Dut) -> None:
     dut.sdo.abort(entry.index, entry.subindex)
 
 
-@case("SDO-17", "A segment asked for with the wrong toggle bit is refused", "7.2.4.3.7, 7.2.4.3.17")
+@case("SDO-17", "A segment requested with the wrong toggle bit is refused", "7.2.4.3.7, 7.2.4.3.17")
 def wrong_toggle(dut: Dut) -> None:
     entry, _ = long_object(dut)
     what = f"read of {entry}"
     dut.sdo.served(b"\x40" + mux(entry.index, entry.subindex), what)
-    toggled = "a first segment asked for with toggle bit 1"
+    toggled = "a first segment requested with toggle bit 1"
     dut.sdo.aborts(b"\x70", entry.index, entry.subindex, (0x0503_0000,), toggled)
     answer = dut.sdo.ask(b"\x60", "a segment of a transfer that was aborted")
     if answer[0] != 0x80:
@@ -249,7 +263,9 @@ def wrong_toggle(dut: Dut) -> None:
 
 
 @case(
-    "SDO-18", "Objects of more than four bytes are read in segments, toggle and last bit right", "7.2.4.3.7"
+    "SDO-18",
+    "Objects of more than four bytes are read in segments with correct toggle and last bits",
+    "7.2.4.3.7",
 )
 def read_segments(dut: Dut) -> None:
     entry, value = long_object(dut)

@@ -15,7 +15,7 @@ _BLOCK_SIZE, _SEQUENCE, _CRC = 0x0504_0002, 0x0504_0003, 0x0504_0004
 
 
 def _block(transfer: Callable[[], bytes | None]) -> bytes | None:
-    """Run a block transfer. Raises NotApplicable if the server does not know block transfer."""
+    """Run a block transfer. Raises NotApplicable if the server does not support it."""
     try:
         return transfer()
     except Aborted as abort:
@@ -45,12 +45,12 @@ def block_read_short(dut: Dut) -> None:
     _read(dut, 0x1000, 0, dut.sdo.read(0x1000), crc=False)
 
 
-@case("SDO-20", "0x100C is written by block transfer without CRC and read back", "7.2.4.3.8 to 11")
+@case("SDO-20", "0x100C can be written by block transfer without CRC and read back", "7.2.4.3.8 to 11")
 def block_write_guard_time(dut: Dut) -> None:
     _write(dut, GUARD_TIME, crc=False)
 
 
-@case("SDO-21", "0x1017 is written by block transfer without CRC and read back", "7.2.4.3.8 to 11")
+@case("SDO-21", "0x1017 can be written by block transfer without CRC and read back", "7.2.4.3.8 to 11")
 def block_write_heartbeat(dut: Dut) -> None:
     _write(dut, HEARTBEAT, crc=False)
 
@@ -70,14 +70,14 @@ def block_read_crc(dut: Dut) -> None:
     _read(dut, entry.index, entry.subindex, value, crc=True)
 
 
-@case("SDO-24", "0x100C is written by block transfer with CRC and read back", "7.2.4.3.8 to 11, 16")
+@case("SDO-24", "0x100C can be written by block transfer with CRC and read back", "7.2.4.3.8 to 11, 16")
 def block_write_guard_time_crc(dut: Dut) -> None:
     _write(dut, GUARD_TIME, crc=True)
 
 
 @case(
     "SDO-25",
-    "0x1017 is written by block transfer with CRC; a wrong CRC changes nothing",
+    "0x1017 can be written by block transfer with CRC; a wrong CRC changes nothing",
     "7.2.4.3.8 to 11, 16",
 )
 def block_write_heartbeat_crc(dut: Dut) -> None:
@@ -96,7 +96,7 @@ def block_write_heartbeat_crc(dut: Dut) -> None:
     check(dut, HEARTBEAT, 0, 2)
 
 
-@case("SDO-26", "A block size of 128, and of 0, is refused", "7.2.4.3.13, 7.2.4.3.17")
+@case("SDO-26", "Block sizes of 128 and 0 are refused", "7.2.4.3.13, 7.2.4.3.17")
 def wrong_block_size(dut: Dut) -> None:
     for size in (128, 0):
         request = b"\xa0" + mux(0x1000, 0) + bytes((size, 0))
@@ -106,7 +106,7 @@ def wrong_block_size(dut: Dut) -> None:
             _block(lambda: dut.sdo.read_block(0x1000))
 
 
-@case("SDO-27", "An acknowledge of a segment that was never sent (128) is refused", "7.2.4.3.14, 7.2.4.3.17")
+@case("SDO-27", "Acknowledging a segment that was never sent (128) is refused", "7.2.4.3.14, 7.2.4.3.17")
 def wrong_sequence(dut: Dut) -> None:
     _block(lambda: dut.sdo.read_block(0x1000))
     dut.sdo.served(b"\xa0" + mux(0x1000, 0) + b"\x14", "a block read of 0x1000:00")
@@ -115,7 +115,7 @@ def wrong_sequence(dut: Dut) -> None:
     dut.sdo.aborts(b"\xa2\x80\x14", 0x1000, 0, codes, "an acknowledge of segment 128")
 
 
-@case("SDO-28", "0x1201 to 0x127F: those of the EDS can be read, the others do not exist", "7.5.2.33")
+@case("SDO-28", "0x1201 to 0x127F: objects in the EDS can be read, others do not exist", "7.5.2.33")
 def further_servers(dut: Dut) -> None:
     for index in range(0x1201, 0x1280):
         if dut.eds.has(index):
@@ -125,7 +125,7 @@ def further_servers(dut: Dut) -> None:
             dut.sdo.aborts(b"\x40" + mux(index, 1), index, 1, NO_OBJECT, f"read of 0x{index:04X}:01")
 
 
-@case("SDO-29", "Further SDO servers are as they were after reset communication", "7.5.2.33; 7.3.2.2")
+@case("SDO-29", "Further SDO servers are unchanged after reset communication", "7.5.2.33; 7.3.2.2")
 def servers_after_reset(dut: Dut) -> None:
     servers = dut.eds.indices(0x1201, 0x127F)
     if not servers:
@@ -145,7 +145,7 @@ def servers_after_reset(dut: Dut) -> None:
 
 @case(
     "SDO-30",
-    "SDO clients (0x1280 to 0x12FF) are kept by 0x1010:01 over reset communication",
+    "SDO clients (0x1280 to 0x12FF) stored by 0x1010:01 survive reset communication",
     "7.5.2.34, 7.5.2.13",
 )
 def clients_stored(dut: Dut) -> None:

@@ -32,7 +32,7 @@ _EVENT_MS = 20
 
 @case(
     "STATE-01",
-    "Reset node: one boot-up message, and every parameter as it was before",
+    "Reset node: one boot-up message, and every parameter as before",
     "7.3.2.2.1, 7.2.8.3.3",
 )
 def boot_up(dut: Dut) -> None:
@@ -46,7 +46,7 @@ def boot_up(dut: Dut) -> None:
         other = bytes(byte ^ 0x5A for byte in value)
         request = bytes((0x23 | (4 - len(other)) << 2,)) + mux(index, subindex) + other
         if len(other) <= 4:
-            # A device may refuse these; none may survive the reset.
+            # The device may refuse the write, but no new value may survive the reset.
             changed += dut.sdo.ask(request, f"write to 0x{index:04X}:{subindex:02X}")[0] == 0x60
     if not changed:
         raise Failed("at least one parameter of 0x1000 to 0x1FFF that can be changed", "none")
@@ -62,7 +62,7 @@ def boot_up(dut: Dut) -> None:
 
 
 def _check_state(dut: Dut, state: int, what: str) -> None:
-    """Check the state by heartbeat and by guarding, as far as the device supports them, and SDO."""
+    """Check the state by heartbeat and by guarding, as far as the device supports them."""
     dut.start_heartbeat()
     dut.expect_state(state, what)
     if dut.eds.find(HEARTBEAT) is not None:
@@ -85,7 +85,7 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """Set TPDOs up to be sent every 20 ms in OPERATIONAL; return CAN-ID and length."""
+    """Set TPDOs up to be sent every 20 ms in OPERATIONAL; return their lengths by CAN-ID."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):
@@ -98,7 +98,7 @@ def _timed(dut: Dut) -> dict[int, int]:
 
 
 def _no_pdos(dut: Dut, state: str) -> None:
-    """Check that no TPDO is sent, neither at the event timer nor after SYNC."""
+    """Check that no TPDO is sent, either at the event timer or after SYNC."""
     can_ids = _timed(dut) if state == "PRE-OPERATIONAL" else {}
     sync(dut)
     for can_id in can_ids:
@@ -122,7 +122,7 @@ def operational(dut: Dut) -> None:
     _check_state(dut, 5, "after start")
     dut.sdo.read(0x1000)
     for can_id, length in can_ids.items():
-        frame = dut.bus.expect(can_id, f"a TPDO each {_EVENT_MS} ms in OPERATIONAL")
+        frame = dut.bus.expect(can_id, f"a TPDO every {_EVENT_MS} ms in OPERATIONAL")
         if len(frame.data) != length:
             raise Failed(f"a TPDO of {counted(length, 'byte')}", describe(frame))
     entry = dut.eds.find(_BEHAVIOUR, 1)
@@ -162,12 +162,12 @@ def stopped(dut: Dut) -> None:
     dut.nmt(PRE_OPERATIONAL)
     dut.expect_state(127, "after enter pre-operational")
     if dut.bus.take(dut.sdo.answer_id, QUIET_S) is not None:
-        raise Failed("no late answer to an SDO request of STOPPED", "one")
+        raise Failed("no late answer to an SDO request sent in STOPPED", "one")
     dut.sdo.read(0x1000)
 
 
 def _no_emcy(dut: Dut) -> None:
-    """Send a frame that causes an emergency message in OPERATIONAL: an RPDO without data."""
+    """Check that an RPDO without data, an error in OPERATIONAL, causes no emergency message."""
     dut.bus.pending(dut.emcy_id)
     dut.bus.send(0x200 + dut.node_id)
     dut.bus.expect_silence(dut.emcy_id, "emergency message in STOPPED")

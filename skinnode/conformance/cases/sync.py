@@ -18,7 +18,7 @@ _BUSY = (0x0800_0022,)
 
 
 def consume_only(dut: Dut) -> None:
-    """Disable producer and period, so that the counter can be written."""
+    """Stop the producer and set the period to 0, so that the counter can be written."""
     dut.need(COB_ID)
     dut.sdo.write_integer(COB_ID, 0, SYNC_ID, 4)
     if dut.eds.find(PERIOD) is not None:
@@ -43,10 +43,10 @@ def default(dut: Dut) -> None:
     dut.need(COB_ID)
     cob_id = dut.sdo.integer(COB_ID)
     if cob_id & 0x3FFF_FFFF != SYNC_ID:
-        raise Failed("0x1005:00 = 0x00000080, bit 30 of no account", f"0x{cob_id:08X}")
+        raise Failed("0x1005:00 = 0x00000080, bit 30 ignored", f"0x{cob_id:08X}")
 
 
-@case("SYNC-02", f"The producer sends SYNC each {PERIOD_MS} ms, and stops", "7.2.5, 7.5.2.6")
+@case("SYNC-02", f"The producer sends SYNC every {PERIOD_MS} ms and can be stopped", "7.2.5, 7.5.2.6")
 def producer(dut: Dut) -> None:
     produce(dut)
     frames = [dut.bus.expect(SYNC_ID, "SYNC") for _ in range(12)]
@@ -78,14 +78,14 @@ def count(dut: Dut) -> None:
 
 
 def _synchronous(dut: Dut) -> Pdo:
-    """Return a TPDO that is synchronous by default, else the first that maps something."""
+    """Return a TPDO that is synchronous by default, otherwise the first that maps something."""
     usable = [pdo for pdo in tpdos(dut) if mapped(dut, pdo)]
     if not usable:
         raise NotApplicable("no TPDO maps anything by default")
     return next((pdo for pdo in usable if dut.sdo.integer(pdo.parameter, 2) <= 240), usable[0])
 
 
-@case("SYNC-04", "A consumer takes a communication cycle period of 0", "7.5.2.6")
+@case("SYNC-04", "A consumer accepts a communication cycle period of 0", "7.5.2.6")
 def no_period(dut: Dut) -> None:
     dut.need(PERIOD)
     consume_only(dut)
@@ -105,7 +105,7 @@ def wrong_overflow(dut: Dut) -> None:
         raise Failed(f"0x1019:00 still {before}", str(dut.sdo.integer(OVERFLOW)))
 
 
-@case("SYNC-06", "With an overflow value of 0 the producer sends SYNC without a byte", "7.2.5, 7.5.2.22")
+@case("SYNC-06", "With an overflow value of 0 the producer sends SYNC without data", "7.2.5, 7.5.2.22")
 def no_counter(dut: Dut) -> None:
     dut.need(OVERFLOW)
     consume_only(dut)
@@ -114,7 +114,7 @@ def no_counter(dut: Dut) -> None:
     for _ in range(3):
         frame = dut.bus.expect(SYNC_ID, "SYNC")
         if frame.data:
-            raise Failed("SYNC without a byte", describe(frame))
+            raise Failed("SYNC without data", describe(frame))
 
 
 def _counted(dut: Dut, values: list[int], what: str) -> None:
@@ -124,7 +124,7 @@ def _counted(dut: Dut, values: list[int], what: str) -> None:
             raise Failed(f"SYNC with counter {value} {what}", describe(frame))
 
 
-@case("SYNC-07", "With an overflow value of 5 the producer counts 1 to 5 and again from 1", "7.2.5, 7.5.2.22")
+@case("SYNC-07", "With an overflow value of 5 the producer counts from 1 to 5 repeatedly", "7.2.5, 7.5.2.22")
 def counter(dut: Dut) -> None:
     dut.need(OVERFLOW)
     consume_only(dut)
@@ -134,7 +134,7 @@ def counter(dut: Dut) -> None:
 
 
 @case(
-    "SYNC-08", "Producer and counter, stored by 0x1010:01, begin at 1 after reset node", "7.5.2.13, 7.5.2.22"
+    "SYNC-08", "Producer and counter, stored by 0x1010:01, start at 1 after reset node", "7.5.2.13, 7.5.2.22"
 )
 def counter_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
@@ -147,7 +147,7 @@ def counter_stored(dut: Dut) -> None:
     _counted(dut, [1, 2, 3], "after reset node")
 
 
-@case("SYNC-09", "The overflow value is not written while there is a period", "7.5.2.22")
+@case("SYNC-09", "The overflow value cannot be written while the period is not 0", "7.5.2.22")
 def overflow_in_use(dut: Dut) -> None:
     dut.need(OVERFLOW)
     dut.need(PERIOD)
@@ -157,7 +157,7 @@ def overflow_in_use(dut: Dut) -> None:
     dut.sdo.aborts(request, OVERFLOW, 0, _BUSY, "write to 0x1019:00 with a period in 0x1006")
 
 
-@case("SYNC-10", "The overflow value is stored by 0x1010:01 and kept over reset node", "7.5.2.13, 7.5.2.22")
+@case("SYNC-10", "The overflow value stored by 0x1010:01 survives reset node", "7.5.2.13, 7.5.2.22")
 def overflow_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
     dut.need_storage(STORE, 1)

@@ -22,7 +22,7 @@ _NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"
 
 
 def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
-    """Return an object of 0x2000 to 0x9FFF that took another value, and its value before."""
+    """Change an object from 0x2000 to 0x9FFF; return it and its previous value, None if none can change."""
     for entry in dut.eds.between(0x2000, 0x9FFF):
         if not (entry.readable and entry.writable and entry.data_type in UNSIGNED and entry.size <= 4):
             continue
@@ -81,7 +81,7 @@ def _transition(dut: Dut, command: int, *others: int) -> None:
             dut.bus.send(0x000, bytes((command, dut.node_id % 127 + 1)))
             dut.bus.send(0x000, bytes((command,)))
             dut.bus.send(0x000, bytes((0x7F, dut.node_id)))
-            dut.expect_state(_COMMANDS[other], "after commands that are not for it")
+            dut.expect_state(_COMMANDS[other], "after commands not addressed to it")
             dut.bus.send(0x000, bytes((command, node_id)))
             dut.expect_state(state, f"{name} (node-ID {node_id}) after {_NAMES[other]}")
     dut.nmt(command)

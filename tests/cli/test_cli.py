@@ -71,7 +71,7 @@ def skinnode_version() -> str:
         ("info", "skinnode info: NODE: got nothing, allowed: node-ID, or the name of a patch of --hand"),
         (
             "node",
-            "skinnode node: --source: got nothing, allowed: source of the resistances: MODULE:NAME, or a name",
+            "skinnode node: --source: got nothing, allowed: source of the resistances: MODULE:NAME, or a",
         ),
         ("host hand.toml --seconds -1", "skinnode host: --seconds: got '-1', allowed: a number of seconds"),
         ("node --source simulated --seconds inf", "skinnode node: --seconds: got 'inf', allowed: a number"),

@@ -1,19 +1,19 @@
-"""Every exception this project raises.
+"""Exceptions of this project.
 
 ::
 
     SkinError
-     ├ ConfigError(ValueError)     which key, what it got, what is allowed
-     │  ├ ProfileError             an EDS that contradicts itself or the profile
-     │  └ BusLoadError             bus load needed against available
-     ├ BusError                    a CAN interface that does not open, send or receive
-     │  └ NodeError                one node misbehaves
+     ├ ConfigError(ValueError)     names the key, the value found and the values allowed
+     │  ├ ProfileError             an EDS contradicts itself or the profile
+     │  └ BusLoadError             a plan needs more bus load than available
+     ├ BusError                    a CAN interface fails to open, send or receive
+     │  └ NodeError                a node misbehaves
      │     ├ NodeTimeout(TimeoutError)
-     │     └ SdoAbort              code and text of CiA 301
-     └ CodecError(ValueError)      a payload that is not what its COB-ID promises
+     │     └ SdoAbort              with code and text of CiA 301
+     └ CodecError(ValueError)      a payload does not match its COB-ID
 
-A lost chunk, a stale patch or a solve that did not converge is normal operation: a status and a counter,
-never an exception. An argument of the wrong shape is a plain ``ValueError``.
+Lost chunks, stale patches and solves that do not converge are part of normal operation: they are reported by
+statuses and counters, never by exceptions. An argument of the wrong shape raises a plain ``ValueError``.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from skinnode.text.words import counted
 
 
 class SkinError(Exception):
-    """Root of all errors of this project. ``str(error)`` is one line that a technician can act on."""
+    """Base class of all errors of this project; ``str(error)`` is a one-line message for a technician."""
 
 
 class Shown(str):
-    """A text that an error shows without quotes."""
+    """Text that an error message shows without quotes."""
 
     __slots__ = ()
 
@@ -37,18 +37,18 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""Value that a message shows where a key is missing."""
+"""Value that a message shows for a missing key."""
 
 _MOST_SHOWN: Final = 240
 
 
 class ConfigError(SkinError, ValueError):
-    """A configuration value that cannot be used.
+    """Configuration value that cannot be used.
 
     Args:
         key: Dotted path of the value, such as ``patches[1].node_id``, or name of the option.
-        got: Value found there; None if there is none.
-        allowed: Phrase that says what is accepted.
+        got: Value found; None if there is no value.
+        allowed: Phrase that describes the accepted values.
         where: File, line and column of the value, if known.
     """
 
@@ -62,13 +62,13 @@ class ConfigError(SkinError, ValueError):
 
 
 class ProfileError(ConfigError):
-    """An EDS that contradicts itself or the patch profile."""
+    """EDS that contradicts itself or the patch profile."""
 
 
 class BusLoadError(ConfigError):
-    """A plan that needs more of a bus than it may use. ``needed`` and ``available`` are shares of the bus."""
+    """Plan that exceeds the load limit of a bus; ``needed`` and ``available`` are fractions of the bus."""
 
-    def __init__(  # noqa: PLR0913 - one argument for each part of the message
+    def __init__(  # noqa: PLR0913 - one argument per part of the message
         self, key: str, got: object, allowed: str, *, needed: float, available: float, where: str = ""
     ) -> None:
         self.needed, self.available = needed, available
@@ -76,11 +76,11 @@ class BusLoadError(ConfigError):
 
 
 class BusError(SkinError):
-    """A CAN interface that does not open, send or receive. Raised ``from`` the library's own error."""
+    """CAN interface that fails to open, send or receive; raised ``from`` the error of python-can."""
 
 
 class NodeError(BusError):
-    """One node does not do what it should."""
+    """Node that does not behave as specified."""
 
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id
@@ -88,11 +88,11 @@ class NodeError(BusError):
 
 
 class NodeTimeout(NodeError, TimeoutError):
-    """A node did not answer in time."""
+    """Node that did not answer in time."""
 
 
 class SdoAbort(NodeError):
-    """An SDO transfer was aborted; ``code`` is the abort code of CiA 301 table 22."""
+    """Aborted SDO transfer; ``code`` is the abort code of CiA 301 table 22."""
 
     def __init__(self, node_id: int, code: int, text: str) -> None:
         self.code = code
@@ -100,7 +100,7 @@ class SdoAbort(NodeError):
 
 
 class CodecError(SkinError, ValueError):
-    """A payload that cannot be decoded. ``cob_id`` and ``data`` are those of the frame."""
+    """Payload that cannot be decoded; ``cob_id`` and ``data`` come from the frame."""
 
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed

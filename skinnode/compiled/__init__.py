@@ -1,5 +1,5 @@
-"""Compiled code other than the kernels themselves.
+"""Infrastructure for compiled kernels.
 
-``jit`` decorates kernels, ``kernel_cache`` stores them, ``array_table`` passes many arrays in one argument,
-``simd`` holds vector instructions.
+``jit`` provides the decorators, ``kernel_cache`` stores compiled kernels, ``array_table`` passes many arrays
+in one argument, and ``simd`` provides vector instructions.
 """

@@ -1,8 +1,8 @@
-"""Many arrays and numbers passed to a kernel in one argument, each under its name.
+"""Passes many arrays and numbers to a kernel in one argument, with access by name.
 
-Numba checks and unpacks every argument of every call: for the fifty arrays of a patch that takes 4 µs with
-warm caches and 40 µs with cold ones, as long as solving four wires. An :class:`ArrayTable` is one array of
-addresses and shapes. A subclass declares the fields once; both sides are derived from that declaration:
+Numba checks and unpacks every argument of every call. For the fifty arrays of a patch this takes 4 µs with
+warm caches and 40 µs with cold caches, as long as solving four wires. An :class:`ArrayTable` is one array of
+addresses and shapes. A subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -15,9 +15,9 @@ addresses and shapes. A subclass declares the fields once; both sides are derive
 
     kernel(Scan(ohm=np.zeros((10, 30)), limit=1.0).table)
 
-Python packs by name, kernels read by name, so the order of a declaration means nothing. The constructor
-checks element type, number of axes, contiguity, and that axes of one name have one length. The first entry of
-a table is a digest of its declaration; a kernel that is passed another table raises TypeError.
+Python packs and kernels read by name, so the order of the declaration does not matter. The constructor
+checks element type, number of axes, contiguity, and that axes with the same name have the same length. The
+first entry of a table is a digest of its declaration; a kernel that receives another table raises TypeError.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from numba.extending import register_model as typed_register_model
 from numba.np import arrayobj as typed_arrayobj
 from numpy.typing import NDArray
 
-cgutils: Any = typed_cgutils  # numba's own types are in the way here
+cgutils: Any = typed_cgutils  # numba's own type hints do not fit here
 errors: Any = typed_errors
 imputils: Any = typed_imputils
 types: Any = typed_types
@@ -59,7 +59,7 @@ _T = TypeVar("_T", bound="ArrayTable")
 
 @dataclass(frozen=True)
 class _Field:
-    """One array, or one number where ``axes`` is None."""
+    """One array, or one number if ``axes`` is None."""
 
     name: str
     dtype: str
@@ -71,7 +71,7 @@ class _Field:
         return kind if self.axes is None else types.Array(kind, len(self.axes), "C", readonly=self.readonly)
 
     def check(self, table: str, array: Any, lengths: dict[str, int]) -> None:
-        """Raise TypeError unless a kernel can use ``array``; ``lengths`` are those of the axes so far."""
+        """Raise TypeError unless a kernel can use ``array``; ``lengths`` collects the axis lengths."""
         assert self.axes is not None
         if not isinstance(array, np.ndarray):
             raise TypeError(f"{table}.{self.name}: got {type(array).__name__}, {self._wanted()}")
@@ -97,7 +97,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Group:
-    """The fields of a NamedTuple, which kernels read as that tuple."""
+    """Fields of a NamedTuple, which kernels read as that tuple."""
 
     name: str
     made_of: type
@@ -131,18 +131,18 @@ def _declared(table: str, hints: dict[str, Any]) -> tuple[_Field | _Group, ...]:
 
 
 class ArrayTable:
-    """Named arrays and numbers for kernels: subclass it and declare the fields as annotations.
+    """Base class for tables of named arrays and numbers; subclasses declare the fields as annotations.
 
     Args:
-        values: every declared field by its name. Arrays are kept, not copied: write to them in place.
+        values: Every declared field by name. Arrays are not copied; write to them in place.
 
     Raises TypeError if a field is missing or unknown, or if an array has another element type, number of
     axes or length than declared, is not contiguous or cannot be written.
     """
 
     table: NDArray[np.int64]
-    """(1 + fields, 4) int64: a digest of the declaration, then address and shape of each field. Kernels take
-    this."""
+    """(1 + fields, 4) int64 argument for kernels: a digest of the declaration, then the address and shape of
+    each field."""
     _fields: ClassVar[tuple[_Field | _Group, ...]] = ()
     _names: ClassVar[frozenset[str]] = frozenset()
     _rows: ClassVar[dict[str, int]] = {}
@@ -176,12 +176,12 @@ class ArrayTable:
                     _enter(name, inner, getattr(value, inner.name), table[row + i], lengths)
             else:
                 _enter(name, field, value, table[row], lengths)
-        vars(self).update(values, table=table)  # arrays live as long as their addresses
+        vars(self).update(values, table=table)  # keeps the arrays alive
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self._names and value is not getattr(self, name):  # x += 1 sets x to itself
             raise AttributeError(
-                f"{type(self).__name__}.{name}: kernels have its address, write to it in place"
+                f"{type(self).__name__}.{name}: kernels use its address; write to it in place"
             )
         super().__setattr__(name, value)
 
@@ -197,8 +197,8 @@ def _enter(table: str, field: _Field, value: Any, row: NDArray[np.int64], length
     row[1 : 1 + value.ndim] = value.shape
 
 
-class _ViewType(types.Type):  # type: ignore[misc]  # numba has no types for its types
-    """An :class:`ArrayTable` in compiled code: the address of its table."""
+class _ViewType(types.Type):  # type: ignore[misc]  # numba has no type hints
+    """Numba type of an :class:`ArrayTable`, represented by the address of its table."""
 
     def __init__(self, made_of: type[ArrayTable]) -> None:
         self.made_of = made_of
@@ -215,14 +215,14 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Make the function by which kernels read a table of ``made_of``: it returns an object with its fields.
+    """Return a function for kernels that converts a table of ``made_of`` to an object with its fields.
 
-    The function is known to compiled code only. A field is read from the table wherever its name stands, so
-    read it before a loop. In kernels bool arrays are uint8. Raises TypeError, in the kernel, if the table was
-    not made by this declaration.
+    Only compiled code can call the function. Each use of a field name reads the table again, so read fields
+    before loops. In kernels, bool arrays are uint8. Raises TypeError in the kernel if the table has another
+    declaration.
     """
     view, digest = _ViewType(made_of), made_of._digest
-    message = f"table: got another one, must be the table of a {made_of.__name__}"
+    message = f"table: got a table of another class, must be the table of a {made_of.__name__}"
 
     @intrinsic  # type: ignore[untyped-decorator]
     def read(_typing: Any, table: Any) -> Any:

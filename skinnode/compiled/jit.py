@@ -1,14 +1,14 @@
 """Compiles kernels: ``@njit`` with a cache that cannot go stale.
 
-A file cache notices an edit to the file of a function, but not to the functions it calls in other files. So
-the cache (:mod:`skinnode.compiled.kernel_cache`) is in a folder named after a digest of every file that holds
-kernels: an edit to any of them recompiles all of them. The folder is below ``$SKINNODE_CACHE_DIR``, the
-user's cache folder or the system's temporary folder, the first that is writable; if none is, nothing is
-cached.
+A plain file cache notices edits to the file of a function, but not to functions that it calls in other files.
+Therefore the folder of the cache (:mod:`skinnode.compiled.kernel_cache`) is named after a digest of every
+file that contains kernels: an edit to any of these files recompiles all kernels. The folder is created below
+``$SKINNODE_CACHE_DIR``, the user's cache folder or the system's temporary folder, whichever is writable
+first. If no folder is writable, nothing is cached.
 
-``error_model="numpy"`` because a division by zero must become inf (a status), not an exception; ``nogil``
-because a thread pool solves several patches at a time. ``fastmath`` stays off: results must not depend on
-how a compiler reorders sums.
+``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of an exception, and
+``nogil`` lets a thread pool solve several patches at a time. ``fastmath`` stays off because results must not
+depend on how a compiler reorders sums.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numba as typed_numba
 
 from skinnode.compiled.kernel_cache import SUFFIX, KernelCache
 
-numba: Any = typed_numba  # its type hints leave out configuration and options that are used here
+numba: Any = typed_numba  # its type hints lack configuration and options used here
 _F = TypeVar("_F", bound=Callable[..., Any])
 _KERNEL_FILES = (
     "compiled/*.py",
@@ -41,7 +41,7 @@ _KERNEL_FILES = (
 def _writable(folder: Path) -> bool:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():  # a shared temporary folder must not feed us code
+        if folder.stat().st_uid != os.getuid():  # never load code from another user's folder
             return False
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -51,7 +51,7 @@ def _writable(folder: Path) -> bool:
 
 @functools.cache
 def cache_dir() -> Path | None:
-    """Return the folder of the compiled kernels, or None if no folder can be written."""
+    """Return the folder of the compiled kernels, or None if no folder is writable."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for pattern in _KERNEL_FILES:
@@ -60,9 +60,9 @@ def cache_dir() -> Path | None:
     leaf = f"numba-{digest.hexdigest()[:16]}"
     roots = [os.environ.get("SKINNODE_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME")]
     candidates = [Path(root) / "skinnode" / leaf for root in roots if root]
-    with contextlib.suppress(RuntimeError):  # there may be no home directory
+    with contextlib.suppress(RuntimeError):  # no home directory
         candidates.append(Path.home() / ".cache" / "skinnode" / leaf)
-    with contextlib.suppress(OSError):  # no temporary folder either
+    with contextlib.suppress(OSError):  # no temporary folder
         candidates.append(Path(tempfile.gettempdir()) / f"skinnode-{os.getuid()}" / leaf)
     return next((folder for folder in candidates if _writable(folder)), None)
 
@@ -70,7 +70,7 @@ def cache_dir() -> Path | None:
 def is_cold(kernel: str = "solve_patch") -> bool:
     """Return whether ``kernel`` still has to be compiled.
 
-    Commands ask so that they can say why they take longer.
+    Commands use this to explain a slow start.
     """
     folder = cache_dir()
     return folder is None or not any(folder.glob(f"*.{kernel}-*{SUFFIX}"))
@@ -80,18 +80,18 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def njit_part(function: _F) -> _F:
-    """Compile ``function`` for other kernels only: Python cannot call it, and its code is cached with theirs.
+    """Compile ``function`` for calls from other kernels only; its code is cached with that of its callers.
 
-    Building no entry for Python saves a fifth of the compile time.
+    Python cannot call it. Omitting the Python entry point saves a fifth of the compile time.
     """
     compiled: _F = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
     return compiled
 
 
 def njit_body(function: _F) -> _F:
-    """Copy ``function`` into the one kernel that calls it, before anything is compiled.
+    """Inline ``function`` into the only kernel that calls it, before compilation.
 
-    Compiling both and linking one into the other takes half as long again.
+    Compiling and linking both separately takes 50 % longer.
     """
     compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
     return compiled
@@ -105,8 +105,8 @@ def njit(function: _F) -> _F:
 def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but keep the interpreter lock while it runs.
 
-    It is for kernels that take a microsecond: releasing the lock would let another thread take it for longer
-    than the rest of the field needs.
+    Use this for kernels that take about a microsecond: if the lock were released, another thread could hold
+    it for longer than the rest of the field takes.
     """
     return _kept(function, nogil=False)
 
@@ -114,6 +114,6 @@ def njit_brief(function: _F) -> _F:
 def _kept(function: _F, *, nogil: bool) -> _F:
     compiled: _F = numba.njit(no_cfunc_wrapper=True, **_OPTIONS | {"nogil": nogil})(function)
     folder = cache_dir()
-    if folder is not None and compiled is not function:  # with NUMBA_DISABLE_JIT it is not compiled
+    if folder is not None and compiled is not function:  # with NUMBA_DISABLE_JIT nothing is compiled
         compiled._cache = KernelCache(function, folder)  # type: ignore[attr-defined]
     return compiled

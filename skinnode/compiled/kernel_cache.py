@@ -1,13 +1,15 @@
-"""Compiled kernels in files that are checked before they are used.
+"""File cache of compiled kernels that verifies each file before use.
 
-Numba's own file cache unpickles any file it finds: a truncated file raises in the first call of a kernel, on
-every run, and machine code with a flipped bit is executed. All signatures of a function share one index, so
-two processes that compile different signatures at once can file the code of one under the name of the other.
+Numba's own file cache unpickles any file it finds: a truncated file raises an exception in the first call of
+a kernel, on every run, and machine code with a flipped bit is executed. All signatures of a function share
+one index, so two processes that compile different signatures at once can store the code of one under the name
+of the other.
 
-Here each compiled signature has its own file: a magic number, the SHA-256 of the payload, the payload. The
-name contains a digest of everything that the code depends on, so there is no index. Files are written under a
-temporary name and renamed. A file that fails its check is removed, the kernel is compiled again, and one line
-is logged; one line is also logged if a kernel cannot be cached. No error of the cache reaches the caller.
+Here each compiled signature has its own file, with a magic number, the SHA-256 of the payload, and the
+payload. The name contains a digest of everything that the code depends on, so no index is needed. Files are
+written under a temporary name and renamed. If a file fails verification, it is removed, the kernel is
+recompiled, and one line is logged. One line is also logged if a kernel cannot be cached. Errors of the cache
+never reach the caller.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from numba.core import compiler, serialize
 
 from skinnode.files.whole_file import replace_file
 
-_numba_compiler: Any = compiler  # neither has types
+_numba_compiler: Any = compiler  # neither has type hints
 _numba_serialize: Any = serialize
 _MAGIC: Final = b"skinnode kernel 1\n"
 _HEAD_BYTES: Final = len(_MAGIC) + hashlib.sha256().digest_size
@@ -44,7 +46,7 @@ _reported: set[str] = set()
 class KernelCache:
     """Cache of the compiled signatures of a function.
 
-    It replaces ``numba.core.caching.FunctionCache`` as the ``_cache`` of a dispatcher.
+    Replaces ``numba.core.caching.FunctionCache`` as the ``_cache`` of a dispatcher.
 
     Args:
         function: The Python function.
@@ -64,7 +66,7 @@ class KernelCache:
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Load the compiled ``signature``. Return None if there is no usable file."""
+        """Return the compiled code of ``signature``, None if there is no usable file."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
@@ -81,14 +83,14 @@ class KernelCache:
                 if kept_signature == signature
                 else None
             )
-        except Exception as error:  # undamaged, but from another installation
+        except Exception as error:  # intact, but from another installation
             if _remove(path):
                 _report(self._folder, f"a file could not be loaded ({error!r:.200}); removed, recompiling")
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write ``compiled`` to the cache if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # as in numba's own cache
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # as numba's own cache does
             return
         path = self._path(signature, compiled.codegen)
         try:
@@ -121,13 +123,13 @@ def _file_digest(file: str) -> str:
 
 
 def _read(path: Path) -> bytes:
-    """Read the payload of a file. Raises OSError if it cannot be read, and ValueError if it is damaged."""
+    """Return the payload of a file. Raises OSError if the file is unreadable, ValueError if damaged."""
     if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would wait for its writer
         raise ValueError("not a file")
     data = path.read_bytes()
     payload = data[_HEAD_BYTES:]
     if data[:_HEAD_BYTES] != _MAGIC + hashlib.sha256(payload).digest():
-        raise ValueError("not a kernel, or a damaged one")
+        raise ValueError("not a kernel file, or damaged")
     return payload
 
 
@@ -136,9 +138,9 @@ def _write(path: Path, payload: bytes) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Remove all damaged files of ``folder`` together, so that one line reports them.
+    """Remove all damaged files of ``folder`` at once, so that one line reports them.
 
-    If several processes find the damage, the first removes the files and reports them.
+    If several processes find the damage, the first process removes and reports the files.
     """
     with _locked(folder):
         files = list(folder.glob(f"*{SUFFIX}"))
@@ -163,9 +165,9 @@ def _is_damaged(file: Path) -> bool:
 def _remove(path: Path) -> bool:
     try:
         path.unlink()
-    except FileNotFoundError:  # another process was first
+    except FileNotFoundError:  # another process removed it
         return False
-    except OSError:  # a folder, perhaps
+    except OSError:  # possibly a folder
         shutil.rmtree(path, ignore_errors=True)
         return not path.exists()
     return True
@@ -187,7 +189,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log ``what`` once for each process and folder: forty kernels on a full disk are one event."""
+    """Log ``what`` once per process and folder, so that forty kernels on a full disk log one line."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

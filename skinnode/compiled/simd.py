@@ -1,11 +1,12 @@
-"""Vectors of doubles for kernels, written out where the compiler's own vectors are not good enough.
+"""Explicit vectors of doubles for kernels in which automatic vectorisation is not good enough.
 
-LLVM prefers 256-bit vectors where 512-bit vectors are twice as fast, gives up if it cannot prove that rows do
-not overlap, and may keep sums in memory. A kernel that says ``load``, ``fma``, ``store`` gets exactly those
-instructions, and each lane holds its own sum, in the order written: the result is the same for any number of
-threads and any split of the columns. Processors with narrower vectors run the same code in pieces.
+LLVM prefers 256-bit vectors where 512-bit vectors are twice as fast, does not vectorise unless it can prove
+that rows do not overlap, and may keep sums in memory. A kernel that calls ``load``, ``fma`` and ``store``
+gets exactly these instructions, and each lane accumulates its own sum in the order written. The result is
+therefore the same for any number of threads and any split of the columns. On processors with narrower
+vectors, each operation is split.
 
-Lanes behave like numbers under + − *; a double in such an expression stands for a vector of it.
+Lanes support + − *; a double in such an expression is broadcast to a vector.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from numba.core.typing import templates as typed_templates
 
 from skinnode.compiled.jit import numba
 
-extending: Any = typed_extending  # numba's own types are in the way here
+extending: Any = typed_extending  # numba's own type hints do not fit here
 types: Any = typed_types
 templates: Any = typed_templates
 signature: Any = templates.signature
@@ -36,13 +37,13 @@ def _lanes() -> int:
         return 8 if "+avx512f" in (chosen or "") else 4
     try:
         return 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4
-    except RuntimeError:  # not known on this platform
+    except RuntimeError:  # unknown on this platform
         return 4
 
 
 LANES: Final = _lanes()
 Lanes = Any
-"""Type of LANES doubles; it exists in compiled code only."""
+"""Type of a vector of LANES doubles; exists in compiled code only."""
 
 _DOUBLE = ir.DoubleType()
 _INT = ir.IntType(64)
@@ -50,7 +51,7 @@ _VECTOR = ir.VectorType(_DOUBLE, LANES)
 _BITS = ir.VectorType(_INT, LANES)
 
 
-class _LanesType(types.Type):  # type: ignore[misc]  # numba has no types for its types
+class _LanesType(types.Type):  # type: ignore[misc]  # numba has no type hints
     def __init__(self) -> None:
         super().__init__(name=f"float64x{LANES}")
 
@@ -69,7 +70,7 @@ def _constant(vector: Any, value: Any) -> Any:
 
 
 def _splat(builder: Any, value: Any) -> Any:
-    """Return ``value`` as a vector: a double in every lane, a vector unchanged."""
+    """Return ``value`` as a vector; a double is copied to every lane, a vector is unchanged."""
     if value.type == _VECTOR:
         return value
     seed = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -96,7 +97,7 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 
 
 def _first(builder: Any, count: Any) -> Any:
-    """Mask of the first ``count`` lanes."""
+    """Return a mask of the first ``count`` lanes."""
     undefined = ir.Constant(_BITS, ir.Undefined)
     seed = builder.insert_element(undefined, count, ir.Constant(ir.IntType(32), 0))
     every = builder.shuffle_vector(seed, undefined, ir.Constant(ir.VectorType(ir.IntType(32), LANES), None))
@@ -127,9 +128,9 @@ _binary(operator.mul, operator.imul, "fmul")
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
-    """Load LANES elements of a row from ``start`` on.
+    """Load LANES elements of a row, starting at ``start``.
 
-    Only the first ``count`` elements are read; the other lanes are 0.
+    Only the first ``count`` elements are read; the remaining lanes are 0.
 
     Args:
         row: Contiguous row of float64.
@@ -149,13 +150,13 @@ def load(_typing: Any, row: Any, start: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def store(_typing: Any, row: Any, start: Any, count: Any, value: Any) -> Any:
-    """Store the first ``count`` lanes of ``value`` into a row from ``start`` on.
+    """Store the first ``count`` lanes of ``value`` in a row, starting at ``start``.
 
     Args:
         row: Contiguous row of float64.
         start: Index of the first element.
         count: Number of lanes to store.
-        value: The lanes.
+        value: Vector to store.
     """
     _require_row(row)
 
@@ -181,7 +182,7 @@ def splat(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return a·b + c, rounded once where the processor can."""
+    """Return a·b + c, rounded once if the processor supports it."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         inputs = [_splat(builder, argument) for argument in arguments]
@@ -202,7 +203,7 @@ def drop(_typing: Any, value: Any, count: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def total(_typing: Any, value: Any) -> Any:
-    """Return the sum of the lanes, halves first."""
+    """Return the sum of the lanes, adding halves pairwise."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         value, width = arguments[0], LANES
@@ -218,7 +219,7 @@ def total(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def rough_inverse_root(_typing: Any, value: Any) -> Any:
-    """Return 1 / √value to 3.5 %, from the bits of ``value``; inf below the smallest normal number.
+    """Return 1 / √value to within 3.5 % by bit manipulation; inf below the smallest normal number.
 
     Source: Lomont, Fast inverse square root, 2003, for doubles.
     """

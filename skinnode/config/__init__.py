@@ -1,4 +1,4 @@
-"""The options of a hand, read from ``hand.toml``: one module for each table of the file.
+"""Options of a hand, read from ``hand.toml``, with one module per table of the file.
 
 ::
 
@@ -6,10 +6,10 @@
          -> HandConfig, or explain (one-line errors)
 
 :func:`load_hand` reads a file, :func:`parse_hand` validates a table in memory. Both raise
-:class:`~skinnode.errors.ConfigError` with one line: file, line and column, the dotted key, the value found
-and the values allowed. Types are strict, as TOML is typed: ``node_id = "3"`` is an error, not a 3.
+:class:`~skinnode.errors.ConfigError` with a one-line message: file, line and column, dotted key, value found
+and values allowed. Types are strict because TOML is typed: ``node_id = "3"`` is an error, not a 3.
 
-The suffix of a key is its unit; a key without a unit is a count, a ratio or a name.
+The suffix of a key gives its unit; a key without a unit is a count, a ratio or a name.
 """
 
 from skinnode.config.buses import (

@@ -1,7 +1,7 @@
 """Explains validation errors of pydantic in one line: key, value found, values allowed, position.
 
-Positions are the reason that these lines are written here: pydantic knows the key but not the line of the
-file, and its own text names Python types ("Input should be a valid integer"), not the range allowed in TOML.
+Pydantic knows the key but not its line in the file, and its messages name Python types ("Input should be a
+valid integer") instead of the range allowed in TOML.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LONGEST_SHOWN: Final = 60
 def first_error(
     error: ValidationError, table: type[BaseModel], where: Callable[[KeyPath], str]
 ) -> ConfigError:
-    """Return the error to report among pydantic's errors about a table.
+    """Return the error to report from pydantic's errors about a table.
 
     Args:
         error: The errors.
@@ -32,11 +32,11 @@ def first_error(
         where: Function that returns the position of a key in its file.
     """
     found = error.errors()
-    # A misspelt key that is required is missing as well; its misspelling says more.
+    # A misspelt required key is also reported as missing; the misspelling is more informative.
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, ConfigError):  # from a check of ours that knows the rest of its key
+    if isinstance(cause, ConfigError):  # from a check of this package, with the rest of the key
         path = (*location, *key_path(cause.key))
         return ConfigError(dotted(path), cause.got, cause.allowed, where=where(path))
     keys, allowed = _place(location, table)
@@ -45,7 +45,7 @@ def first_error(
         close = difflib.get_close_matches(unknown, keys, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         listed = f"a key of this table{hint}: {', '.join(keys)}"
-        return ConfigError(dotted(location), Shown("a key unknown here"), listed, where=where(location))
+        return ConfigError(dotted(location), Shown("an unknown key"), listed, where=where(location))
     if kind == "value_error" and cause is not None:
         allowed = str(cause)
     got = NOTHING if kind == "missing" else short(first["input"])
@@ -55,13 +55,13 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``, or the first 60 characters of its text if it is longer, for one line."""
+    """Return ``value``, or the first 60 characters of its text if it is longer, to fit on one line."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 
 
 def dotted(path: KeyPath) -> str:
-    """Return a path as text: ``("patches", 1, "node_id")`` is ``patches[1].node_id``."""
+    """Return a path as text: ``("patches", 1, "node_id")`` becomes ``patches[1].node_id``."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
     return "".join(parts).removeprefix(".")
 
@@ -90,19 +90,19 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
 
 
 def allowed_in(field: FieldInfo) -> str | None:
-    """Return the values allowed at a key, in words; None if its type says enough."""
+    """Return a description of the values allowed at a key; None if its type is sufficient."""
     marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
     return next(iter([*marks, *_marks_in(field.annotation)]), None)
 
 
 def tables_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models of the tables that a key may hold, alone or in a list."""
+    """Return the models of the tables that a key may hold, directly or in a list."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [table for part in get_args(annotation) for table in tables_in(part)]
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Return the marks below a union, as in ``Stiffness | None``."""
+    """Return the marks inside a union such as ``Stiffness | None``."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]

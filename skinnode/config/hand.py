@@ -1,4 +1,4 @@
-"""The whole hand: ``hand.toml`` as frozen, validated options."""
+"""Model of the whole hand: ``hand.toml`` as frozen, validated options."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from skinnode.config.table import Allowed, Name, Table
 from skinnode.config.toml_text import Document, read_toml
 from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.model.layout_file import impossible
+from skinnode.text.words import counted
 
 MOST_BUSES: Final = 64
-"""Maximum buses of a hand, far more than one machine has interfaces."""
+"""Maximum number of buses of a hand, far above the number of interfaces of a machine."""
 
 
 class HandConfig(Table):
-    """A hand: its buses, its patches and what the host does with them.
+    """Hand with its buses and patches, and the settings of the host.
 
-    A name, node-ID or serial number used twice, an unknown bus, an impossible geometry or a role that a bus
-    cannot have is a ConfigError, which pydantic wraps in its ValidationError; :func:`parse_hand` unwraps it.
-    Whether the plan fits its buses is checked by :func:`skinnode.bus_load.plan.check_plan`.
+    A duplicate name, node-ID or serial number, an unknown bus, an impossible geometry or a conflict with the
+    role of a bus raises a ConfigError, which pydantic wraps in its ValidationError; :func:`parse_hand`
+    unwraps it. :func:`skinnode.bus_load.plan.check_plan` checks whether the plan fits its buses.
     """
 
     name: Name = "hand"
@@ -40,7 +41,7 @@ class HandConfig(Table):
     patches: Annotated[
         tuple[PatchConfig, ...], Field(min_length=1, strict=False), Allowed("at least one [[patches]]")
     ]
-    """Patches of skin of the hand."""
+    """Skin patches of the hand."""
     sync: SyncConfig = SyncConfig()
     bring_up: BringUpConfig = BringUpConfig()
     solver: SolverConfig = SolverConfig()
@@ -49,7 +50,7 @@ class HandConfig(Table):
     _read_of: Document = PrivateAttr(Document("", {}, {}))
 
     def bus(self, name: str) -> BusConfig:
-        """Return the bus of that name.
+        """Return the bus with that name.
 
         Raises:
             KeyError: The hand has no such bus.
@@ -57,7 +58,7 @@ class HandConfig(Table):
         return {bus.name: bus for bus in self.buses}[name]
 
     def patch(self, name: str) -> PatchConfig:
-        """Return the patch of that name.
+        """Return the patch with that name.
 
         Raises:
             KeyError: The hand has no such patch.
@@ -65,7 +66,7 @@ class HandConfig(Table):
         return {patch.name: patch for patch in self.patches}[name]
 
     def patches_on(self, bus: str) -> tuple[PatchConfig, ...]:
-        """Return the patches on the bus of that name, in the order of the file."""
+        """Return the patches on the bus with that name, in file order."""
         return tuple(patch for patch in self.patches if patch.bus == bus)
 
     def where(self, key: str) -> str:
@@ -73,14 +74,14 @@ class HandConfig(Table):
         return self._read_of.where(key_path(key))
 
     def on(self, interface: str | None = None, channel: str | None = None) -> HandConfig:
-        """Return the same hand on another interface or channel.
+        """Return a copy of the hand that uses another interface or channel.
 
         Args:
-            interface: python-can interface in place of the file's, for all buses.
-            channel: Channel in place of the file's.
+            interface: python-can interface that replaces that of the file, for all buses.
+            channel: Channel that replaces that of the file.
 
         Raises:
-            ConfigError: A channel is given for a hand of several buses, or a name is empty.
+            ConfigError: A channel is given for a hand with several buses, or a name is empty.
         """
         if channel is not None and len(self.buses) > 1:
             raise ConfigError(
@@ -103,13 +104,13 @@ class HandConfig(Table):
         if isinstance(table, Mapping):
             buses, patches = table.get("buses"), table.get("patches")
             if isinstance(buses, list) and len(buses) > MOST_BUSES:
-                raise ConfigError("buses", Shown(f"{len(buses)} of them"), f"at most {MOST_BUSES}")
+                raise ConfigError("buses", Shown(f"{len(buses)} buses"), f"at most {MOST_BUSES}")
             if isinstance(patches, list) and isinstance(buses, list):
                 most = MAX_NODE_ID * len(buses)
                 if len(patches) > most > 0:
-                    on = "it has" if len(buses) == 1 else f"{len(buses)} have"
-                    allowed = f"at most {most}: a bus has node-IDs 1 to {MAX_NODE_ID}, and {on} no more"
-                    raise ConfigError("patches", Shown(f"{len(patches)} of them"), allowed)
+                    on = counted(len(buses), "bus", "buses")
+                    allowed = f"at most {most}: node-IDs 1 to {MAX_NODE_ID} on {on}"
+                    raise ConfigError("patches", Shown(f"{len(patches)} patches"), allowed)
         return table
 
     @model_validator(mode="after")
@@ -129,17 +130,15 @@ class HandConfig(Table):
         return self
 
     def _check_roles(self) -> None:
-        """Check what a bus in its role cannot give its host or its patches."""
+        """Check settings that conflict with the role of a bus."""
         overflow, guest = self.sync.counter_overflow, all(bus.role == "guest" for bus in self.buses)
         if overflow == 1 or (overflow == 0 and not guest):
-            allowed = "an integer from 2 to 240; 0 where all buses are a guest's"
+            allowed = "an integer from 2 to 240; or 0 if the host is a guest on all buses"
             raise ConfigError("sync.counter_overflow", overflow, allowed)
         masters = [bus for bus in self.buses if bus.role == "master"]
         if (len(masters) - 1) * self.sync.stagger_ms >= self.sync.period_ms:
             most = self.sync.period_ms / (len(masters) - 1)
-            allowed = (
-                f"below {most:g}: the SYNC of the last of {len(masters)} buses must be out before the next"
-            )
+            allowed = f"below {most:g}: all {len(masters)} buses must send their SYNC within one period"
             raise ConfigError("sync.stagger_ms", self.sync.stagger_ms, allowed)
         for i, bus in enumerate(self.buses):
             node_ids = [patch.node_id for patch in self.patches_on(bus.name)]
@@ -153,7 +152,7 @@ class HandConfig(Table):
         self._check_guests()
 
     def _check_guests(self) -> None:
-        """Check that the file holds what a host that is a guest cannot ask of the nodes."""
+        """Check that the file contains the data that a guest cannot request from the nodes."""
         for i, patch in enumerate(self.patches):
             bus = self.bus(patch.bus)
             if bus.role == "master" or bus.guest_sends == "sdo":
@@ -166,7 +165,7 @@ class HandConfig(Table):
                 raise ConfigError(f"patches[{i}].layout.coordinates", "node", allowed)
         guests = [bus.name for bus in self.buses if bus.role == "guest"]
         if guests and "period_ms" not in self.sync.model_fields_set:
-            allowed = f"that of the SYNC on {guests[0]}, where the host is a guest"
+            allowed = f"the period of the SYNC on {guests[0]}, where the host is a guest"
             raise ConfigError("sync.period_ms", NOTHING, allowed)
 
 
@@ -178,7 +177,8 @@ def load_hand(path: Path | str) -> HandConfig:
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, a wrong type,
-            a value out of range, or fails a check of :class:`HandConfig`. One line, with line and column.
+            a value out of range, or fails a check of :class:`HandConfig`. The message is one line with line
+            and column.
     """
     path = Path(path)
     return _parse(read_toml(path, "hand file"), path.parent)
@@ -189,8 +189,8 @@ def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: s
 
     Args:
         table: The table, as tomllib reads it.
-        folder: Folder where relative paths start. Default: the working directory.
-        where: File to name in errors.
+        folder: Base folder of relative paths; default the working directory.
+        where: File name for errors.
 
     Raises:
         ConfigError: As :func:`load_hand`.
@@ -208,7 +208,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raise ConfigError for an impossible geometry, or if the wires do not have one gain each."""
+    """Raise ConfigError if the geometry is impossible or the number of gains differs from that of wires."""
     try:
         layout = patch.layout.build()
     except ValueError as error:
@@ -217,7 +217,7 @@ def _check_geometry(key: str, patch: PatchConfig) -> None:
         raise impossible(error, f"{key}.layout") from None
     gains, wires = patch.calibration.upper_gain, layout.shape[0]
     if gains is not None and len(gains) != wires:
-        allowed = f"{wires} numbers, one for each upper wire"
+        allowed = f"{wires} numbers, one per upper wire"
         raise ConfigError(f"{key}.calibration.upper_gain", short(list(gains)), allowed)
 
 

@@ -44,11 +44,11 @@ _Gain = Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False), Allowed("a n
 
 
 class LayoutConfig(Table):
-    """Geometry of a patch: the arguments of :meth:`skinnode.PatchLayout.preset`, or a file."""
+    """Geometry of a patch, from a preset (:meth:`skinnode.PatchLayout.preset`) or a file."""
 
     file: Annotated[Path | None, Field(strict=False), Allowed("the path of a layout file")] = None
-    """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML with the other keys of
-    this table, which are then not allowed here. Relative to the hand file."""
+    """NPZ or TOML file with the electrodes (``upper_m``, ``lower_m``, metres), or TOML file with the other
+    keys of this table, which are then not allowed here. The path is relative to the hand file."""
     preset: Annotated[Preset, one_of(Preset)] = "staggered"
     """Named arrangement of the electrodes."""
     pitch_m: Length = 4e-3
@@ -56,18 +56,18 @@ class LayoutConfig(Table):
     height_m: Length = 2e-3
     """Height of the upper electrodes above the lower ones, metres."""
     upper_wires: Count = 10
-    """Upper wires U, the rows of a frame."""
+    """Number of upper wires, U, which are the rows of a frame."""
     upper_electrodes: Count = 10
-    """Electrodes of an upper wire, N."""
+    """Number of electrodes per upper wire, N."""
     lower_wires: Count | None = None
-    """Lower wires K, the columns of a frame; None is 3 for each electrode of an upper wire."""
+    """Number of lower wires, K, which are the columns of a frame; None: 3 N."""
     lower_electrodes: Count | None = None
-    """Electrodes of a lower wire, M; None is one for each upper wire."""
+    """Number of electrodes per lower wire, M; None: U."""
     resistivity_ohm_per_m: _Resistivity = 1e7
-    """Resistance of the rubber for each metre between two electrodes."""
+    """Resistance of the rubber per metre between two electrodes."""
     coordinates: Annotated[Coordinates, one_of(Coordinates)] = "preset"
     """``node``: the host reads the positions of the electrodes from the patch (0x2300). Plans and simulations
-    use preset or file, whose numbers of wires and electrodes must be right."""
+    still use the preset or file, so its numbers of wires and electrodes must be correct."""
 
     @field_validator("file")
     @classmethod
@@ -78,7 +78,7 @@ class LayoutConfig(Table):
     def _file_or_keys(self) -> LayoutConfig:
         if self.file is not None:
             for key in sorted(self.model_fields_set - {"file", "coordinates"}):
-                raise ConfigError(key, getattr(self, key), "only without layout.file, which sets it")
+                raise ConfigError(key, getattr(self, key), "only without layout.file")
         return self
 
     def build(self) -> PatchLayout:
@@ -104,9 +104,9 @@ class LayoutConfig(Table):
 
 @functools.lru_cache(maxsize=256)
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
-    """Return a cached layout.
+    """Return a layout from a cache.
 
-    The patches of a hand are mostly alike and are built at every check; layouts are immutable.
+    The patches of a hand are mostly alike and are built in every check; layouts are immutable.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
@@ -152,11 +152,11 @@ class PoseConfig(Table):
 class CalibrationConfig(Table):
     """Measured properties of this patch.
 
-    Its resistances at rest are in ``baseline``, its resistivity is in the layout.
+    Resistances at rest are in ``baseline``, the resistivity is in the layout.
     """
 
     stiffness_n_per_m: Stiffness | None = None
-    """Stiffness of the rubber under one electrode, in place of ``solver.stiffness_n_per_m``."""
+    """Stiffness of the rubber under one electrode; overrides ``solver.stiffness_n_per_m``."""
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
     ] = _RUBBER.young_pa
@@ -166,43 +166,43 @@ class CalibrationConfig(Table):
     )
     """Poisson's ratio of the rubber."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """One factor for each upper wire that restores its resistances to those at the time of the baseline."""
+    """One factor per upper wire that restores its resistances to their values at the time of the baseline."""
 
     @property
     def rubber(self) -> Rubber:
-        """The rubber, for the posterior."""
+        """Rubber parameters for the posterior."""
         return Rubber(self.young_pa, self.poisson)
 
 
 class PatchConfig(Table):
-    """One patch of skin: its identity on the bus, its geometry and its calibration."""
+    """Skin patch: identity on the bus, geometry and calibration."""
 
     name: Name
     """Name of the patch in programs and reports."""
     node_id: NodeId
     """CANopen node-ID, 1 to 127, unique on its bus."""
     bus: Name = "can0"
-    """Name of its bus."""
+    """Name of the bus of the patch."""
     link: Name | None = None
     """Name of the robot link that carries the patch, for programs with a robot model."""
     pose: PoseConfig = PoseConfig()
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
-    """Electronic data sheet to compare with the wire format of this file; relative to the hand file."""
+    """Electronic data sheet to compare with the wire format of this file; path relative to the hand file."""
     layout: LayoutConfig = LayoutConfig()
     code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
-    """Width of a resistance on the bus."""
+    """Width of a resistance code on the bus."""
     serial: Annotated[int | None, Field(ge=0, le=0xFFFF_FFFF), Allowed("an integer from 0 to 2^32 - 1")] = (
         None
     )
-    """Serial number that the node must have (0x1018:4); None accepts any. If the node does not answer at its
-    node-ID, the host finds it by this number over LSS and assigns the node-ID."""
+    """Required serial number of the node (0x1018:4); None accepts any. If no node answers at the node-ID, the
+    host finds the node by its serial number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
-    """Standard deviation of the analogue noise of a resistance, relative, without quantisation."""
+    """Relative standard deviation of the analogue noise of a resistance, without quantisation."""
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
-    """File of the resistances at rest, ohm: one line for each upper wire, one number for each lower wire.
-    None: the host reads them from the node."""
+    """File of the resistances at rest, ohm, with one line per upper wire and one number per lower wire. None:
+    the host reads them from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
 
     @field_validator("eds", "baseline")
@@ -216,11 +216,11 @@ def load_layout(path: Path | str) -> PatchLayout:
     """Read a layout file.
 
     Args:
-        path: NPZ or TOML with the arrays ``upper_m`` and ``lower_m``, or TOML with the keys of
+        path: NPZ or TOML file with the arrays ``upper_m`` and ``lower_m``, or TOML file with the keys of
             ``[patches.layout]``.
 
     Raises:
-        ConfigError: The file cannot be read or does not hold a possible layout. One line.
+        ConfigError: The file cannot be read or does not contain a possible layout. The message is one line.
     """
     path = Path(path)
     if path.suffix == ".npz":
@@ -230,9 +230,7 @@ def load_layout(path: Path | str) -> PatchLayout:
         return from_electrodes(document.table, path)
     for key in ("file", "coordinates"):
         if key in document.table:
-            raise ConfigError(
-                key, document.table[key], "nothing in a layout file", where=document.where((key,))
-            )
+            raise ConfigError(key, document.table[key], "only in a hand file", where=document.where((key,)))
     try:
         return LayoutConfig.model_validate(document.table).build()
     except ValidationError as error:

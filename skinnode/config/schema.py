@@ -1,4 +1,4 @@
-"""The JSON Schema of a hand file. ``python -m skinnode.config.schema`` writes the shipped file again."""
+"""JSON Schema of a hand file. ``python -m skinnode.config.schema`` regenerates the shipped file."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Final
 from skinnode.config.hand import HandConfig
 
 SCHEMA_FILE: Final = Path(__file__).with_name("hand.schema.json")
-"""File of the shipped schema; a test compares it with the code."""
+"""Shipped schema file, which a test compares with the code."""
 
 
 def schema_text() -> str:
-    """Return the schema as JSON, the same bytes for the same code."""
+    """Return the schema as JSON text; the same code yields the same bytes."""
     schema = HandConfig.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"

@@ -1,4 +1,4 @@
-"""``[simulation]``: the scene that ``vcan-sim`` plays."""
+"""``[simulation]``: the scene that ``vcan-sim`` simulates."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ _Cycle = Annotated[
 
 
 class SimulationConfig(Table):
-    """The scene that ``vcan-sim`` plays on each patch: press, slide, lift, repeat. The host ignores it."""
+    """Scene that ``vcan-sim`` simulates on each patch: press, slide, lift, repeat. The host ignores it."""
 
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
-    """Seed of the converter noise and of the places where the indenters press."""
+    """Random seed of the converter noise and of the positions of the indenters."""
     indenter_radius_m: Length = 0.04
-    """Radius of the sphere that presses."""
+    """Radius of the spherical indenter."""
     depth: Ratio = 0.1
-    """Maximum indentation as a share of the height of the upper layer; 0: nothing touches the hand."""
+    """Maximum indentation as a fraction of the height of the upper layer; 0: nothing touches the hand."""
     shear_ratio: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False), Allowed("a number from 0 to 2")] = (
         0.3
     )
-    """Coefficient of friction: tangential over normal load while sliding."""
+    """Coefficient of friction: ratio of tangential to normal load while sliding."""
     slide_speed_m_per_s: _Speed = 0.008
-    """Speed of the slide."""
+    """Sliding speed."""
     cycle_s: _Cycle = 4.0
-    """Time of one press, slide and lift."""
+    """Duration of one press, slide and lift."""
     converter_noise: Ratio = 3e-6
     """Standard deviation of the noise of the simulated converter, relative to the resistance."""

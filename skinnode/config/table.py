@@ -1,4 +1,4 @@
-"""Base class and value types of the tables of a hand file: frozen, strict, with allowed values in words."""
+"""Base class and value types for tables of a hand file, with descriptions of the allowed values."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from skinnode.canopen.indices import MAX_NODE_ID
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Mark in the type of a field: the values that a technician may write there, in words."""
+    """Annotation that describes the values allowed in a field, for messages."""
 
     text: str
 
 
 class Table(BaseModel):
-    """A table of the hand file. The docstring of a key is its description in the JSON Schema."""
+    """Base class of tables of the hand file. The docstring of a key is its description in the JSON Schema."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
 
 
 def one_of(names: Any) -> Allowed:
-    """Return the mark for the values of a Literal."""
+    """Return the annotation for the values of a Literal."""
     return Allowed(" or ".join(map(str, get_args(names))))
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """Return ``value`` below the folder of the hand file.
+    """Return ``value`` relative to the folder of the hand file.
 
     Raises:
         ValueError: There is no such file.
@@ -43,11 +43,11 @@ def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path |
     return path
 
 
-_NAME: Final = "a text of 1 to 64 printable characters, not all of them blanks"
+_NAME: Final = "a string of 1 to 64 printable characters, not all blank"
 
 
 def _printable(value: str) -> str:
-    """Names are printed as they are: nothing in them may steer a terminal or end a line."""
+    """Check a name, which is printed unescaped and must not control a terminal or end a line."""
     if not value.isprintable() or not value.strip():
         raise ValueError(_NAME)
     return value

@@ -1,8 +1,8 @@
-"""TOML with positions: the value of each key, and the line and column where it stands.
+"""TOML with positions: reads the value of each key with its line and column.
 
-tomllib reads the file and checks its syntax, but keeps no positions. So a file that tomllib has accepted is
-scanned once more, for its keys alone. This stays hand-written because no TOML reader with positions is both
-maintained and as strict as tomllib.
+tomllib parses the file and checks its syntax, but records no positions. Files that tomllib accepts are
+therefore scanned again for the positions of keys. The scanner is hand-written because no maintained TOML
+reader with positions is as strict as tomllib.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skinnode.errors import NOTHING, ConfigError, Shown
 from skinnode.files.input_file import read_input
 
 KeyPath = tuple[int | str, ...]
-"""``patches[1].node_id`` as ``("patches", 1, "node_id")``."""
+"""Path of a key: ``patches[1].node_id`` is ``("patches", 1, "node_id")``."""
 
 _GAP: Final = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 _SPACE: Final = re.compile(r"[ \t]*")
@@ -32,27 +32,27 @@ _VALUE: Final = re.compile(rf"{_STRING}|[^,\[\]{{}}#\n]+", re.DOTALL)
 _KEY: Final = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|[A-Za-z0-9_-]+')
 _LONGEST_LINE: Final = 60
 _DEEPEST: Final = 32
-"""Parts of a key; a hand file has six."""
+"""Maximum number of parts of a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""A key with many more parts than that; also a long run of numbers joined by dots, which no hand file has."""
+"""Key with many more parts; also matches long runs of numbers joined by dots, which no hand file has."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # an integer of TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
-_TOO_DEEP: Final = f"tables and arrays in up to {_DEEPEST} others"
+_TOO_DEEP: Final = f"tables and arrays nested up to {_DEEPEST} deep"
 
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A TOML file that was read."""
+    """Contents of a TOML file."""
 
     path: str
     table: dict[str, Any]
     places: Mapping[KeyPath, tuple[int, int]]
-    """Line and column of each key, of each item of an array and of each table, from 1."""
+    """Line and column of each key, array item and table, counted from 1."""
 
     def where(self, key: KeyPath) -> str:
-        """Return ``file:line:column`` of ``key``, or of the table around it if the key is missing."""
+        """Return ``file:line:column`` of ``key``, or of the enclosing table if the key is missing."""
         for length in range(len(key), 0, -1):
             if key[:length] in self.places:
                 line, column = self.places[key[:length]]
@@ -65,11 +65,11 @@ def read_toml(path: Path, what: str) -> Document:
 
     Args:
         path: The file.
-        what: Name of the file in errors.
+        what: Kind of file, for errors.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, nests deeper than any hand file, or has integers
-            outside the range that TOML guarantees. One line.
+        ConfigError: The file cannot be read, is not TOML, is nested deeper than any hand file, or has
+            integers outside the range that TOML guarantees. The message is one line.
     """
     try:
         text = read_input(what, path).decode()
@@ -85,7 +85,7 @@ def read_toml(path: Path, what: str) -> Document:
         raise _syntax_error(str(path), text, str(error)) from None
     except RecursionError:
         raise ConfigError(what, Shown("deeper nesting"), _TOO_DEEP, where=str(path)) from None
-    except ValueError:  # of more decimal digits than Python takes for a number
+    except ValueError:  # an integer with more decimal digits than Python accepts
         raise ConfigError(what, _TOO_LONG, _INTEGERS, where=str(path)) from None
     leaves = list(_leaves(table))
     if any(len(key) > _DEEPEST for key, _ in leaves):
@@ -98,7 +98,7 @@ def read_toml(path: Path, what: str) -> Document:
 
 
 def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
-    """Yield each value that holds no others, with its key; too deep a value is yielded whole."""
+    """Yield each scalar or empty value with its key; values nested too deeply are yielded whole."""
     todo: list[tuple[KeyPath, Any]] = [((), table)]
     while todo:
         key, value = todo.pop()
@@ -114,9 +114,9 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
-    """Return the error for a message of tomllib.
+    """Convert a message of tomllib to an error.
 
-    tomllib ends its message with the position: ``(at line 3, column 5)`` or ``(at end of document)``.
+    The message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
     """
     match = re.fullmatch(r"(?P<what>.*) \(at (?P<place>.*)\)", message, flags=re.DOTALL)
     what, place = (match["what"], match["place"]) if match else (message, "somewhere")
@@ -128,7 +128,7 @@ def _syntax_error(where: str, text: str, message: str) -> ConfigError:
 
 
 def places(text: str) -> dict[KeyPath, tuple[int, int]]:
-    """Return line and column of every key, item and table of a document that tomllib accepts."""
+    """Return line and column of every key, array item and table of a document that tomllib accepts."""
     offsets = _Scanner(text.replace("\r\n", " \n")).offsets
     found, line, start = {}, 1, 0
     for path, offset in sorted(offsets.items(), key=lambda item: item[1]):
@@ -139,12 +139,12 @@ def places(text: str) -> dict[KeyPath, tuple[int, int]]:
 
 
 class _Scanner:
-    """Scans a document and notes where the first mention of each path begins."""
+    """Scanner that records where the first occurrence of each path begins."""
 
     def __init__(self, text: str) -> None:
         self._text, self._at = text, 0
         self.offsets: dict[KeyPath, int] = {}
-        self._newest: dict[KeyPath, int] = {}  # last item of each array of tables
+        self._newest: dict[KeyPath, int] = {}  # index of the last item of each array of tables
         table: KeyPath = ()
         self._skip(_GAP)
         while self._at < len(text):
@@ -159,7 +159,7 @@ class _Scanner:
 
     def _skip(self, pattern: re.Pattern[str]) -> str:
         match = pattern.match(self._text, self._at)
-        assert match is not None, f"tomllib accepts what this does not, at {self._at}"
+        assert match is not None, f"tomllib accepted what this scanner does not, at {self._at}"
         self._at = match.end()
         return match[0]
 

@@ -1,1 +1,1 @@
-"""Reads and writes files safely: locked, written whole or not at all, with one-line errors."""
+"""Safe file access: locks, atomic writes and one-line errors."""

@@ -1,4 +1,4 @@
-"""A lock file that names its owner, cannot become stale, and is removed on release."""
+"""Lock file that names its owner, cannot become stale, and is removed on release."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TRIES: Final = 100
 
 
 class FileInUse(BlockingIOError):
-    """The lock has an owner: ``process`` is its process ID, or None if unknown."""
+    """Another owner holds the lock; ``process`` is its process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -25,7 +25,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """The path is a symbolic link, a folder, a pipe or a device; such files are not locked."""
+    """The path is a symbolic link, a folder, a pipe or a device, none of which is locked."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -34,14 +34,14 @@ class NotARegularFile(OSError):
 
 @dataclass(frozen=True, slots=True)
 class FileLock:
-    """A held lock. The kernel releases it when the process ends, even if it is killed."""
+    """Acquired lock. The kernel releases it when the process ends, even if the process is killed."""
 
     path: Path
     descriptor: int
     process: int
 
     def release(self) -> None:
-        """Release the lock. Call only once; a forked child that inherited the lock keeps it locked."""
+        """Release the lock; call only once. A forked child that inherited the lock keeps it locked."""
         if self.process == os.getpid():
             with contextlib.suppress(OSError):
                 self.path.unlink()
@@ -52,7 +52,7 @@ def lock_file(path: Path) -> FileLock:
     """Create and lock the file ``path``, and write the ID of this process into it.
 
     Returns:
-        The lock, to be released.
+        The lock, which the caller must release.
 
     Raises:
         FileInUse: This or another process owns the lock.

@@ -1,4 +1,4 @@
-"""Reads files named by the user whole, without blocking forever and up to a size limit."""
+"""Reads files named by the user, without blocking forever and up to a size limit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ about a hundred times the memory of the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read all of a file that the user named. A pipe is read if it has a writer, as in ``<(command)``.
+    """Read all of a file that the user named; also reads pipes that have a writer, as in ``<(command)``.
 
     Args:
         key: Option or key that named the file, for errors.
@@ -34,7 +34,7 @@ def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise ConfigError(key, str(path), f"a file that can be read ({error.strerror})") from None
-    except ValueError as error:  # a NUL in its name
+    except ValueError as error:  # NUL in the name
         raise ConfigError(key, str(path), f"a file that can be read ({error})") from None
     if len(data) > most_bytes:
         raise ConfigError(key, str(path), f"a file of at most {most_bytes >> 20} MiB")

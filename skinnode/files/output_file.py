@@ -11,7 +11,7 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written, before any work is done for it.
+    """Check that a file can be written, before the work that produces it.
 
     Args:
         option: Option that named the file, for errors.
@@ -34,7 +34,7 @@ def write_text(option: str, file: Path, text: str) -> None:
     """Write ``text`` in UTF-8 to ``file``, the value of ``option``.
 
     Raises:
-        ConfigError: Not all of it could be written; the file then keeps its old content.
+        ConfigError: The text could not be written completely; a regular file then keeps its old content.
     """
     write_bytes(option, file, text.encode())
 
@@ -42,11 +42,11 @@ def write_text(option: str, file: Path, text: str) -> None:
 def write_bytes(option: str, file: Path, data: bytes) -> None:
     """Write ``data`` to ``file``, the value of ``option``.
 
-    A regular file is replaced once all data is written, and keeps its permissions; anything else, such as a
+    A regular file is replaced once all data is written and keeps its permissions; any other target, such as a
     pipe, is written in place.
 
     Raises:
-        ConfigError: Not all of it could be written; a regular file then keeps its old content.
+        ConfigError: The data could not be written completely; a regular file then keeps its old content.
     """
     try:
         target = Path(os.path.realpath(file))  # for /dev/stdout, a name that does not exist

@@ -1,4 +1,4 @@
-"""Writes plots with matplotlib, an extra; a command that needs it says so before it does any work."""
+"""Writes plots with matplotlib, an optional dependency whose absence is reported before any work is done."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def require_matplotlib(file: Path) -> None:
 
 
 def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
-    """Write a matplotlib figure to a file, whole or not at all, in the format of its suffix.
+    """Write a matplotlib figure atomically to a file, in the format of the file's suffix.
 
     Args:
         option: Option that named the file, for errors.

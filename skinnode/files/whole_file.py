@@ -1,8 +1,8 @@
 """Writes files atomically.
 
 The new content is written to a file with a random name in the same folder, created exclusively and never
-through a symbolic link, and renamed once complete. A reader always finds either the old content or the new;
-an error leaves the old content.
+through a symbolic link, and renamed once complete. Readers always see either the old or the new
+content; after an error the old content remains.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ SUFFIX: Final = ".new"
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
-    """Replace the content of ``path`` by ``data``. A symbolic link is replaced, not followed.
+    """Replace the content of ``path`` with ``data``; a symbolic link is replaced, not followed.
 
     Args:
         path: The file; it need not exist.
         data: New content.
         mode: Permissions, reduced by the umask.
-        durable: Return only when file and name are on the storage medium.
+        durable: Whether to return only once the file and its name are on the storage medium.
 
     Raises:
         OSError: The file cannot be written; it keeps its old content.
@@ -43,16 +43,16 @@ def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool =
     """Write ``data`` to a new file in the folder of ``path``, to be renamed or discarded.
 
     Args:
-        path: The file that the new one is to replace.
+        path: The file to be replaced by the new file.
         data: Content of the new file.
         mode: Permissions, reduced by the umask.
-        durable: Return only when the data is on the storage medium.
+        durable: Whether to return only once the data is on the storage medium.
 
     Returns:
         Path of the new file.
 
     Raises:
-        OSError: It cannot be written; no file is left behind.
+        OSError: The new file cannot be written; no file is left behind.
     """
     beside = path.with_name(f".{path.name[:200]}.{secrets.token_hex(8)}{SUFFIX}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -76,7 +76,7 @@ def discard(path: Path) -> None:
 
 
 def discard_leftovers(path: Path) -> None:
-    """Remove the files of processes that were killed while writing ``path``.
+    """Remove incomplete files of processes that were killed while writing ``path``.
 
     Only the sole writer of ``path`` may call this.
     """

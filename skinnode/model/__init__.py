@@ -1,6 +1,6 @@
 """Model of a patch, as values and pure functions.
 
-``layout`` and ``layout_file`` hold the electrodes at rest, ``forward`` and ``kernels`` turn positions into
-resistances, ``elastic`` turns loads into displacements, ``pose`` turns a patch into the hand's frame.
-``frames`` and ``status`` are what a solver takes and returns.
+``layout`` and ``layout_file`` define the electrodes at rest, ``forward`` and ``kernels`` compute resistances
+from positions, ``elastic`` computes displacements from loads, and ``pose`` transforms from a patch's frame to
+the hand's frame. ``frames`` and ``status`` define the inputs and results of a solver.
 """

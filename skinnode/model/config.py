@@ -1,4 +1,4 @@
-"""Old path of :mod:`skinnode.config`, for one version."""
+"""Former path of :mod:`skinnode.config`, kept for one version."""
 
 from skinnode.moved import moved
 

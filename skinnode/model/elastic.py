@@ -1,19 +1,19 @@
-"""Rubber as an elastic half-space: loads on its surface to displacements of its surface.
+"""Rubber as an elastic half-space: computes surface displacements from surface loads.
 
-The body fills z < 0, its surface is z = 0, z points out of it as everywhere in this project; a press is a
+The body fills z < 0, its surface is z = 0, and z points outwards, as everywhere in this project; a press is a
 load with a negative z component. With d = (x, y) from load to point, r = |d|, shear modulus G and Poisson's
 ratio ν, a unit point load displaces the surface by (Boussinesq 1885, Cerruti 1882; Johnson, Contact
-Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, turned into our axes)
+Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
 
     ⎡ u_x ⎤      1   ⎡ (1−ν)/r + ν x²/r³    ν x y/r³              (½−ν) x/r² ⎤ ⎡ f_x ⎤
     ⎢ u_y ⎥  =  ───  ⎢ ν x y/r³             (1−ν)/r + ν y²/r³     (½−ν) y/r² ⎥ ⎢ f_y ⎥
     ⎣ u_z ⎦     2πG  ⎣ −(½−ν) x/r²          −(½−ν) y/r²           (1−ν)/r    ⎦ ⎣ f_z ⎦
 
-Everything here is that matrix: at a point (:func:`point_compliance`), integrated over a rectangle of uniform
-traction (:func:`rectangle_compliance`) or over the pressure below a sphere (:class:`HertzContact`).
+This module evaluates that matrix at a point (:func:`point_compliance`), integrated over a rectangle of
+uniform traction (:func:`rectangle_compliance`) or over the pressure under a sphere (:class:`HertzContact`).
 
-What the model leaves out: a finite thickness of the rubber (a bonded layer pushes back sooner and its
-displacement decays faster than 1/r), large strain and curvature of the skin.
+The model neglects the finite thickness of the rubber (a bonded layer is stiffer and its displacement decays
+faster than 1/r), large strain, and curvature of the skin.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ class Rubber:
     """A linear elastic, isotropic material.
 
     Args:
-        young_pa: Young's modulus, Pa. The default is that of a soft silicone of about 20 Shore A.
-        poisson: Poisson's ratio. Rubber keeps its volume, so the default is 0.5. Normal and tangential loads
-            then do not couple on the surface, and Hertz's theory is exact under friction as well.
+        young_pa: Young's modulus, Pa. The default is typical of a soft silicone, about 20 Shore A.
+        poisson: Poisson's ratio. Rubber is nearly incompressible, so the default is 0.5. Normal and
+            tangential loads then do not couple at the surface, and Hertz's theory remains exact under
+            friction.
 
     Raises:
         ValueError: If the modulus is not positive and finite or the ratio is outside 0 … 0.5.
@@ -57,7 +58,7 @@ class Rubber:
 
     @property
     def contact_modulus_pa(self) -> float:
-        """Contact modulus E* = E / (1 − ν²), Pa, of the rubber and a rigid body (Johnson eq. 4.17)."""
+        """Contact modulus E* = E / (1 − ν²), Pa, for contact with a rigid body (Johnson eq. 4.17)."""
         return self.young_pa / (1 - self.poisson**2)
 
 
@@ -66,13 +67,13 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 
     Args:
         rubber: The material.
-        offset_m: (P, 2) from the load to each point, metres.
+        offset_m: (P, 2) offset of each point from the load, metres.
         softening_m: ε in r → √(r² + ε²), metres; spreads the load over a spot of about that radius, so that
-            the displacement stays finite at the load. 0 is the point load itself.
+            the displacement at the load stays finite. 0 is an ideal point load.
 
     Returns:
-        (P, 3, 3), m/N. The last axis is the component of the load, the axis before the component of the
-        displacement. Inf and NaN at the load itself if ``softening_m`` is 0.
+        (P, 3, 3) compliance, m/N. The last axis is the component of the load, the second-to-last that of the
+        displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
 
     Raises:
         ValueError: If the array has the wrong shape or NaN, or the softening is negative.
@@ -89,19 +90,19 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
 
 
 def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[float, float]) -> Float:
-    """Return the displacement of surface points per unit traction on a rectangle. It is finite everywhere.
+    """Return the displacement of surface points per unit traction on a rectangle; finite everywhere.
 
-    The closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the normal part;
-    Johnson eq. 3.25): each kernel of the module's matrix has an elementary antiderivative in x and y, taken
-    between the corners.
+    Closed form for a uniform load on a rectangle (Love, Phil. Trans. A 228, 1929, for the normal part;
+    Johnson eq. 3.25): each entry of the module's matrix has an elementary antiderivative in x and y, which is
+    evaluated at the corners.
 
     Args:
         rubber: The material.
-        offset_m: (P, 2) from the centre of the rectangle to each point, metres.
+        offset_m: (P, 2) offset of each point from the centre of the rectangle, metres.
         size_m: Lengths of the rectangle in x and y, metres.
 
     Returns:
-        (P, 3, 3), m/Pa, axes as in :func:`point_compliance`.
+        (P, 3, 3) compliance, m/Pa, with axes as in :func:`point_compliance`.
 
     Raises:
         ValueError: If the array has the wrong shape or NaN, or a length is not positive.
@@ -119,12 +120,12 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
 
 
 def _antiderivatives(x: Float, y: Float) -> Float:
-    """(5, P) functions whose mixed derivatives ∂²/∂x∂y are x²/r³, y²/r³, xy/r³, x/r² and y/r²."""
+    """Return functions (5, P) with the mixed derivatives ∂²/∂x∂y x²/r³, y²/r³, xy/r³, x/r² and y/r²."""
     r = np.hypot(x, y)
     ax, ay = np.abs(x), np.abs(y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # asinh(x/|y|) is ln(x + r) − ln|y|; the second term drops out between the corners, and without it
-        # nothing cancels
+        # asinh(x/|y|) = ln(x + r) − ln|y|: the second term drops out between the corners, and asinh avoids
+        # the cancellation in x + r
         xx = np.where(ay > 0, y * np.arcsinh(x / ay), 0.0)
         yy = np.where(ax > 0, x * np.arcsinh(y / ax), 0.0)
         log_r = np.where(r > 0, np.log(r), 0.0)
@@ -134,10 +135,10 @@ def _antiderivatives(x: Float, y: Float) -> Float:
     return np.stack([xx, yy, -r, x_r2, y_r2])
 
 
-def _compliance(  # noqa: PLR0913 - the six functions of r in the matrix
+def _compliance(  # noqa: PLR0913 - the six functions in the matrix
     rubber: Rubber, inverse: Float, xx: Float, yy: Float, xy: Float, x_r2: Float, y_r2: Float
 ) -> Float:
-    """(P, 3, 3) the module's matrix from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
+    """Return the module's matrix (P, 3, 3) from 1/r, x²/r³, y²/r³, xy/r³, x/r², y/r² or their integrals."""
     nu = rubber.poisson
     matrix = np.empty((*inverse.shape, 3, 3))
     matrix[..., 0, 0] = (1 - nu) * inverse + nu * xx
@@ -154,21 +155,22 @@ def _compliance(  # noqa: PLR0913 - the six functions of r in the matrix
 
 @dataclass(frozen=True)
 class HertzContact:
-    """A rigid sphere pressed into the rubber and dragged over it: Hertz's pressure, full sliding friction.
+    """Contact of a rigid sphere pressed into the rubber and dragged over it: Hertz's pressure, full sliding.
 
-    The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. Its
-    surface displacement is a closed form everywhere: p is symmetric, so all of the matrix's integrals follow
-    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P = load within r. That the shear
-    leaves the pressure alone is exact for incompressible rubber and an approximation below (Johnson 7.1).
+    The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
+    surface displacement has a closed form everywhere: p is symmetric, so all integrals of the matrix follow
+    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. That shear
+    does not change the pressure is exact for incompressible rubber and an approximation for ν < 0.5 (Johnson
+    7.1).
 
     Args:
         rubber: The material.
         radius_m: Radius of the sphere, metres.
-        indentation_m: Approach δ of the sphere, metres: the normal displacement at the centre of a contact
-            without shear (with ν = 0.5, of any contact). 0 is no contact.
-        center_m: (x, y) of the contact circle, metres.
-        traction_ratio: (t_x, t_y) shear on the rubber over the pressure: the coefficient of friction along
-            the direction in which the sphere slides.
+        indentation_m: Approach δ of the sphere, metres. This is the normal displacement at the centre of a
+            contact without shear or, if ν = 0.5, of any contact. 0 means no contact.
+        center_m: Centre (x, y) of the contact circle, metres.
+        traction_ratio: (t_x, t_y) ratio of the shear on the rubber to the pressure: the coefficient of
+            friction in the sliding direction of the sphere.
 
     Raises:
         ValueError: If a value is not finite, the radius is not positive, or the indentation is negative.
@@ -201,7 +203,7 @@ class HertzContact:
 
     @functools.cached_property
     def force_n(self) -> tuple[float, float, float]:
-        """Total load on the rubber, N; its normal part is −4/3 E* √R δ^{3/2}."""
+        """Total load (x, y, z) on the rubber, N; the normal component is −4/3 E* √R δ^{3/2}."""
         normal = 2 / 3 * math.pi * self.peak_pressure_pa * self.contact_radius_m**2
         return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
 
@@ -220,7 +222,7 @@ class HertzContact:
         return np.asarray(pressure[:, None] * np.array([*self.traction_ratio, -1.0]))
 
     def displacement_m(self, points_m: ArrayLike) -> Float:
-        """Return the displacement (P, 3) of surface points (P, 2), metres; exactly 0 without a contact.
+        """Return the displacement (P, 3) of surface points (P, 2), metres; exactly 0 without contact.
 
         Raises:
             ValueError: If the array has the wrong shape or NaN.
@@ -243,11 +245,11 @@ class HertzContact:
 
 
 def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float, Float, Float]:
-    """Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of p = peak √(1 − r²/a²).
+    """Return Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of p = peak √(1 − r²/a²).
 
     χ = ∫ p |d| has the Laplacian Φ, so its gradient is d S with S = ∫₀ʳ Φ s ds / r², its second derivatives
-    are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a flat charge, by
-    Gauss's law in the plane d P/r².
+    are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a flat charge,
+    which is d P/r² by Gauss's law in the plane.
     """
     r2 = np.einsum("pi,pi->p", offset, offset)
     near = r2 <= a * a
@@ -256,13 +258,13 @@ def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float
     phi = c * a * a * (2 - s2)
     isotropic = c * a * a * (1 - 0.75 * s2)
     radial = np.full_like(r2, 0.5 * c)
-    # 1 − (1 − s²)^{3/2} over s², without the cancellation at the centre
+    # (1 − (1 − s²)^{3/2}) / s² without cancellation at the centre
     root = np.sqrt(1 - s2)
     enclosed = 2 / 3 * math.pi * peak * (1 + root + (1 - s2)) / (1 + root)
     far = ~near
     q2 = r2[far]
     w = np.sqrt(q2 - a * a)
-    angle = np.arctan2(a, w)  # arcsin(a/r), without its loss of digits next to the edge
+    angle = np.arctan2(a, w)  # arcsin(a/r) without loss of digits near the edge
     c = math.pi * peak / (2 * a)
     outside = c * ((2 * a * a - q2) * angle + a * w)
     mean = c * ((a * a - 0.25 * q2) * angle + (0.75 * a * a + 0.25 * w * w) * a * w / q2)

@@ -1,11 +1,11 @@
-"""Forward model of a patch: electrode positions to wire-to-wire resistances (NumPy reference).
+"""Forward model of a patch: computes wire-to-wire resistances from electrode positions (NumPy reference).
 
-The rubber between two electrodes is a resistor ρ d; the N·M paths between an upper and a lower wire are in
-parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F is the potential of the
-lower wire's M unit charges summed over the N electrodes of the upper wire, and
+The rubber between two electrodes at distance d is a resistor ρ d. The N·M paths between an upper and a lower
+wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F is the
+potential of the lower wire's M unit charges summed over the N electrodes of the upper wire, and
 ∂F_k/∂x_i = − Σ_j (x_i − x̄_jk) / |x_i − x̄_jk|³.
 
-These functions define what the compiled ones in ``kernels`` must compute; they are written for reading.
+These functions are the readable reference for the compiled versions in ``kernels``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skinnode.model.layout import Float, PatchLayout, require_array
 
 
 def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """x_i − x̄_jk for every pair of electrodes, (U, K, M, N, 3)."""
+    """Return x_i − x̄_jk (U, K, M, N, 3) for every pair of electrodes."""
     upper = require_array("upper_m", upper_m, layout.upper_m.shape)
     return upper[:, None, None, :, :] - layout.lower_m[None, :, :, None, :]
 
@@ -57,7 +57,7 @@ def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
         upper_m: (U, N, 3) positions of the upper electrodes, metres.
 
     Returns:
-        (U, K, N, 3), 1/m².
+        (U, K, N, 3) Jacobian, 1/m².
 
     Raises:
         ValueError: If the array has the wrong shape or NaN.

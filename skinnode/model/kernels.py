@@ -1,9 +1,9 @@
-"""The forward model of one wire, compiled, in structure-of-arrays order.
+"""Compiled forward model of one wire, in structure-of-arrays order.
 
-Lower electrodes are (3, M, K) and the Jacobian is kept as its transpose (3N, K): a vector of neighbouring
-lower wires k is read and written as it lies, and its sums stay in registers. The distances cost most: a
-square root and a division a pair keep one slow unit of the processor busy, so 1/√ is made of multiplications
-instead. Lengths are in any one unit; F is in its inverse.
+Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K), so vectors of neighbouring
+lower wires k are contiguous in memory and their sums stay in registers. Distances are the main cost: a square
+root and a division per pair would saturate one slow unit of the processor, so 1/√ is computed from
+multiplications instead. Lengths may be in any unit; F is in its inverse.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _T = TypeVar("_T", float, Float)
 
 
 def lower_rows(lower: Float) -> Float:
-    """Return lower electrodes (K, M, 3) as the rows (3, M, K) that the kernels read."""
+    """Return lower electrodes (K, M, 3) as the rows (3, M, K) that the kernels expect."""
     return np.ascontiguousarray(lower.transpose(2, 1, 0))
 
 
@@ -35,10 +35,10 @@ relative_residual_part = njit_body(relative_residual)
 
 @njit_part
 def _inverse_root(square: Lanes) -> Lanes:
-    """1 / √``square`` to 1.5 ulp from 1e-307 to 1e307; NaN below the normal numbers and at inf.
+    """Return 1 / √``square`` to 1.5 ulp from 1e-307 to 1e307; NaN for subnormal numbers and inf.
 
-    With e = 1 − square y² the root is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …): cut there twice, e falls
-    from 0.07 to 1e-5 and below the last bit.
+    With e = 1 − square y² the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). Two iterations of this
+    series without the e⁴ term reduce e from 0.07 to 1e-5 and then below the last bit.
     """
     y = rough_inverse_root(square)
     for _ in range(2):
@@ -52,7 +52,7 @@ def _inverse_root(square: Lanes) -> Lanes:
 def potential(x: Float, lower: Float, f: Float) -> None:
     """Write F of one wire into ``f`` (K,).
 
-    ``x`` (3N,) holds its electrodes as x₁ y₁ z₁ x₂ …, ``lower`` (3, M, K) the lower ones.
+    ``x`` (3N,) holds the electrodes of the wire as x₁ y₁ z₁ x₂ …, ``lower`` (3, M, K) the lower electrodes.
     """
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
@@ -70,7 +70,7 @@ def potential(x: Float, lower: Float, f: Float) -> None:
 
 @njit
 def potential_jacobian(x: Float, lower: Float, f: Float, jt: Float) -> None:
-    """Write F of one wire into ``f`` (K,), as :func:`potential`, and (∂F/∂x)ᵀ into ``jt`` (3N, K)."""
+    """Write F of one wire into ``f`` (K,), as :func:`potential` does, and (∂F/∂x)ᵀ into ``jt`` (3N, K)."""
     charges, wires = lower.shape[1], lower.shape[2]
     for k in range(0, wires, LANES):
         count = wires - k

@@ -1,6 +1,7 @@
-"""Geometry of a patch: positions of its electrodes at rest. No other file states a matrix size.
+"""Geometry of a patch: positions of its electrodes at rest. All matrix sizes are derived from it.
 
-Axes: x along an upper wire, y across the upper wires, z out of the skin; the lower layer lies at z = 0.
+The x axis is along an upper wire, y across the upper wires and z out of the skin; the lower layer is at
+z = 0.
 """
 
 from __future__ import annotations
@@ -20,30 +21,31 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum upper electrodes of a patch, such as 32 × 32: a covariance of their 3072 coordinates takes 75 MB,
-and the posterior holds several."""
+"""Maximum number of upper electrodes of a patch, for example 32 × 32. A covariance of their 3072 coordinates
+takes 75 MB, and the posterior stores several."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum pairs of an upper and a lower electrode: the distances between them take 100 MB, and each
-evaluation of all wires computes that many."""
+"""Maximum number of pairs of an upper and a lower electrode. Their distances take 100 MB, and each evaluation
+of all wires computes all of them."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Resolution of coordinates in the hash, m: layouts whose electrodes agree to a nanometre are the same."""
+"""Resolution of coordinates in the hash, m; layouts that agree to a nanometre count as equal."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
-    """Return a value as a C-ordered float64 array.
+    """Return the value as a C-ordered float64 array.
 
     Args:
-        name: Name of the argument, for the message.
-        value: The value; not copied if it is such an array already.
-        shape: Its shape; a letter stands for any length of at least 1.
+        name: Name of the argument, for error messages.
+        value: The value; not copied if it already is such an array.
+        shape: Required shape; a letter stands for any length of at least 1.
         finite: Whether every number must be finite.
 
     Raises:
-        ValueError: If it is not such an array; with the argument, its value and what it must be.
+        ValueError: If the value cannot be converted. The message names the argument, its value and the
+            requirement.
     """
-    if (  # as from every frame of a host
+    if (  # fast path: a host passes this with every frame
         type(value) is np.ndarray
         and value.dtype == np.float64
         and value.shape == shape
@@ -73,7 +75,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
 
 
 def _require_size(upper_wires: int, upper_electrodes: int, lower_wires: int, lower_electrodes: int) -> None:
-    """Raise ValueError if a patch is too large to be solved."""
+    """Raise ValueError if a patch is too large to solve."""
     upper, lower = upper_wires * upper_electrodes, lower_wires * lower_electrodes
     if upper > MOST_ELECTRODES:
         name, got = "upper_wires × upper_electrodes", f"{upper_wires} × {upper_electrodes}"
@@ -87,18 +89,18 @@ def _require_size(upper_wires: int, upper_electrodes: int, lower_wires: int, low
 
 @dataclass(frozen=True, eq=False)
 class PatchLayout:
-    """Electrodes of a patch at rest.
+    """Positions of a patch's electrodes at rest.
 
     Args:
-        upper_m: (U, N, 3) electrodes of the U upper wires, metres. They move with the surface.
-        lower_m: (K, M, 3) electrodes of the K lower wires, metres. They do not move.
+        upper_m: (U, N, 3) electrodes of the U upper wires, metres; they move with the surface.
+        lower_m: (K, M, 3) electrodes of the K lower wires, metres; they do not move.
         resistivity_ohm_per_m: Resistance of the rubber per metre between two electrodes, the paper's g.
-        name: A preset's name or any other.
+        name: Name of the layout, of a preset or any other.
 
     Raises:
         ValueError: If a shape is wrong, a coordinate is NaN, the resistivity is not positive, an upper
-            electrode lies on a lower one, or there are more than :data:`MOST_ELECTRODES` or
-            :data:`MOST_PAIRS`.
+            electrode lies on a lower one, or a limit (:data:`MOST_ELECTRODES`,
+            :data:`MOST_PAIRS`) is exceeded.
     """
 
     upper_m: Float
@@ -117,7 +119,7 @@ class PatchLayout:
         gaps = upper.reshape(-1, 1, 3) - lower.reshape(1, -1, 3)
         closest = float(np.sqrt(np.min(np.einsum("abi,abi->ab", gaps, gaps))))
         if closest < _HASH_RESOLUTION_M:
-            raise ValueError(f"upper_m: an electrode lies {closest} m from a lower one, must be apart")
+            raise ValueError(f"upper_m: an electrode lies {closest} m from a lower one, must be farther")
         upper.setflags(write=False)
         lower.setflags(write=False)
         object.__setattr__(self, "upper_m", upper)
@@ -125,7 +127,7 @@ class PatchLayout:
         object.__setattr__(self, "resistivity_ohm_per_m", float(self.resistivity_ohm_per_m))
 
     def __repr__(self) -> str:
-        """One line; the electrodes are in the arrays."""
+        """Return a one-line summary without the electrodes."""
         (wires, electrodes), (lower, charges) = self.upper_m.shape[:2], self.lower_m.shape[:2]
         return (
             f"PatchLayout({self.name!r}, {wires} upper wires of {electrodes}, {lower} lower of {charges}, "
@@ -147,24 +149,24 @@ class PatchLayout:
     ) -> PatchLayout:
         """Return a flat layout by name.
 
-        ``aligned``    straight wires along y, x over the patch, electrodes a quarter pitch off the upper
-                       wires: the plain reading of the paper's figure
-        ``symmetric``  as ``aligned`` without the quarter pitch; its Jacobian is close to singular
-        ``staggered``  half a pitch wider than the patch, electrode pitch 1.2, wires shifted in y by
-                       0.43 (k mod 3 − 1) pitches: measured to be up to a thousand times better conditioned
+        ``aligned``    lower wires straight along y and evenly spaced in x, electrodes offset from the upper
+                       wires by a quarter pitch: the literal reading of the paper's figure
+        ``symmetric``  as ``aligned`` without the offset; the Jacobian is close to singular
+        ``staggered``  lower layer half a pitch wider than the patch, electrode pitch 1.2, wires shifted in y
+                       by 0.43 (k mod 3 − 1) pitches; up to a thousand times better conditioned as measured
 
         Args:
             name: ``aligned``, ``symmetric`` or ``staggered``.
-            pitch_m: Distance of neighbouring upper electrodes, metres.
+            pitch_m: Distance between neighbouring upper electrodes, metres.
             height_m: Height of the upper electrodes above the lower layer, metres.
             upper_wires: Number of upper wires, U.
-            upper_electrodes: Number of electrodes of an upper wire, N.
+            upper_electrodes: Number of electrodes per upper wire, N.
             lower_wires: Number of lower wires, K; default 3 N, for square systems.
-            lower_electrodes: Number of electrodes of a lower wire, M; default U.
+            lower_electrodes: Number of electrodes per lower wire, M; default U.
             resistivity_ohm_per_m: ρ of the resistor ρ d between two electrodes at distance d, ohm/m.
 
         Raises:
-            ValueError: If the name is unknown, or a number is out of its range.
+            ValueError: If the name is unknown, or a number is out of range.
         """
         if name not in PRESETS:
             raise ValueError(f"name: got {name!r}, must be one of {', '.join(PRESETS)}")
@@ -214,8 +216,8 @@ class PatchLayout:
     def pitch_m(self) -> float:
         """Length scale of the patch, metres.
 
-        It is the median distance between neighbours on an upper wire or, if a wire has a single electrode,
-        from an upper electrode to the nearest lower one.
+        This is the median distance between neighbours on an upper wire or, if a wire has a single electrode,
+        the median distance from an upper electrode to the nearest lower electrode.
         """
         steps = np.linalg.norm(np.diff(self.upper_m, axis=1), axis=2)
         if steps.size:
@@ -230,7 +232,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and all coordinates in nanometres; nodes have it in 0x2000, hosts check it."""
+        """CRC-32 of the sizes and all coordinates in nanometres; nodes store it in 0x2000, hosts check it."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

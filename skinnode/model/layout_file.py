@@ -1,4 +1,4 @@
-"""Layouts in files of their own: NPZ or TOML with the electrodes, or TOML with the keys of a preset."""
+"""Layout files: NPZ or TOML with the electrodes, or TOML with the keys of a preset."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _ARRAYS = ("upper_m", "lower_m")
 _KEYS = (*_ARRAYS, "resistivity_ohm_per_m")
 _MOST_NPZ_BYTES: Final = 16 << 20
 _MOST_VALUES: Final = {"upper_m": 3 * MOST_ELECTRODES, "lower_m": 3 * MOST_PAIRS, "resistivity_ohm_per_m": 1}
-"""Maximum numbers in each array."""
+"""Maximum number of values in each array."""
 _MOST_ITEM_BYTES: Final = 32
-"""Maximum size of one number: a complex one of two long doubles, which is refused later, by its type."""
+"""Maximum size of one value: a complex long double, which is rejected later because of its type."""
 _LONGEST_KEY: Final = 40
 _MOST_HEADER_BYTES: Final = 10_240
-"""Maximum size of what precedes the numbers; NumPy reads a header of at most 10,000 characters."""
+"""Maximum size of the data before the values; NumPy reads headers of up to 10,000 characters."""
 
 
 def read_npz(path: Path) -> PatchLayout:
@@ -35,7 +35,7 @@ def read_npz(path: Path) -> PatchLayout:
             number ``resistivity_ohm_per_m``.
 
     Raises:
-        ConfigError: If the file is not an NPZ file, or not one of a layout.
+        ConfigError: If the file is not an NPZ file, or does not contain a layout.
     """
     try:
         data = io.BytesIO(read_input("layout file", path, _MOST_NPZ_BYTES))
@@ -45,18 +45,18 @@ def read_npz(path: Path) -> PatchLayout:
             table = {key: file[key] for key in file.files}
     except ConfigError:
         raise
-    except Exception as error:  # zipfile, its decompressors and NumPy raise some fifteen types
+    except Exception as error:  # zipfile, its decompressors and NumPy raise about fifteen types
         what = " ".join(str(error).split())[:80] or type(error).__name__
         raise ConfigError("layout file", str(path), f"an NPZ file ({what})") from None
     return from_electrodes(table, path)
 
 
 def _require_sizes(data: io.BytesIO, path: Path) -> None:
-    """Check the headers of an NPZ file before a member is unpacked: some megabytes can unpack to gigabytes.
+    """Check the headers of an NPZ file before unpacking: a few megabytes can unpack to gigabytes.
 
     Raises:
-        ConfigError: If a member is unknown, double, compressed otherwise or too large. zipfile and NumPy
-            raise their own errors if it is not an NPZ file.
+        ConfigError: If a member is unknown, duplicate, too large or uses another compression. zipfile and
+            NumPy raise their own errors if the file is not an NPZ file.
     """
     with zipfile.ZipFile(data) as members:
         seen: set[str] = set()
@@ -69,7 +69,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # others unpack at once
+            ):  # others are unpacked all at once
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
@@ -90,15 +90,15 @@ def _require_size(key: str, got: str, size: int, most: int, path: Path) -> None:
 
 
 def has_electrodes(table: Mapping[str, Any]) -> bool:
-    """Return whether the table of a TOML layout file has electrodes, instead of the keys of a preset."""
+    """Return whether the table of a TOML layout file has electrodes rather than the keys of a preset."""
     return any(key in table for key in _ARRAYS)
 
 
 def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
-    """Make a layout of a table with the keys of :func:`read_npz`.
+    """Return the layout given by a table with the keys of :func:`read_npz`.
 
     Raises:
-        ConfigError: If a key is missing or unknown, or a value is not possible; ``path`` is named.
+        ConfigError: If a key is missing or unknown, or a value is impossible; the error names ``path``.
     """
     for key in _ARRAYS:
         if key not in table:
@@ -116,7 +116,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
 
 
 def impossible(error: ValueError, table: str = "", where: str = "") -> ConfigError:
-    """Return an error of :class:`PatchLayout` as a ConfigError of the key in its ``table``."""
+    """Convert an error of :class:`PatchLayout` to a ConfigError for the key in ``table``."""
     key, _, what = str(error).partition(": ")
     got, _, allowed = what.partition(", must be ")
     key = f"{table}.{key}" if table else key

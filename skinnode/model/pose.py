@@ -1,4 +1,4 @@
-"""Pose of a patch on the hand, and its vectors and points in the hand's frame."""
+"""Pose of a patch on the hand, and conversion of vectors and points to the hand's frame."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Largest distance of a quaternion's length from 1 that can be rounding."""
+"""Largest deviation of a quaternion's length from 1 that is attributed to rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
     """Position and orientation of a patch's frame in the frame of the hand.
 
-    The patch's x is along its upper wires, its z out of the skin.
+    The x axis of the patch is along its upper wires, the z axis points out of the skin.
 
     Args:
         position_m: Origin of the patch's frame, metres.
@@ -42,7 +42,7 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]) -> Self:
-        """Make a pose of roll, pitch and yaw about the fixed axes x, y, z of the hand, in this order.
+        """Return the pose for roll, pitch and yaw about the fixed axes x, y, z of the hand, in this order.
 
         This is the convention of URDF.
 
@@ -65,7 +65,7 @@ class Pose:
 
     @property
     def rotation(self) -> Float:
-        """(3, 3) matrix that turns vectors in the patch's frame into vectors in the hand's."""
+        """(3, 3) matrix that rotates vectors from the patch's frame to the hand's frame."""
         x, y, z, w = np.array(self.quaternion_xyzw) / math.hypot(*self.quaternion_xyzw)
         return np.array(
             [
@@ -76,12 +76,12 @@ class Pose:
         )
 
     def vectors(self, of_patch: ArrayLike) -> Float:
-        """Return displacements, forces or normals (..., 3) of the patch's frame in the hand's frame."""
+        """Convert displacements, forces or normals (..., 3) from the patch's frame to the hand's frame."""
         turned: Float = np.asarray(of_patch, np.float64) @ self.rotation.T
         return turned
 
     def points_m(self, of_patch_m: ArrayLike) -> Float:
-        """Return points (..., 3), metres, of the patch's frame in the hand's frame."""
+        """Convert points (..., 3), metres, from the patch's frame to the hand's frame."""
         points: Float = self.vectors(of_patch_m) + np.array(self.position_m)
         return points
 

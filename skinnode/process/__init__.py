@@ -1,1 +1,1 @@
-"""Signals, child processes and garbage collector settings of a running program."""
+"""Signal handling, child processes and garbage collection of a running program."""

@@ -1,9 +1,9 @@
-"""Starts child processes that survive the signals of the command's terminal.
+"""Starts child processes that survive signals from the terminal of the command.
 
-A terminal sends Ctrl-C (SIGINT) and SIGHUP to the children of a command as well. Python would print a
+A terminal also sends Ctrl-C (SIGINT) and SIGHUP to the children of a command. Python would print a
 traceback in a child that is still importing, and SIGHUP would end the resource tracker of ``multiprocessing``
-before it has cleaned up. So children start with both signals blocked and keep them blocked; the command ends
-them.
+before it has cleaned up. Children therefore start with both signals blocked and keep them blocked; the
+command terminates them.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 def starting_children() -> Iterator[None]:
     """Block the terminal's signals for child processes started in this ``with`` block.
 
-    A signal that arrives in the block is handled at its end: a child that is left half started prints a
-    traceback.
+    A signal that arrives in the block is handled at the end of the block, because a half-started child prints
+    a traceback.
     """
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)

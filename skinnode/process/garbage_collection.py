@@ -1,4 +1,4 @@
-"""Keeps garbage collection and busy threads from delaying a program with deadlines."""
+"""Prevents garbage collection and busy threads from delaying programs with deadlines."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_long_collections() -> Iterator[None]:
-    """Make garbage collection skip the objects that exist on entry, for the length of the block.
+    """Exclude objects that exist on entry from garbage collection for the duration of the block.
 
-    The objects that numba and canopen load make a full collection take 30 ms on a small computer, and it
-    stops every thread: long enough for a node to skip a scan or a host to delay a SYNC. Enter the block when
-    all is set up. Objects that exist on entry and become cyclic garbage are freed after the block.
+    With the objects of numba and canopen, a full collection stops every thread for 30 ms on a small computer,
+    long enough for a node to skip a scan or a host to delay a SYNC. Enter the block after all setup is done.
+    Objects that exist on entry and become cyclic garbage are freed after the block.
     """
     gc.collect()
     gc.freeze()
@@ -26,7 +26,7 @@ def without_long_collections() -> Iterator[None]:
 
 @contextmanager
 def responsive_threads() -> Iterator[None]:
-    """Make a computing thread give way after 0.5 ms instead of Python's 5 ms, for the length of the block.
+    """Make computing threads yield after 0.5 ms, instead of Python's 5 ms, for the duration of the block.
 
     With 5 ms, a thread that receives or draws could delay a scan for longer than solving it takes.
     """

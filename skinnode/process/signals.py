@@ -1,4 +1,4 @@
-"""Lets a program that runs until Ctrl-C end the ordinary way."""
+"""Orderly termination of programs that run until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from types import FrameType
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that a signal to stop sets; handle the signals as before after the block.
+    """Yield an event that stop signals set, and restore the previous handlers after the block.
 
-    The signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal has closed). SIGHUP is left alone if it
-    is ignored, as under nohup.
+    The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). SIGHUP stays ignored if it was
+    ignored before, as under nohup.
 
     Raises:
-        ValueError: The caller is not the main thread, the only one that Python lets handle signals.
+        ValueError: If the caller is not the main thread; Python lets no other thread set signal handlers.
     """
     stop = threading.Event()
 

@@ -1,1 +1,1 @@
-"""Text for people and machines: plural forms, printable characters, JSON values."""
+"""Text output: plural forms, printable characters, HTML pages and JSON values."""

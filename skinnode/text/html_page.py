@@ -1,4 +1,4 @@
-"""The frame of every HTML page that this project writes, and the escaping of untrusted text in it."""
+"""Skeleton of all HTML pages of this project, and escaping of untrusted text in them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def page(title: str, style: str, body: Iterable[str]) -> str:
     Args:
         title: Untrusted text.
         style: CSS.
-        body: HTML elements; untrusted text in them has passed :func:`escaped`.
+        body: HTML elements, in which untrusted text is already escaped by :func:`escaped`.
     """
     return _PAGE.substitute(title=escaped(title), style=style, body="\n".join(body))
 

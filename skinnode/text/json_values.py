@@ -1,4 +1,4 @@
-"""Makes values fit for JSON."""
+"""Converts values to types that JSON supports."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` with tuples as lists, and None in place of NaN and infinity, which JSON lacks."""
+    """Return ``value`` with tuples as lists, and with None for NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,16 +1,16 @@
-r"""Makes untrusted text printable: the one place that decides what may reach a terminal, a log or a page.
+r"""Makes untrusted text printable; decides alone what may reach a terminal, a log or a page.
 
-Untrusted is any text from a device, a file, a recording or the command line. The rules:
+Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
 * Text from a bus or a data sheet is made printable, on one line and of limited length, where it is decoded
-  (:func:`printable`). The bytes themselves are preserved: in ``od --json``, in a DCF, in comparisons.
-* Names in hand.toml are refused unless they are printable (``skinnode.config``).
+  (:func:`printable`). The bytes themselves are preserved in ``od --json``, in a DCF and in comparisons.
+* Names in hand.toml are rejected unless they are printable (``skinnode.config``).
 * The output of every command passes through :class:`PrintableStream`, and rich output through the console of
-  ``skinnode.cli``: a safety net for everything echoed, such as file names and arguments.
+  ``skinnode.cli``: a safety net for echoed text such as file names and arguments.
 * Pages also escape HTML, and untrusted text is never interpreted as markup.
 
 Printable is defined by :meth:`str.isprintable`: no control characters (C0, DEL, C1), no format characters
-(such as those that reverse the direction of text, or have no width), no surrogates. Other characters are
+(which reverse the direction of text or have no width, for example), no surrogates. Other characters are
 shown as Python escapes: ``\x1b``, ``\u202e``.
 """
 
@@ -20,7 +20,7 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum characters shown of an untrusted text: more than any name needs, few enough for one line."""
+"""Maximum characters shown of an untrusted text; longer than any name, but short enough for one line."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
@@ -30,8 +30,8 @@ def printable(text: str | bytes, most: int = MOST) -> str:
     """Return ``text`` on one line, without control sequences.
 
     Args:
-        text: The text. Bytes are a VISIBLE_STRING: one character a byte, without trailing NULs.
-        most: Maximum characters; a longer text is cut and ends in ``…``.
+        text: The text. Bytes are read as a VISIBLE_STRING: one character per byte; trailing NULs are dropped.
+        most: Maximum characters; longer text is truncated and ends in ``…``.
     """
     if isinstance(text, bytes):
         text = text.rstrip(b"\0").decode("latin-1")
@@ -41,9 +41,9 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` without control sequences, at its full length and with its line ends and tabs.
+    """Return ``text`` without control sequences, in full length, with line ends and tabs.
 
-    It is meant for messages that contain untrusted parts.
+    Use this for messages that contain untrusted parts.
     """
     return text if text.isprintable() else _SUSPECT_IN_LINES.sub(_escaped, text)
 
@@ -54,9 +54,9 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """A text stream, such as stdout, that escapes control characters instead of passing them on.
+    """Text stream wrapper, for stdout for example, that escapes control characters.
 
-    Output of rich must bypass it, and does so by the attribute ``rich_proxied_file``.
+    Output of rich must bypass the wrapper and does so through the attribute ``rich_proxied_file``.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -9,11 +9,11 @@ def counted(number: int, one: str, several: str = "") -> str:
     Args:
         number: The number.
         one: The noun in the singular.
-        several: The noun in the plural, unless that is ``one`` and an s.
+        several: The noun in the plural; default ``one`` with an s appended.
     """
     return f"{number} {one}" if number == 1 else f"{number} {several or one + 's'}"
 
 
 def known(value: object) -> str:
-    """Return ``value`` as text, or *unknown* if it is None, because messages never show ``None``."""
+    """Return ``value`` as text, or "unknown" for None, because messages never show ``None``."""
     return "unknown" if value is None else str(value)

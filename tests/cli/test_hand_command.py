@@ -107,7 +107,7 @@ def test_a_file_that_cannot_be_used(tmp_path: Path) -> None:
     error = command("check", str(path)).exception
     assert isinstance(error, ConfigError)
     assert str(error).startswith(
-        f"{path}:6:3: patches[0].code_bit: got a key unknown here, allowed: a key of this table (did you mean"
+        f"{path}:6:3: patches[0].code_bit: got an unknown key, allowed: a key of this table (did you mean"
     )
 
 

@@ -77,7 +77,7 @@ def test_example_says_the_defaults() -> None:
         assert getattr(spare, part) == getattr(hand, part)
 
 
-NAME = "a text of 1 to 64 printable characters, not all of them blanks"
+NAME = "a string of 1 to 64 printable characters, not all blank"
 
 
 @pytest.mark.parametrize(
@@ -86,20 +86,20 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
         (
             ["patches", 1, "nodeid"],
             3,
-            "patches[1].nodeid: got a key unknown here, allowed: a key of this table "
+            "patches[1].nodeid: got an unknown key, allowed: a key of this table "
             "(did you mean node_id?): name, node_id, bus, link, pose, eds, layout, code_bits, "
             "serial, relative_noise, baseline, calibration",
         ),
         (
             ["colour"],
             "red",
-            "colour: got a key unknown here, allowed: a key of this table: "
+            "colour: got an unknown key, allowed: a key of this table: "
             "name, buses, patches, sync, bring_up, solver, stream, simulation",
         ),
         (
             ["sync", "overflow"],
             240,
-            "sync.overflow: got a key unknown here, allowed: a key of this table "
+            "sync.overflow: got an unknown key, allowed: a key of this table "
             "(did you mean counter_overflow?): period_ms, counter_overflow, stagger_ms",
         ),
         (
@@ -163,16 +163,19 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
         (
             ["buses", 0, "bitrate_bps"],
             5_000_000,
-            "buses[0].bitrate_bps: got 5000000, "
-            "allowed: an integer from 10000 to 1000000, as classic CAN has it",
+            "buses[0].bitrate_bps: got 5000000, allowed: an integer from 10000 to 1000000, as in classic CAN",
         ),
         (["sync", "period_ms"], 8.5, "sync.period_ms: got 8.5, allowed: an integer from 1 to 60000"),
-        (["sync", "stagger_ms"], -1, "sync.stagger_ms: got -1, allowed: a number of milliseconds from 0 on"),
+        (
+            ["sync", "stagger_ms"],
+            -1,
+            "sync.stagger_ms: got -1, allowed: a number of milliseconds of at least 0",
+        ),
         (
             ["sync", "counter_overflow"],
             241,
             "sync.counter_overflow: got 241, "
-            "allowed: an integer from 2 to 240; 0 where all buses are a guest's",
+            "allowed: an integer from 2 to 240; or 0 if the host is a guest on all buses",
         ),
         (
             ["solver", "operator"],
@@ -183,14 +186,14 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
             (
                 ["buses", 0, "options"],
                 {"port": 1, key: [1]},
-                f"buses[0].options.{key}: got [1], allowed: a text, a number, true or false",
+                f"buses[0].options.{key}: got [1], allowed: a string, a number, true or false",
             )
             for key in ("a", "role")
         ),
         (
             ["buses", 0, "options"],
             {"bitrate": 500000},
-            "buses[0].options.bitrate: got 500000, allowed: no such option here: [[buses]] has a key for it",
+            "buses[0].options.bitrate: got 500000, allowed: use the key of [[buses]] instead",
         ),
         (
             ["buses", 0, "others"],
@@ -235,8 +238,7 @@ NAME = "a text of 1 to 64 printable characters, not all of them blanks"
         (
             ["patches", 0, "calibration", "upper_gain"],
             [1.0, 1.01],
-            "patches[0].calibration.upper_gain: got [1.0, 1.01], "
-            "allowed: 10 numbers, one for each upper wire",
+            "patches[0].calibration.upper_gain: got [1.0, 1.01], allowed: 10 numbers, one per upper wire",
         ),
         (["simulation", "depth"], 1.0, "simulation.depth: got 1.0, allowed: a number from 0 to below 1"),
     ],
@@ -350,7 +352,7 @@ def test_nesting_has_an_end(text: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_hand(path)
     assert str(caught.value) == (
-        f"{path}: hand file: got deeper nesting, allowed: tables and arrays in up to 32 others"
+        f"{path}: hand file: got deeper nesting, allowed: tables and arrays nested up to 32 deep"
     )
 
 
@@ -430,7 +432,7 @@ def test_options_do_not_change() -> None:
 def test_a_misspelt_required_key_is_named_as_such() -> None:
     table = {"buses": [{}], "patches": [{"name": "palm", "node_idd": 3}]}
     with pytest.raises(
-        ConfigError, match=r"patches\[0\]\.node_idd: got a key unknown here, .* \(did you mean node_id\?\)"
+        ConfigError, match=r"patches\[0\]\.node_idd: got an unknown key, .* \(did you mean node_id\?\)"
     ):
         parse_hand(table)
 
@@ -445,6 +447,6 @@ def test_a_guest_says_what_the_master_does() -> None:
     with pytest.raises(ConfigError) as caught:
         parse_hand(table)
     assert str(caught.value) == (
-        "sync.period_ms: got nothing, allowed: that of the SYNC on can1, where the host is a guest"
+        "sync.period_ms: got nothing, allowed: the period of the SYNC on can1, where the host is a guest"
     )
     assert parse_hand(table | {"sync": {"period_ms": 80}}).sync.period_ms == 80

@@ -108,7 +108,7 @@ def test_every_key_of_any_document_has_its_place(table: dict[str, Any]) -> None:
     [
         (HEAD + "bus = 7\n", ":6:1: patches[0].bus: got 7, "),
         (HEAD.replace("node_id = 1\n", ""), ":3:1: patches[0].node_id: got nothing, "),
-        (HEAD + "[patches.layout]\npitch_mm = 4\n", ":7:1: patches[0].layout.pitch_mm: got a key "),
+        (HEAD + "[patches.layout]\npitch_mm = 4\n", ":7:1: patches[0].layout.pitch_mm: got an unknown key, "),
         (
             HEAD + "pose = { position_m = [0.0, 'x', 1.0] }\n",
             ":6:29: patches[0].pose.position_m[1]: got 'x', ",
@@ -175,7 +175,7 @@ def test_keys_of_a_preset_in_a_file(tmp_path: Path) -> None:
             b"upper_m = [[[0.0, 0.0, 1.0]]]\nlower_m = [[[0.0, 0.0, 0.0]]]\npitch_m = 1.0",
             "pitch_m: got an unknown key, allowed: one of upper_m, lower_m, resistivity_ohm_per_m",
         ),
-        ("bad.toml", b'file = "bad.toml"', "file: got 'bad.toml', allowed: nothing in a layout file"),
+        ("bad.toml", b'file = "bad.toml"', "file: got 'bad.toml', allowed: only in a hand file"),
         ("bad.toml", b"height_m = -1", "bad.toml:1:1: height_m: got -1, allowed: a number of metres"),
     ],
 )
@@ -205,5 +205,5 @@ def test_keys_beside_a_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_hand(path)
     assert str(caught.value) == (
-        f"{path}:6:32: patches[0].layout.pitch_m: got 0.001, allowed: only without layout.file, which sets it"
+        f"{path}:6:32: patches[0].layout.pitch_m: got 0.001, allowed: only without layout.file"
     )

@@ -261,7 +261,7 @@ def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: Han
         (
             "period_ms = 200",
             "periode_ms = 200",
-            ":8:1: sync.periode_ms: got a key unknown here, allowed: a key of this table "
+            ":8:1: sync.periode_ms: got an unknown key, allowed: a key of this table "
             "(did you mean period_ms?): period_ms, counter_overflow, stagger_ms",
         ),
         (

@@ -383,7 +383,7 @@ def test_a_layout_file_is_read_strictly(tmp_path: Path) -> None:
     for text, says in (
         (
             "pitch = 1",
-            ":1:1: pitch: got a key unknown here, allowed: a key of this table (did you mean pitch_m?)",
+            ":1:1: pitch: got an unknown key, allowed: a key of this table (did you mean pitch_m?)",
         ),
         ("upper_wires = 0", ":1:1: upper_wires: got 0, allowed: an integer from 1 to 254"),
         ("upper_wires = = 3", ": line 1, column 15: got 'upper_wires = = 3', allowed: TOML"),

@@ -1,7 +1,8 @@
 """Recordings of a hand: written while a host runs, and replayed as the same fields.
 
-``recorder`` writes raw frames to a candump log or BLF file and, beside it, a ``journal`` of what else decided
-how the host decoded them. ``replay`` reads both and decodes the frames with the host's own code.
+``recorder`` writes raw frames to a candump log or BLF file and, next to it, a ``journal`` of the other events
+that determined how the host decoded the frames. ``replay`` reads both and decodes the frames with the host's
+own code.
 """
 
 from skinnode.record.recorder import Recorder, RecorderStats

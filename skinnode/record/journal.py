@@ -1,21 +1,21 @@
-"""The journal of a recording: JSON lines, beside the log, of what a replay needs besides the frames.
+"""Journal of a recording: JSON lines next to the log, holding what a replay needs besides the frames.
 
-The first line holds the hand and the offset of its clock (:class:`Header`). Each further line is an event
-that decided what the host made of the frames. ``bus`` and ``at`` say after how many received frames of which
-bus it happened, ``t_ns`` when (monotonic clock of the host).
+The first line holds the hand and the offset of the host's clock (:class:`Header`). Each further line is an
+event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
+the event, ``t_ns`` its time (monotonic clock of the host).
 
 =============  ==============================================================================
 ``event``      meaning
 =============  ==============================================================================
 ``resumed``    scans of ``patch`` are decoded with ``facts`` (baseline, scale, serial number, and the layout
                if it differs from the hand's) or, without ``facts``, with the same solver as before;
-               ``anew``: what was assembled before is discarded
-``withheld``   scans of ``patch`` are not decoded any more
-``polled``     the clock ended a scan that lacked frames
+               ``anew``: scans assembled so far are discarded
+``withheld``   scans of ``patch`` are no longer decoded
+``polled``     a timeout ended a scan that lacked frames
 ``overtaken``  ``scan`` of ``patch``, complete at ``received_ns``, was skipped for a newer one
 ``dropped``    ``frames`` were not written, because the disk was too slow
-``ended``      the recording ended with ``frames`` in the log; without this event its process was killed or
-               the disk was full
+``ended``      the recording was closed with ``frames`` in the log; if this event is missing, the process was
+               killed or the disk was full
 =============  ==============================================================================
 """
 
@@ -40,11 +40,12 @@ FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
 
 COMPLAINTS_KEPT: Final = 100
-"""Maximum unreadable lines named; more are only counted."""
+"""Maximum unreadable lines reported one by one; further lines are only counted."""
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum bytes of a line: the facts of the largest patch take one. A longer line is read as several."""
+"""Maximum bytes per line: enough for the facts of the largest patch. A longer line is read as several
+lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 
@@ -56,7 +57,7 @@ class Header:
     started: str
     """Local date and time, ISO 8601."""
     wall_minus_mono_ns: int
-    """Subtracted from the times in the log, gives times of the host's monotonic clock."""
+    """Offset that, subtracted from a time in the log, gives the time on the host's monotonic clock, ns."""
 
     def line(self) -> str:
         """Return the header as a line of JSON."""
@@ -66,7 +67,7 @@ class Header:
 
 
 def _without_paths(value: Any) -> Any:
-    """Remove file names: bring-up needed them, a replay has their contents."""
+    """Remove file names, which only bring-up needs; the journal holds the contents of the files."""
     if isinstance(value, Mapping):
         kept = {key: item for key, item in value.items() if not isinstance(item, Path)}
         return {key: _without_paths(item) for key, item in kept.items()}
@@ -76,7 +77,7 @@ def _without_paths(value: Any) -> Any:
 
 
 def facts_table(facts: NodeFacts) -> dict[str, Any]:
-    """Return NodeFacts as JSON; numbers survive bit by bit."""
+    """Return NodeFacts as a JSON table that preserves every bit of its numbers."""
     layout, planned = facts.layout, facts.config.layout.build()
     same = np.array_equal(layout.upper_m, planned.upper_m) and np.array_equal(layout.lower_m, planned.lower_m)
     own = {"upper_m": layout.upper_m.tolist(), "lower_m": layout.lower_m.tolist(), "name": layout.name}
@@ -93,7 +94,7 @@ def facts_table(facts: NodeFacts) -> dict[str, Any]:
 
 
 def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> NodeFacts:
-    """Return the NodeFacts of :func:`facts_table`.
+    """Rebuild NodeFacts from the result of :func:`facts_table`.
 
     Args:
         table: Content of a journal line.
@@ -123,7 +124,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # the first versions lack it: their nodes sent no checks
+    checked = table.get("checked", False)  # absent in the first versions, whose nodes sent no checks
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(
@@ -138,7 +139,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         path: The journal.
 
     Returns:
-        Header, events, and a line of text for each line that cannot be read.
+        Header, events, and one line of text per line that cannot be read.
 
     Raises:
         ConfigError: The journal cannot be read, or its first line is not a header.
@@ -196,7 +197,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # the first versions did not count
+            _whole(event.get("frames", 0))  # absent in the first versions
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])
@@ -207,7 +208,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
 
 
 def _whole(value: object, least: int = 0) -> int:
-    """Return ``value`` if it is an integer of 64 bits, at least ``least``. Raises ValueError otherwise."""
+    """Return ``value`` if it is a 64-bit integer of at least ``least``. Raises ValueError otherwise."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= _MOST:
         raise ValueError
     return value

@@ -1,7 +1,7 @@
-"""Records a host while it runs.
+"""Records the frames of a running host.
 
-The host's threads put entries into a queue; the recorder's own thread writes them, so that a slow disk delays
-only the recording.
+The host's threads queue entries and the recorder's own thread writes them, so that a slow disk delays only
+the recording.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFr
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""Interval of flushes to the kernel: older entries survive this process."""
+"""Interval of flushes to the kernel: older entries survive a crash of this process."""
 
 SYNC_S: Final = 1.0
-"""Interval of fsync: older entries are on the disk. An fsync takes about 10 ms, on the writer thread only."""
+"""Interval of fsync: older entries are on the disk. Each fsync takes the writer thread about 10 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum batches queued for the disk: some seconds of four full buses."""
+"""Maximum batches queued for the disk: several seconds of four fully loaded buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -52,7 +52,7 @@ class RecorderStats:
     dropped: int
     """Frames not written, because the disk was too slow or failed."""
     failure: str | None
-    """Why nothing is written any more, in one line; None if all is well."""
+    """One-line reason why writing has stopped; None while the recorder works."""
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
@@ -64,7 +64,7 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 def make_folder(path: Path) -> Path | None:
     """Create the folder ``path`` with its parents, and return it; None if it existed already.
 
-    A name with a suffix is taken for a misspelt recording. Raises ConfigError for such a name, or if the
+    A name with a suffix counts as a misspelt recording file. Raises ConfigError for such a name, or if the
     folder cannot be created.
     """
     if path.is_dir():
@@ -89,17 +89,17 @@ def _is_folder(path: Path) -> bool:
 
 
 class Recorder:
-    """A recording, from construction to :meth:`close`; the host's ``tap``.
+    """Recording of a host, from construction to :meth:`close`; the host takes it as ``tap``.
 
     Example::
 
         with Recorder(hand, "runs/") as recorder, Host.from_config(hand, tap=recorder) as host:
             ...
 
-    A recording that begins before the host does replays bit by bit. One that begins while the host runs
-    (:meth:`Host.tap`) lacks the solvers' memory. A ``with`` block that fails before the first frame leaves no
-    file. If the disk fails, the recording ends, one log line says so, and the host continues. An entry that
-    raises any other exception is lost, and counted in ``dropped``.
+    A recording that begins before the host starts is replayed bit by bit. A recording that begins while the
+    host runs (:meth:`Host.tap`) lacks the state of the solvers. A ``with`` block that fails before the first
+    frame leaves no file. If the disk fails, the recording ends, one log line reports it, and the host
+    continues. An entry that raises any other exception is lost and counted in ``dropped``.
 
     Args:
         hand: The hand.
@@ -166,11 +166,11 @@ class Recorder:
         self._event(patch, "resumed", anew=anew, **facts)
 
     def withheld(self, patch: str) -> None:
-        """Record that scans of a patch are not decoded any more."""
+        """Record that scans of a patch are no longer decoded."""
         self._event(patch, "withheld")
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """Record that the clock ended a scan."""
+        """Record that a timeout ended a scan."""
         self._event(patch, "polled", t_ns=t_ns)
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
@@ -217,7 +217,7 @@ class Recorder:
         self._log.close()
 
     def _turn(self) -> bool:
-        """Wait briefly for the next entry and write it. Returns whether to go on."""
+        """Wait briefly for the next entry and write it. Returns whether to continue."""
         if self._ended:
             return False
         with suppress(queue.Empty):
@@ -245,7 +245,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal before the log: it must not know less."""
+        """Flush the journal before the log, so that the journal is never behind."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", time.monotonic_ns(), "dropped", frames=lost)
@@ -273,7 +273,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return the channel of each bus in a log: its name, if candump could have written it."""
+    """Return the log channel of each bus: its name if candump allows that name, otherwise a numbered one."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

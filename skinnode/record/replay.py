@@ -1,12 +1,12 @@
-"""Replays a recording as fields, with the code that decodes them live.
+"""Replays a recording as fields, with the code that decodes live frames.
 
-Dispatcher, assembler, decoder, stream, solver and publisher are the host's. Nothing here has a thread: each
-scan is solved when its last frame is dispatched.
+Dispatcher, assembler, decoder, stream, solver and publisher are the host's. No threads are used: each scan is
+solved when its last frame is dispatched.
 
-**Same as live.** The fields of scans that were solved live are equal bit by bit if the recording began before
-the host did and is whole, build and processor are the same, and no deadline cut a solve short. Times are
-those of the recording host's clock, to 1 µs, as log files have them. If frames are missing or damaged, events
-of the journal are placed by time instead of by count, and the time of the frames ends incomplete scans.
+**Same as live.** Scans that were solved live give bit-identical fields if the recording began before the host
+started and is complete, build and processor are the same, and no deadline cut a solve short. Times are on the
+recording host's clock, to 1 µs, the resolution of log files. If frames are missing or damaged, journal events
+are placed by time instead of by frame count, and the times of later frames end incomplete scans.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
-"""Maximum silence replayed; a longer one may be a damaged time."""
+"""Maximum silence replayed; a longer silence may come from a damaged timestamp."""
 
 _ROUNDING_NS: Final = 2_000
-"""Maximum rounding error of a time in a log."""
+"""Maximum rounding error of a timestamp in a log."""
 
 _SLICE_S: Final = 0.1
 """Maximum delay of :meth:`Replay.stop`."""
@@ -57,7 +57,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    No scan that was solved live is skipped, whatever the speed.
+    No scan that was solved live is skipped, at any speed.
 
     Args:
         path: File ending in .log or .blf.
@@ -71,7 +71,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
 
 
 class Replay:
-    """A recording being replayed; see :func:`replay`. Iterate once; then read the counters."""
+    """Replay of a recording; see :func:`replay`. Iterate once, then read the counters."""
 
     def __init__(self, path: Path, speed: float | None, cancelled: Callable[[], bool] = _never) -> None:
         if speed is not None and not 0 < speed < float("inf"):
@@ -79,20 +79,20 @@ class Replay:
         if not path.name:
             raise ConfigError("recording", str(path), "a file ending in .log or .blf")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
-        """One line for each part of the journal that cannot be read."""
+        """One line per part of the journal that cannot be read."""
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
         """The log; ``damaged`` and ``damages`` report what cannot be read."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
-        """Whether the recording was ended, not killed."""
+        """Whether the recording was closed, not killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """After a complete iteration: what the log lacks, in one line; None if it is complete."""
+        """After a complete iteration: one line on what the log lacks; None if the log is complete."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Frames that the recorder could not write."""
         self._now_ns = 0
@@ -148,10 +148,10 @@ class Replay:
 
     @property
     def flaws(self) -> list[str]:
-        """Missing or unreadable parts of the recording, one line each; all after a complete iteration."""
+        """Missing or unreadable parts of the recording, one line each; final after a complete iteration."""
         found = [f"{self.log.path.name} {damage}" for damage in self.log.damages]
         if self.log.damaged > len(found):
-            found.append(f"{self.log.damaged - len(found)} more places like these")
+            found.append(f"{self.log.damaged - len(found)} more damaged places")
         if self.incomplete is not None:
             found.append(f"{self.log.path.name} {self.incomplete}")
         found += self.complaints
@@ -159,7 +159,7 @@ class Replay:
             lost = counted(self.dropped, "frame was", "frames were")
             found.append(f"{lost} not recorded: the disk was too slow")
         if self.strange:
-            found.append(f"{counted(self.strange, 'frame')} on channels that no bus of the hand has")
+            found.append(f"{counted(self.strange, 'frame')} on channels of no bus in the hand")
         return found
 
     def stop(self) -> None:
@@ -168,7 +168,7 @@ class Replay:
 
     @property
     def stopped(self) -> bool:
-        """Whether the iteration was ended before the end of the recording."""
+        """Whether the iteration was stopped before the end of the recording."""
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
@@ -197,7 +197,7 @@ class Replay:
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
-        """Return the time in the recording, ns of its host's monotonic clock."""
+        """Return the current time in the recording, ns on its host's monotonic clock."""
         return self._now_ns
 
     @property
@@ -226,7 +226,7 @@ class _Pace:
 
 
 class _PollerlessDispatcher(Dispatcher):
-    """A dispatcher that never polls: the journal says when streams are polled, not the end of a batch."""
+    """Dispatcher that never polls streams: the journal determines when to poll, not the end of a batch."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass
@@ -255,7 +255,7 @@ class _Bus:
         self._received = self._sent = 0
 
     def take(self, frame: Any, *, sent: bool, whole: bool) -> None:
-        """Process the next frame of the log; ``whole``: no frame before it was damaged."""
+        """Process the next frame of the log; ``whole`` means that the log is undamaged so far."""
         if sent:
             self._sent += 1
             self._dispatcher.count_sent(frame.can_id, frame.data)
@@ -299,7 +299,7 @@ class _Bus:
                     stream.resume(solver, stream.withholdings, anew=bool(event.get("anew")))
 
     def _solver(self, event: dict[str, Any]) -> ScanSolver | None:
-        """Return the solver of an event; None if its facts are unknown."""
+        """Return the solver for an event; None if its facts are unknown."""
         name, replay = event["patch"], self._replay
         if "facts" in event:
             self._solvers[name] = None

@@ -1,6 +1,6 @@
-"""CAN interfaces: ports on buses, the threads that receive on them, and log files of frames.
+"""CAN interfaces: bus ports, their receiving threads, and frame log files.
 
-No other room uses python-can at run time.
+No other package of the project uses python-can at run time.
 """
 
 from skinnode.transport.frame import Frame

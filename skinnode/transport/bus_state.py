@@ -1,6 +1,6 @@
-"""Fault confinement states of a CAN controller (ISO 11898-1) as SocketCAN's error frames report them.
+"""Fault confinement states of a CAN controller (ISO 11898-1), as reported by SocketCAN error frames.
 
-The coding of the error frames is that of <linux/can/error.h>.
+The error frames are coded as in <linux/can/error.h>.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""A bus of UDP packets for load tests: each packet holds one frame in SocketCAN's memory layout.
+"""UDP bus for load tests: each packet holds one frame in SocketCAN's memory layout.
 
-The reader is exactly that of SocketCAN: the same system calls, kernel timestamps, bounded buffer and drop
-counter. Only the CAN driver and the protocol below the socket differ: UDP over the loopback device takes
-their place and costs the receiver about as much.
+The reader is SocketCAN's, with the same system calls, kernel timestamps, bounded buffer and drop counter.
+Only the CAN driver and the protocol below the socket differ: UDP over the loopback device replaces them and
+costs the receiver about as much.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _MTU: Final = {False: 8, True: 64}  # bytes of data in <linux/can.h>'s struct ca
 
 
 def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
-    """Return the packet of a frame with an 11-bit identifier.
+    """Return the packet for a frame with an 11-bit identifier.
 
     Args:
         can_id: 0 to 0x7FF.
@@ -32,16 +32,16 @@ def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
 
 
 def free_channel() -> str:
-    """Return a UDP port of this machine on which no program listens at the moment."""
+    """Return a UDP port of this machine on which no program currently listens."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((LOOPBACK, 0))
         return str(sock.getsockname()[1])
 
 
 class DatagramPort(CanPort):
-    """A port that receives packets and sends nothing.
+    """Port that receives packets and never sends.
 
-    ``channel`` of its configuration is the number of a UDP port.
+    The ``channel`` of its configuration is a UDP port number.
     """
 
     def _open(self) -> can.BusABC:

@@ -1,4 +1,4 @@
-"""A received frame, the same for every interface."""
+"""Received frame, in the same form for every interface."""
 
 from __future__ import annotations
 

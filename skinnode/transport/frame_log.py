@@ -1,9 +1,9 @@
-"""Write frames to a file with python-can's writers: candump's text (``.log``) or Vector's BLF.
+"""Writes frames to a file with python-can's writers: candump text (``.log``) or Vector BLF.
 
-Both keep all frames written before the last :meth:`FrameLog.flush`, whatever happens to the process later. A
-``.log`` file only grows. python-can's BLF writer holds back up to 128 kB of frames, and corrects the file
-header when it stops; so each flush stops the writer and opens another that appends, which leaves a complete
-BLF file each time.
+Both formats keep all frames written before the last :meth:`FrameLog.flush`, even if the process is killed
+later. A ``.log`` file is only appended to. python-can's BLF writer buffers up to 128 kB of frames and
+corrects the file header only when it stops. Each flush therefore stops the writer, which leaves a complete
+BLF file, and opens another writer that appends.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SUFFIXES: Final = (".log", ".blf")
 
 _CONTAINER_BYTES: Final = 1 << 20
 """Maximum size of a BLF container before compression: more than is written between two flushes, so that no
-frame is split over two containers."""
+frame is split between two containers."""
 
 
 class LoggedFrame(NamedTuple):
@@ -31,13 +31,13 @@ class LoggedFrame(NamedTuple):
 
     frame: Frame
     channel: str
-    """Name of the channel; in BLF, which numbers channels, its number counted from 0."""
+    """Name of the channel; in BLF, which numbers channels, the channel number, counted from 0."""
     sent: bool
-    """Whether the recording program sent it."""
+    """Whether the recording program sent the frame."""
 
 
 class FrameLog:
-    """A log file that is being written. Owned by one thread.
+    """Log file being written. Owned by one thread.
 
     Args:
         path: A new file ending in ``.log`` or ``.blf``.
@@ -45,7 +45,7 @@ class FrameLog:
 
     Raises:
         ConfigError: if the file exists already, or cannot be created.
-        OSError: from the other methods, if the disk does not take what is written.
+        OSError: from the other methods, if writing to the disk fails.
     """
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
@@ -61,7 +61,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame; it is safe after the next :meth:`flush`."""
+        """Write a frame, which is safe after the next :meth:`flush`."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()
@@ -85,7 +85,7 @@ class FrameLog:
         """Pass everything written so far to the kernel, which keeps it if this process is killed.
 
         Args:
-            to_disk: Also wait until the disk has it, so that it survives a loss of power.
+            to_disk: Whether to wait until the data is on the disk, so that it survives a loss of power.
         """
         if self._is_blf:
             self._end_blf()
@@ -95,7 +95,7 @@ class FrameLog:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """End the file. Never raises: earlier calls have already reported what could not be written."""
+        """Close the file. Never raises: earlier calls have already reported write errors."""
         with contextlib.suppress(OSError):
             self.flush(to_disk=True)
         with contextlib.suppress(OSError):
@@ -131,4 +131,4 @@ def create(path: Path) -> TextIO:
             "recording", str(path), "a new file; this one exists and is not overwritten"
         ) from None
     except OSError as error:
-        raise ConfigError("recording", str(path), f"a file that can be made ({error.strerror})") from None
+        raise ConfigError("recording", str(path), f"a file that can be created ({error.strerror})") from None

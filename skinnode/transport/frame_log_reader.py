@@ -1,8 +1,8 @@
-"""Read frames from a candump log or a BLF file, damaged or not.
+"""Reads frames from a candump log or a BLF file, even if the file is damaged.
 
 A truncated or partly overwritten file yields every complete frame; the damage is counted and located by line
-or offset (:class:`Damage`). No content of a file raises. A byte changed into another of the same kind shows
-in BLF, whose containers have checksums, but not in a candump log, which has none.
+or offset (:class:`Damage`). No file content raises an exception. A changed byte that is still valid is
+detected in BLF, whose containers have checksums, but not in a candump log, which has no checksum.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.frame_log import SUFFIXES, LoggedFrame
 
 DAMAGES_KEPT: Final = 100
-"""Maximum number of damages described; further ones are only counted."""
+"""Maximum number of damaged places described; further places are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A piece of a file that could not be read."""
+    """Part of a file that could not be read."""
 
     line: int | None
     """Line number, counted from 1; None in BLF, which has no lines."""
@@ -45,7 +45,7 @@ class Damage:
 
 
 class FrameLogReader:
-    """A log, read once from the beginning by iterating over it. Owned by one thread.
+    """Log file, read once from the beginning by iterating over it. Owned by one thread.
 
     Raises:
         ConfigError: if the file cannot be opened, or its name does not end in ``.log`` or ``.blf``.
@@ -60,9 +60,9 @@ class FrameLogReader:
             raise ConfigError("recording", str(path), f"a file that can be read ({error.strerror})") from None
         self.path = path
         self.damages: list[Damage] = []
-        """The first :data:`DAMAGES_KEPT` damages."""
+        """The first :data:`DAMAGES_KEPT` damaged places."""
         self.damaged = 0
-        """Number of damages up to the present position."""
+        """Number of damaged places up to the current position."""
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         with self._file:
@@ -134,22 +134,22 @@ class FrameLogReader:
                 self._complain(None, at, "cut off: a container without its end")
             return min(end, len(data)), body
         if method != _DEFLATE:
-            self._complain(None, at, f"a container packed by unknown method {method}")
+            self._complain(None, at, f"a container compressed by unknown method {method}")
             return min(end, len(data)), None
         inflater = zlib.decompressobj()
         try:
             objects = inflater.decompress(body, _MOST_INFLATED)
         except zlib.error as error:
-            self._complain(None, at, f"a container that does not unpack ({error})")
+            self._complain(None, at, f"a container that cannot be decompressed ({error})")
             return at + _OBJECT.size, None  # its length may be wrong too
         if not inflater.eof:
             self._complain(None, at, "cut off: a container without its end")
         return min(end, len(data)), objects
 
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
-        """Return the complete objects of ``data``, and the beginning of an incomplete one at its end."""
+        """Return the complete objects in ``data``, and the beginning of an incomplete object at its end."""
         pieces: list[bytes] = []
-        begin = at = 0  # begin: of the objects read so far; at: of the next object
+        begin = at = 0  # offsets: begin, objects found since the last gap; at, next object
         while True:
             start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
             if start < 0 and len(data) - at <= _PADDING_BYTES:
@@ -173,13 +173,13 @@ class FrameLogReader:
                 at = start + length
 
     def _frames(self, header: bytes, objects: bytes, container: int) -> Iterator[LoggedFrame]:
-        """Yield the frames among ``objects``. python-can reads them from a small file of nothing else."""
+        """Yield the frames among ``objects``, read by python-can from a small file of these objects."""
         head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _CONTAINER_HEAD_BYTES + len(objects), _LOG_CONTAINER)
         file = io.BytesIO(header + head + struct.pack("<H6xL4x", _STORED, len(objects)) + objects)
         try:
             for message in can.BLFReader(file):
                 yield _blf_frame(message)
-        except Exception as error:  # python-can does not catch what its parser raises
+        except Exception as error:  # python-can does not catch its parser's exceptions
             self._complain(None, container, f"objects that cannot be read ({type(error).__name__}: {error})")
 
 
@@ -195,7 +195,7 @@ _ERROR_BIT: Final = 0x2000_0000
 
 
 def _candump_frame(line: bytes) -> LoggedFrame | None:
-    """Return the frame on a line as ``candump -L`` and python-can write it; None for other or cut lines."""
+    """Return the frame on a line as written by ``candump -L`` or python-can; None for any other line."""
     match = _LINE.fullmatch(line)
     if match is None:
         return None

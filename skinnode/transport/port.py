@@ -1,8 +1,8 @@
-"""An endpoint on a CAN bus, the same for every interface.
+"""Endpoint on a CAN bus, with the same behaviour on every interface.
 
-Each error of python-can leaves here as a one-line :class:`~skinnode.errors.BusError`. Times are those of the
-host's monotonic clock. If the interface stamps frames with the wall clock (virtual, udp_multicast,
-socketcan), the age of the stamp is subtracted, so that waiting in a queue does not change a frame's time.
+Each python-can error is raised as a one-line :class:`~skinnode.errors.BusError`. Times are on the host's
+monotonic clock. If the interface stamps frames with the wall clock (virtual, udp_multicast, socketcan), the
+age of the stamp is subtracted, so that waiting in a queue does not change a frame's time.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Capacity of an endpoint of python-can's virtual bus: about 4 s of a full bus at 1 Mbit/s. Without a limit,
-an endpoint that is never read would fill the memory."""
+"""Queue capacity of an endpoint on python-can's virtual bus: about 4 s of a fully loaded bus at 1 Mbit/s.
+Without a limit, an endpoint that is never read would fill the memory."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
 """Size of the receive buffer requested from the kernel, if the interface is a socket; a waiting frame takes
@@ -44,20 +44,20 @@ _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
 
 _OLDEST_STAMP_S: Final = 10.0
-"""Maximum age of a timestamp. An older stamp, or one in the future, is not of this machine's wall clock, so
+"""Maximum age of a timestamp. An older or future timestamp does not come from this machine's wall clock, so
 the time of reading is used."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Errors by which the kernel reports, once for each socket, that its interface went down; the sender may be
-the one that gets it."""
+"""Errors by which the kernel reports, once per socket, that its interface went down; a send may receive them
+instead of a receive."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 
-# python-can's loggers warn on stderr where a program has set up no logging, also of what BusError says
-# already.
+# In a program without logging, python-can's loggers would warn on stderr, even of errors that BusError
+# reports.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
@@ -74,9 +74,9 @@ def allowed_interfaces(config: BusConfig) -> str:
 
 
 class _Message(can.Message):
-    """A message that copies five times as fast as python-can's.
+    """Message that is copied five times as fast as python-can's.
 
-    Its virtual bus copies one for each receiver.
+    python-can's virtual bus copies each message once per receiver.
     """
 
     __slots__ = ()
@@ -99,9 +99,9 @@ class _Message(can.Message):
 
 
 class CanPort:
-    """An open endpoint on a bus, from construction to :meth:`close` or the end of a ``with`` block.
+    """Open endpoint on a bus, from construction to :meth:`close` or the end of a ``with`` block.
 
-    An endpoint does not receive what it sent itself. python-can's configuration files and environment
+    An endpoint does not receive its own frames. python-can's configuration files and environment
     variables are ignored.
 
     Threads: any thread may send; one thread receives.
@@ -121,7 +121,7 @@ class CanPort:
         self._link_gone: Exception | None = None
         self._counting = threading.Lock()  # several threads count sent frames; see send()
         self._sent = self._received = self._errors = self._undelivered = self._malformed = 0
-        self._dropped_before = 0  # by readers before the present one
+        self._dropped_before = 0  # by earlier readers
         self._away = False
         self._bus = self._open()
         self._reader = self._open_reader()
@@ -154,7 +154,7 @@ class CanPort:
         return bus
 
     def _open_reader(self) -> SocketReader | None:
-        """Return the reader that takes python-can's place, or None if python-can reads."""
+        """Return the reader that replaces python-can's, or None if python-can receives."""
         bus: Any = self._bus  # python-can's SocketcanBus
         return SocketReader(bus.socket) if self.config.interface == _SOCKETCAN else None
 
@@ -174,7 +174,7 @@ class CanPort:
 
     @property
     def received(self) -> int:
-        """Number of frames read, without the endpoint's own."""
+        """Number of frames read, excluding the endpoint's own."""
         return self._received
 
     @property
@@ -184,7 +184,7 @@ class CanPort:
 
     @property
     def undelivered(self) -> int:
-        """Frames that another endpoint of a virtual bus had no room for and lost."""
+        """Frames lost because another endpoint of a virtual bus had no room for them."""
         return self._undelivered
 
     @property
@@ -200,8 +200,8 @@ class CanPort:
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """Send a frame with an 11-bit identifier.
 
-        More than 8 bytes, on a bus with ``fd``, make a CAN FD frame with bit-rate switch, padded with zeros
-        to a valid length. On a virtual bus, a full queue of another endpoint is that endpoint's loss.
+        On a bus with ``fd``, more than 8 bytes are sent as a CAN FD frame with bit-rate switch, padded with
+        zeros to a valid length. On a virtual bus, another endpoint whose queue is full loses the frame.
 
         Args:
             can_id: 0 to 0x7FF.
@@ -209,7 +209,7 @@ class CanPort:
             remote: Whether to send a remote frame.
 
         Raises:
-            BusError: if the interface does not take the frame.
+            BusError: if the interface rejects the frame.
             ValueError: if the identifier or the length is out of range for this bus.
         """
         if not 0 <= can_id <= 0x7FF:
@@ -244,7 +244,7 @@ class CanPort:
             self._undelivered += undelivered
 
     def recv(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None if none came within ``timeout_s``.
+        """Return the next frame, or None if none arrives within ``timeout_s``.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -253,10 +253,10 @@ class CanPort:
         return batch[0] if batch else None
 
     def recv_batch(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the waiting frames; wait for the first if there is none.
+        """Return the waiting frames; if there are none, wait for the first.
 
         Args:
-            timeout_s: Longest wait for the first frame, s.
+            timeout_s: Maximum wait for the first frame, s.
             most: Maximum number of frames. Interfaces other than socketcan return one at a time.
 
         Raises:
@@ -290,16 +290,16 @@ class CanPort:
                     self._errors += 1
                     raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
                 self._malformed += 1
-            # The endpoint's own frame, or not a frame: wait for the rest of the time.
+            # The endpoint's own frame, or a malformed packet: wait for the remaining time.
             timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
         """Close and open the interface again after it failed; the counters continue.
 
-        While it is closed, sending raises BusError. The receiving thread must have ended before.
+        While it is closed, sending raises BusError. The receiving thread must have ended first.
 
         Raises:
-            BusError: if the interface does not open; it may be tried again later.
+            BusError: if the interface does not open; a later call may succeed.
         """
         if not self._away:
             self._away = True
@@ -311,10 +311,10 @@ class CanPort:
         self._away = False
 
     def set_bitrate(self, bitrate_bps: int) -> None:
-        """Change the bit rate and open the interface again.
+        """Change the bit rate and reopen the interface.
 
-        The bit rate of socketcan is set by ``ip link``, which needs the capability CAP_NET_ADMIN. The
-        receiving thread must have ended before.
+        On socketcan, ``ip link`` sets the bit rate and needs the capability CAP_NET_ADMIN. The receiving
+        thread must have ended first.
 
         Raises:
             BusError: if the bit rate is not accepted; the interface is then open at the previous rate.
@@ -331,7 +331,7 @@ class CanPort:
             self.reopen()
 
     def close(self) -> None:
-        """Close the interface. Closing twice is allowed; the receiving thread must have ended before."""
+        """Close the interface. Closing twice is allowed; the receiving thread must have ended first."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()
@@ -349,15 +349,15 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Request a large receive buffer, and the frames of this multicast group only."""
+    """Request a large receive buffer, and frames of this multicast group only."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:
             duplicate.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
         except OSError:  # only root may exceed net.core.rmem_max
             duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        # python-can binds to any address, and such a socket receives every group that any program has
-        # joined: two buses on two groups would be one.
+        # python-can binds to any address. Such a socket receives every group that any program has joined, so
+        # two buses on two groups would be merged.
         if duplicate.family == socket.AF_INET:
             duplicate.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             _discard_waiting(duplicate)
@@ -394,7 +394,7 @@ def _frame(message: can.Message) -> Frame:
 def _is_garbage(error: Exception) -> bool:
     """Return whether the multicast bus failed on the content of a packet, not on the network.
 
-    msgpack or a check of the message raised the error then, not the socket.
+    In that case msgpack or a check of the message raised the error, not the socket.
     """
     cause = error.__cause__
     return isinstance(error, can.CanOperationError) and cause is not None and not isinstance(cause, OSError)

@@ -1,4 +1,4 @@
-"""Receiving threads: they copy frames into bounded queues, count what does not fit, and do nothing else.
+"""Receiving threads, which only copy frames into bounded queues and count the frames that do not fit.
 
 One reader takes whole batches from the other end of the queues.
 """
@@ -20,49 +20,49 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Capacity of an intake: 2 s of a full bus at 1 Mbit/s (8,000 frames/s), longer than any pause that a host
-survives otherwise."""
+"""Capacity of an intake: 2 s of a fully loaded bus at 1 Mbit/s (8,000 frames/s), longer than any pause that a
+host would survive."""
 
 _POLL_S: Final = 0.02
-"""Longest wait of a thread for a frame, after which it checks whether it should end, s."""
+"""Maximum time that a thread waits for a frame before it checks whether to end, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause after a batch, like the interrupt moderation of a network card: waking for each of 8,000 frames a
-second would cost more than handling them. The first frame after a silence does not wait, and each frame keeps
-its time of arrival."""
+"""Pause after a batch, like the interrupt moderation of a network card: waking for each of 8,000 frames/s
+would cost more than handling them. The first frame after a silence is not delayed, and each frame keeps its
+arrival time."""
 
 LONG_NS: Final = 5_000_000
-"""The same pause while the time of every awaited frame is predicted. An unpredicted frame may wait for one
-and a half times as long."""
+"""Pause after a batch while the arrival of every awaited frame is predicted. An unpredicted frame may wait
+one and a half times as long."""
 
 _BEFORE_NS: Final = 800_000
-"""Time before a predicted arrival at which waiting frames are fetched, so that little is left to do when it
-comes."""
+"""Lead time before a predicted arrival at which waiting frames are fetched, so that little work is left when
+the predicted frame arrives."""
 _SHORT_NS: Final = 300_000
-"""Shortest pause, when a frame is predicted or overdue."""
+"""Minimum pause, used while a predicted frame is imminent or overdue."""
 _LATE_NS: Final = 600_000
-"""Time for which an overdue frame is awaited with such pauses."""
+"""Time for which an overdue frame is awaited with minimum pauses."""
 _GIVEN_UP_NS: Final = 200_000_000
-"""Time after which an overdue frame is not awaited any more."""
+"""Time after which an overdue frame is no longer awaited."""
 _ANSWER_NS: Final = 20_000_000
 """Time after a request during which a response may come at any instant."""
 _LAG_NS: Final = 50_000
-"""Time from a frame's arrival until it can be read."""
+"""Delay from a frame's arrival until it can be read."""
 
 
 class Intake:
-    """The bounded queue of one port, between the thread that receives and the thread that takes.
+    """Bounded queue of one port, between its receiving thread and the reader.
 
     A full queue drops the newest frame, as a kernel socket does: queued frames stay complete and in order,
-    and only the receiving thread ever touches the end of the queue. ``dropped`` counts.
+    and only the receiving thread ever touches the end of the queue. ``dropped`` counts the lost frames.
 
-    Threads: :meth:`take` and :meth:`expect` belong to the reader, the rest to the receiving thread, except
-    where any thread is mentioned.
+    Threads: only the reader calls :meth:`take` and :meth:`expect`. Other methods belong to the receiving
+    thread unless they are documented for any thread.
 
     Args:
         port: The port to receive on.
-        capacity: Frames that may wait.
+        capacity: Maximum number of waiting frames.
 
     Raises:
         ValueError: if ``capacity`` is below 1.
@@ -73,36 +73,36 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time: all frames that arrived earlier are queued or were dropped."""
+        """Monotonic time before which every frame that arrived is queued or dropped."""
         self.due_ns = 0
         """Monotonic time of the next :meth:`fetch`. Used by the receiver."""
         self._capacity = capacity
         self._queue: deque[list[Frame]] = deque()
-        self._put = self._taken = self._dropped = 0  # the reader writes _taken, the receiver the others
+        self._put = self._taken = self._dropped = 0  # the reader writes _taken, the receiver the other two
         self._error: Exception | None = None
         self._expected: dict[str, tuple[int, ...]] = {}
-        self._first_ns = 0  # the earliest of them all; 0 while one of them may come at any time
+        self._first_ns = 0  # earliest expected time; 0 if any group may arrive at any time
         self._asked_ns = 0
 
     @property
     def dropped(self) -> int:
-        """Frames that found the queue full. The port counts those that the kernel dropped."""
+        """Frames lost because the queue was full. The port counts frames that the kernel dropped."""
         return self._dropped
 
     @property
     def queued(self) -> int:
         """Number of frames waiting."""
-        taken = self._taken  # read first: never more are taken than put
+        taken = self._taken  # read before _put, so that the difference is never negative
         return self._put - taken
 
     def take(self) -> list[Frame]:
         """Return all waiting frames in order of arrival; never waits.
 
         Raises:
-            BusError: if the bus failed, once the frames received before that have been taken.
-            Exception: whatever else receiving raised.
+            BusError: if the bus failed and all frames received before the failure have been taken.
+            Exception: any other exception that receiving raised.
         """
-        error, batches = self._error, self._queue  # the error is read first: queued frames came before it
+        error, batches = self._error, self._queue  # read the error first: queued frames precede it
         if not batches:
             if error is not None:
                 raise error
@@ -118,22 +118,21 @@ class Intake:
 
         Args:
             what: Name of the group of frames. A new prediction replaces the previous one of the same name.
-            times_ns: Monotonic times in ascending order, one of which applies; empty if it may come at any
-                time.
+            times_ns: Possible monotonic times in ascending order; empty if the frame may arrive at any time.
         """
         self._expected[what] = times_ns
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Note that a request was sent at monotonic time ``t_ns``, so a response may follow. Any thread."""
+        """Note that a request was sent at monotonic time ``t_ns``, and may be answered. Any thread."""
         self._asked_ns = t_ns
 
-    # --- the receiver's
+    # --- called by the receiver
 
     def gather(self, now_ns: int) -> None:
-        """Set :attr:`due_ns` after a batch, so that frames gather until then."""
+        """Set :attr:`due_ns` after a batch, so that frames accumulate until then."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # the usual case, decided after every batch of every bus
+        if now_ns < self._first_ns:  # fast path of the usual case: runs after every batch of every bus
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)
@@ -141,7 +140,7 @@ class Intake:
         self.due_ns = min(awaited_ns, _together(now_ns, LONG_NS if known else GATHER_NS))
 
     def _next_awaited(self, now_ns: int) -> tuple[int, bool]:
-        """Return when to fetch a predicted frame, and whether all frames to come are predicted."""
+        """Return when to fetch the next predicted frame, and whether all awaited frames are predicted."""
         awaited_ns, all_known = now_ns + LONG_NS, bool(self._expected)
         for times in tuple(self._expected.values()):
             for t_ns in times:
@@ -165,7 +164,7 @@ class Intake:
         """Queue the frames that have arrived.
 
         Args:
-            timeout_s: Longest wait for the first frame, s.
+            timeout_s: Maximum wait for the first frame, s.
 
         Returns:
             Whether there is something new to take: frames or an error.
@@ -203,8 +202,8 @@ class _Shared:
 class Receiver:
     """Receives on the ports of ``intakes`` from construction until :meth:`close`.
 
-    Threads: ports that read batches share one thread, which wakes once for several buses if it can. Any other
-    port may block in python-can and has a thread of its own. A failing port stops only its own reception.
+    Threads: ports that read batches share one thread, which wakes once for several buses where possible. Any
+    other port may block in python-can and has its own thread. A failing port stops only its own reception.
 
     Args:
         intakes: The queues to fill.
@@ -216,7 +215,7 @@ class Receiver:
     ) -> None:
         self._on_defect = on_defect
         self._news: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self._joining: deque[Intake] = deque()  # waiting to be taken up by the shared thread
+        self._joining: deque[Intake] = deque()  # waiting for the shared thread to add them
         self._stop = threading.Event()
         self._shared: threading.Thread | None = None
         self._alone: dict[Intake, threading.Thread] = {}
@@ -273,7 +272,7 @@ class Receiver:
                 time.sleep(_POLL_S)
 
     def _receive_batch(self, shared: _Shared) -> None:
-        """Run one turn of the shared thread."""
+        """Run one iteration of the shared thread."""
         intakes = shared.intakes
         if self._joining:
             while self._joining:
@@ -320,13 +319,13 @@ class Receiver:
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
     """Fetch from every intake. Returns whether any has something new to take."""
-    return sum(intake.fetch(0.0) for intake in intakes) > 0  # from every intake, whatever the others have
+    return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would skip intakes
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
     """Return the end of a pause of about ``pause_ns``, half to one and a half times as long.
 
-    It is the same instant for all buses, so that waking once serves all.
+    The end is the same instant for all buses, so that one wake-up serves them all.
     """
     return (now_ns + pause_ns // 2) // pause_ns * pause_ns + pause_ns
 
@@ -342,7 +341,7 @@ def _before(t_ns: int, now_ns: int) -> int:
 def _poll_of(intakes: Iterable[Intake]) -> select.poll:
     poll = select.poll()
     for intake in intakes:
-        with contextlib.suppress(ValueError):  # it was closed: the next fetch says so
+        with contextlib.suppress(ValueError):  # closed: the next fetch reports it
             poll.register(intake.port.fileno(), select.POLLIN)
     return poll
 

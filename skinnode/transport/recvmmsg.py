@@ -1,7 +1,7 @@
-"""Receive many messages of a socket in one system call: recvmmsg(2), which Python's socket module lacks.
+"""Receives many messages from a socket in one system call: recvmmsg(2), which Python's socket module lacks.
 
-The call holds the interpreter's lock. It does not wait and takes about a microsecond a message; releasing the
-lock for each of 8,000 messages a second would cost every other thread more.
+The call holds the interpreter's lock. It does not wait and takes about 1 µs per message; releasing the lock
+for each of 8,000 messages/s would cost the other threads more.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most`` and ``count`` waiting messages in place of the previous ones; never waits.
+        """Receive up to ``most`` and ``count`` waiting messages, replacing the last batch; never waits.
 
         Returns:
             Number of messages received.
 
         Raises:
-            OSError: if receiving fails; if messages came before the error, the next call raises it.
+            OSError: if receiving fails; if messages arrived before the error, the next call raises it.
         """
         used = self._got * _USED.size
         self._memory[:used] = self._fresh[:used]  # the kernel overwrote the buffer sizes with the sizes used
@@ -89,13 +89,13 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield for each received message the lengths of its ancillary data and of the message, bytes."""
+        """Yield the lengths of ancillary data and of the message for each received message, bytes."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:
         """Return the memory of the received messages.
 
-        Each is followed by its ancillary data; both with unused space.
+        Each message is followed by its ancillary data; both include unused space.
         """
         return self._room[: self._got * self._record]
 

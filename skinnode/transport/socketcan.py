@@ -1,8 +1,8 @@
-"""Read a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
+"""Reads a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
 
-Why by hand: python-can opens and configures the socket, and sends; but its way of receiving costs a
-``select``, a ``recvmsg`` and a ``Message`` for each frame, and ignores the drop counter. Structures and
-constants: <linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h>, <linux/net_tstamp.h>.
+python-can opens and configures the socket and sends, but is not used to receive: it would need a ``select``,
+a ``recvmsg`` and a ``Message`` per frame, and ignores the drop counter. Structures and constants:
+<linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h>, <linux/net_tstamp.h>.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ _DROPS: Final = struct.Struct("@I")
 _CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head, level, type
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
-_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that is a time and nothing else
+_STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that holds only a time
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
 """A frame and its time in their usual form: identifier, length, 8 bytes, software and hardware time."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
 _OLDEST_NS: Final = 10_000_000_000
-"""Maximum age of a frame. An older stamp was taken before the wall clock was set, so the time of reading is
-used."""
+"""Maximum age of a frame. An older timestamp was taken before the wall clock was set, so the time of reading
+is used."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum time by which a frame may arrive after the reading of its batch began."""
+"""Maximum arrival time of a frame after the reading of its batch began."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames in one call: 30 ms of a full bus at 1 Mbit/s."""
+"""Maximum number of frames per call: 30 ms of a fully loaded bus at 1 Mbit/s."""
 
 
 class SocketReader:
@@ -65,14 +65,14 @@ class SocketReader:
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self.dropped = 0
-        """Frames for which the socket's buffer in the kernel had no room."""
+        """Frames dropped because the socket's kernel buffer was full."""
         self._batch = MessageBatch(BATCH_FRAMES, FD_MTU, _ANCILLARY_BYTES)
         self.hardware_stamps = False
         """Whether the newest frame had a hardware timestamp."""
         self._delay = HardwareDelay()
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0
-        )  # python-can set it; a socket has one kind of timestamp
+        )  # set by python-can; a socket has one kind of timestamp
         sock.setsockopt(
             socket.SOL_SOCKET, _SO_TIMESTAMPING, _RX_SOFTWARE | _SOFTWARE | _RX_HARDWARE | _RAW_HARDWARE
         )
@@ -83,10 +83,10 @@ class SocketReader:
         return self._sock.fileno()
 
     def read(self, timeout_s: float, most: int = BATCH_FRAMES) -> list[Frame]:
-        """Return the waiting frames; wait for the first if there is none.
+        """Return the waiting frames; if there are none, wait for the first.
 
         Args:
-            timeout_s: Longest wait for the first frame, s.
+            timeout_s: Maximum wait for the first frame, s.
             most: Maximum number of frames; never more than :data:`BATCH_FRAMES`.
 
         Raises:
@@ -148,7 +148,7 @@ class SocketReader:
 
 
 def set_link_bitrate(config: BusConfig) -> None:
-    """Take the interface down, set its bit rates and bring it up again, by ``ip link``.
+    """Take the interface down, set its bit rates and bring it up again, with ``ip link``.
 
     Raises:
         BusError: with the message of ``ip``, if a command fails.
@@ -176,11 +176,11 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 
 
 class HardwareDelay:
-    """Converts times of a controller's own clock to the monotonic clock.
+    """Converter of times on a controller's own clock to the monotonic clock.
 
-    A frame that the kernel stamped late thus keeps the time at which it arrived. The kernel's stamp is never
-    early, so the difference of the clocks is known as an upper bound: its lower envelope is tracked, and may
-    rise as fast as two crystals drift apart. Owned by one thread.
+    A frame that the kernel timestamped late thus keeps its arrival time. The kernel's timestamp is never
+    early, so each frame gives an upper bound of the difference between the clocks. The lower envelope of
+    these bounds is tracked; it may rise as fast as two crystals drift apart. Owned by one thread.
     """
 
     DRIFT: Final = 200e-6  # two oscillators of 100 ppm each

@@ -1,4 +1,4 @@
-"""Accuracy, honesty of the reported uncertainty, and speed: every figure beside its requirement."""
+"""Accuracy, speed and calibration of the reported uncertainty: every figure next to its requirement."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
 """Maximum error of the posterior by layout, at a relative noise of 1e-5, h = 0.5, a press of 0.1 heights."""
 SCENES_A_CELL: Final = 25
-"""Random scenes for each scene of a cell of the tables over noise and codes, which has at least 3: its RMS is
-over 300 coordinates a scene already."""
+"""Number of random scenes for each scene of a table cell over noise and codes; a cell has at least 3 scenes.
+The RMS of each scene already covers 300 coordinates."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
     """Return the figures of the benchmark.
 
     Args:
-        scenes: Random scenes for each row of the coverage table.
-        rounds: Times that each candidate is measured.
+        scenes: Number of random scenes for each row of the coverage table.
+        rounds: Number of measurements of each candidate.
     """
     few = max(3, scenes // SCENES_A_CELL)
     coverage, parts = noise.coverage(scenes)
@@ -49,7 +49,7 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each requirement: its name, the figure, the limit as text, and whether it is met.
 
-    A requirement on a time is ``absolute``: it depends on the machine and fails nothing.
+    A requirement on time is ``absolute``: it depends on the machine, so missing it is not a failure.
     """
     found = []
     for row in figures["noise"]:
@@ -89,7 +89,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
     _print_codes(figures["codes"], echo)
     _print_coverage(figures["coverage"], echo)
     _print_parts(figures["parts"], echo)
-    echo("\nwhat must be reached")
+    echo("\nrequirements")
     for row in figures["must"]:
         value = "-" if row["value"] is None else f"{row['value']:.3g}"
         echo(
@@ -98,14 +98,14 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """Return a share in percent, whatever its size, so that a column has one unit."""
+    """Return a fraction as a percentage, whatever its size, so that a column has one unit."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
 def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
     echo(f"\nfour wires, no noise: each solver's fastest way to {ACCURACY:.0e}; *: on the Pareto front")
     for panel in panels:
-        echo(f"  {panel['scene']:32}{'':22}{'tolerance':>10}{'µs a wire':>11}{'error':>10}")
+        echo(f"  {panel['scene']:32}{'':22}{'tolerance':>10}{'µs per wire':>11}{'error':>10}")
         for row in best_of_each(panel["rows"]):
             solved = row["error"] is not None and row["error"] <= front.SOLVED
             error = f"{row['error']:10.0e}" if solved else "fails".rjust(10)
@@ -131,7 +131,7 @@ def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _print_noise(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nerror of a 10% press (reported deviation), share of the displacement; conv.: wires CONVERGED")
+    echo("\nerror (reported standard deviation) of a 10% press / displacement; conv.: wires CONVERGED")
     echo(
         f"  {'layout':16}{'noise':>7}{'exact':>20}{'conv.':>7}{'posterior':>20}{'conv.':>7}"
         f"{'bound, no prior':>17}{'prototype: exact, posterior':>30}"
@@ -145,7 +145,7 @@ def _print_noise(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> N
 
 
 def _print_codes(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nthe same behind codes of R/R0 from 0.25 to 1.25")
+    echo("\nthe same with codes of R/R0 from 0.25 to 1.25")
     echo(f"  {'layout':16}{'bits':>7}{'exact':>20}{'conv.':>7}{'posterior':>20}{'conv.':>7}")
     for exact, posterior in _pairs(rows):
         echo(
@@ -164,7 +164,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nrandom scenes: one body, sharp or blunt, anywhere, 5 to 30% deep, or two")
+    echo("\nrandom scenes: one or two bodies, sharp or blunt, anywhere, 5 to 30% deep")
     echo(
         f"  {'layout':16}{'noise':>7} {'method':10}{'scenes':>7}{'conv.':>7}{'error':>10}{'reported':>10}"
         f"{'ratio':>7}{'in 95 %':>9}"
@@ -179,7 +179,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  forces and contacts of the posterior where it found any: RMS error (reported), share in 95 %")
+    echo("  forces and contacts of the posterior where it found any: RMS error (reported), fraction in 95 %")
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"
@@ -199,7 +199,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
 
 
 def _print_parts(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("  errors of the posterior there, in deviations √(n + b): n by the noise, b left open by the prior")
+    echo("  errors of the posterior there, in units of √(n + b): n due to noise, b left open by the prior")
     echo(
         f"  {'b / (n + b)':16}{'coordinates':>12}{'RMS':>7}{'by noise':>10}{'b in it':>9}{'95 %':>7}"
         f"{'99.9 %':>8}{'kurtosis':>10}"

@@ -1,9 +1,9 @@
-"""Error against time of a few wires: our solvers beside their peers on the same compiled F and J.
+"""Error against time for a few wires: our solvers next to their peers on the same compiled F and J.
 
-The wires are the most deeply pressed ones of the patch; the samples of the press have no noise. Every solver
-starts from rest, either on the last sample alone or sample by sample, each from the solution of the previous
-sample, as the paper does it; at several tolerances, one point each. The time of ``solve_path`` also contains
-what the bare operators leave out: setting up the patch, following the branch, estimating the error.
+The wires are the most deeply pressed wires of the patch; the samples of the press have no noise. Every solver
+starts from rest. It solves either the last sample alone or sample by sample, each from the solution of the
+previous sample, as in the paper. It runs at several tolerances, one point each. The time of ``solve_path``
+includes steps that the bare operators omit: setting up the patch, following the branch, estimating the error.
 """
 
 from __future__ import annotations
@@ -32,39 +32,39 @@ the samples, and the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error, as a share of the displacement, that counts as solved and is drawn."""
+"""Maximum error, relative to the displacement, at which a result counts as solved and is drawn."""
 ROUNDING: Final = 1e-11
-"""Errors below this are equal: they are rounding errors of F, amplified by the condition of J."""
+"""Error below which results count as equal: rounding errors of F, amplified by the condition number of J."""
 LOOSE: Final = 1e-6
-"""Tolerance at samples before the last, as in the paper."""
+"""Tolerance at all samples before the last, as in the paper."""
 REPEATS: Final = 7
 LONG_S: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A few upper wires and the samples of their press."""
+    """A few upper wires and the samples of a press on them."""
 
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), the first after rest."""
+    """(T, U, K), ohm; the first sample is the first after rest."""
     truth_m: Float
-    """(U, N, 3) at the last."""
+    """(U, N, 3), true displacement at the last sample, metres."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` of the samples, evenly spaced, with the last."""
+        """Return ``samples`` of the samples, evenly spaced and including the last."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
     def error(self, displacement_m: Float) -> float:
-        """Return the error of a displacement (U, N, 3) as a share of the true displacement."""
+        """Return the error of a displacement (U, N, 3) relative to the true displacement."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.linalg.norm(displacement_m - self.truth_m) / np.linalg.norm(self.truth_m))
 
 
 def scene_of(name: str, height: float, depth: float) -> Scene:
-    """Return the four middle wires of a preset under a sphere, ``depth`` heights deep."""
+    """Return the four middle wires of a preset, pressed ``depth`` heights deep by a sphere."""
     full = preset(name, height)
     layout = PatchLayout(full.upper_m[3:7], full.lower_m, full.resistivity_ohm_per_m)
     press = Press((18.3e-3, 17.1e-3), 10e-3, depth * full.height_m, (0.2, -0.1))
@@ -75,7 +75,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the fastest of a few calls, or fewer if they are slow; other programs can only add time."""
+    """Return the fastest of a few calls, fewer if they are slow; other programs can only add time."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -85,7 +85,7 @@ def _timed_us(call: Callable[[], object]) -> float:
 
 
 def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tuple[float, float, bool]:
-    """Return µs a wire, the error, and whether every wire converged."""
+    """Return the time in µs per wire, the error, and whether every wire converged."""
     frames = scene.thinned(samples)
     call = functools.partial(solve_path, scene.layout, frames, operator=operator, schedule=schedule)
     path = call()
@@ -94,7 +94,7 @@ def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tupl
 
 
 def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
-    """Return µs a wire and the error."""
+    """Return the time in µs per wire and the error."""
     problem = PatchProblem.of(scene.layout)
     truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
     frames = scene.thinned(samples) * problem.gain
@@ -108,13 +108,13 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
                 x = solve(Case(problem, wire, frame, np.ascontiguousarray(x), truth[wire]), loose)
             found[wire] = x
 
-    with np.errstate(all="ignore"):  # a solver that diverges shows by its error
+    with np.errstate(all="ignore"):  # a diverging solver is detected by its error
         us = _timed_us(paths) / len(found)
         return us, scene.error(problem.displacement_m(found))
 
 
 def pareto(rows: list[dict[str, Any]]) -> list[int]:
-    """Return the rows that solved and that no other row beats in time and error at once, fastest first."""
+    """Return the indices of the solved rows that no other row beats in both time and error, fastest first."""
     front: list[int] = []
     best = SOLVED
     for index in sorted(range(len(rows)), key=lambda i: (rows[i]["us"], rows[i]["error"])):
@@ -126,7 +126,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Return a scatter plot for each scene: rows with time, error, and whether they are on the front."""
+    """Return one scatter plot per scene: rows with time, error, and whether they are on the front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)
@@ -141,7 +141,7 @@ def run() -> list[dict[str, Any]]:
 def _rows(scene: Scene) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     solvers = peers(PatchProblem.of(scene.layout))
-    del solvers["skinnode solve_system, Python callables"]  # the same operator, called from outside
+    del solvers["skinnode solve_system, Python callables"]  # same operator, called from Python
     for tolerance in TOLERANCES:
         for name, solve in solvers.items():
             for samples in (1, 10):

@@ -1,7 +1,7 @@
-"""Error against noise, code width and layout, and how honest the reported deviations are.
+"""Error against noise, code width and layout, and the calibration of the reported standard deviations.
 
-Every scene is tracked for four frames from rest; the last frame counts. Errors and deviations are pooled over
-scenes and coordinates of the converged wires, as RMS shares of the displacement.
+Every scene is tracked for four frames from rest; only the last frame counts. Errors and standard deviations
+are pooled over the scenes and the coordinates of converged wires, as RMS values relative to the displacement.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BITS: Final = (12, 14, 16, 24)
 LAYOUTS: Final = tuple((kind, height) for kind in ("staggered", "aligned") for height in (0.3, 0.5, 1.0))
 PRIOR_SHARES: Final = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST: Final = 1000
-"""Minimum coordinates for a quantile of 99.9 %."""
+"""Minimum number of coordinates for a 99.9 % quantile."""
 SHARES: Final = np.array([0.0, 1 / 3, 2 / 3, 1.0])
 
 PROTOTYPE: Final = {
@@ -45,12 +45,12 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""RMS errors of the prototype: a 10 % press with shear by one Hertz-like indenter."""
+"""RMS errors of the prototype in a 10 % press with shear by one Hertz-like indenter."""
 
 
 @dataclass
 class Pool:
-    """Pools the errors and deviations of many scenes."""
+    """Pools the errors and standard deviations of many scenes."""
 
     scenes: int = 0
     wires: int = 0
@@ -62,7 +62,7 @@ class Pool:
     _size: float = 0.0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene: its last frame, and the true displacement ``truth_m`` (U, N, 3)."""
+        """Add a scene by its last frame and its true displacement ``truth_m`` (U, N, 3)."""
         used = np.array([status is Status.CONVERGED for status in frame.status])
         error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
         self.scenes += 1
@@ -89,14 +89,14 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Compares the posterior's errors with its variance n + b: n from the noise, b left open by the prior."""
+    """Compares the posterior's errors with its variance n + b: n due to noise, b left open by the prior."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene and its truth (U, N, 3). Held frames do not count: their variance has more parts."""
+        """Add a scene and its truth (U, N, 3). Skips held frames, whose variance has more parts."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -107,10 +107,10 @@ class Parts:
         self._left.append(left.ravel())
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each interval of the prior's share b / (n + b).
+        """Return one row for each interval of the prior's fraction b / (n + b).
 
-        It holds error / √(n + b), its RMS, quantiles and kurtosis, the RMS that n alone would give, and the
-        share of b that is found in the errors.
+        It contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS that n alone would give, and
+        the fraction of b that appears in the errors.
         """
         if not self._error:
             return []
@@ -133,7 +133,7 @@ class Parts:
 
 @dataclass
 class Bound:
-    """Pools the Cramér-Rao bound of the wires without a prior, computed at the truth with the NumPy model."""
+    """Pools the Cramér-Rao bound of wires without a prior, computed at the truth with the NumPy model."""
 
     _variance: float = 0.0
     _size: float = 0.0
@@ -147,7 +147,7 @@ class Bound:
 
     @property
     def share(self) -> float:
-        """Bound as a share of the displacement."""
+        """Bound relative to the displacement."""
         return math.sqrt(self._variance / self._size)
 
 
@@ -155,7 +155,7 @@ class Bound:
 class Forces:
     """Compares contacts, forces and centroids with the truth.
 
-    Forces, in scenes with a contact, are shares of the true normal force; centroids are in metres.
+    Forces, in scenes with a contact, are relative to the true normal force; centroids are in metres.
     """
 
     found_right: int = 0
@@ -186,7 +186,7 @@ class Forces:
                 self._place.append((float(off), float(contacts[0].centroid_std_m[axis])))
 
     def row(self) -> dict[str, Any]:
-        """Return RMS errors and deviations, and the shares within 95 % intervals."""
+        """Return RMS errors, RMS standard deviations and the fractions within 95 % intervals."""
         figures: dict[str, Any] = {
             "contacts_right": self.found_right / self.scenes,
             "contacts_none": self.found_none / self.scenes,
@@ -214,21 +214,21 @@ def _case(kind: str, height: float) -> Case:
 
 
 class Follower:
-    """Solves streams of one layout by every method."""
+    """Solves streams of one layout with every method."""
 
     def __init__(self, kind: str, height: float) -> None:
         self.case = _case(kind, height)
         self._solvers = {name: methods.solver_of(self.case, name) for name in METHODS}
 
     def last(self, taken: Stream) -> dict[str, FieldFrame]:
-        """Return the last frame of a stream by each method."""
+        """Return each method's field for the last frame of a stream."""
         return {
             name: methods.fields(self.case, name, solver, taken)[-1] for name, solver in self._solvers.items()
         }
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Yield presses of a tenth of the height, the same for every converter and layout of one height."""
+    """Yield presses of a tenth of the height, the same for all converters and for layouts of equal height."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -236,9 +236,10 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 
 
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
-    """Return a press by a body as blunt as a fingertip: a contact radius of 1.5 to 2.5 pitches at full depth.
+    """Return a press by a fingertip-sized body, with a contact radius of 1.5 to 2.5 pitches at full depth.
 
-    It displaces as much as the prototype's indenter: their Cramér-Rao bounds agree, see PROTOTYPE.
+    It displaces the skin as much as the prototype's indenter does; their Cramér-Rao bounds agree, see
+    PROTOTYPE.
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m
@@ -246,7 +247,7 @@ def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Pr
 
 
 def against_noise(scenes: int) -> list[dict[str, Any]]:
-    """Solve 10 % presses with noise. Returns a row for each layout, noise and method."""
+    """Solve 10 % presses with noise. Returns one row per layout, noise and method."""
     rows = []
     for kind, height in LAYOUTS:
         follower = Follower(kind, height)
@@ -267,7 +268,7 @@ def against_noise(scenes: int) -> list[dict[str, Any]]:
 
 
 def against_codes(scenes: int) -> list[dict[str, Any]]:
-    """Solve 10 % presses behind codes without noise. Returns a row for each layout, width and method."""
+    """Solve 10 % presses with codes but without noise. Returns one row per layout, code width and method."""
     rows = []
     for kind in ("staggered", "aligned"):
         follower = Follower(kind, 0.5)
@@ -292,7 +293,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return one body, sharp or blunt, or in three of ten scenes two bodies in different halves."""
+    """Return one body, sharp or blunt, or, in three of ten scenes, two bodies in different halves."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -314,8 +315,8 @@ def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes.
 
     Returns:
-        A row for each layout, noise and method, with forces if there are any; and the posterior's errors in
-        all scenes, by the share of the prior in its variance.
+        One row per layout, noise and method, with forces if there are any; and the posterior's errors in all
+        scenes, by the prior's fraction of the variance.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

@@ -1,4 +1,4 @@
-"""Time of a tracked frame: the exact inverse, the posterior of a full frame, the posterior of few wires."""
+"""Time per tracked frame: the exact inverse, the posterior of a full frame, the posterior of a few wires."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 class Cycle:
     """A press down and up again, solved frame by frame.
 
-    Every call solves all of its frames, so that no turn has only the cheap frames.
+    Every call solves all frames of the cycle, so that no turn gets only the cheap frames.
 
     Args:
-        solver: The solver.
-        frames: Frames (T, U, K) of the press down, ohm.
+        solver: Solver to measure.
+        frames: Frames (T, U, K) of the downward press, ohm.
         valid: Mask (U, K) of the resistances to use; default: all.
     """
 
@@ -49,17 +49,17 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """Return a press that deepens from half to all of its depth."""
+    """Return a press that deepens from half to full depth."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 
 
 def run(rounds: int) -> list[dict[str, Any]]:
-    """Return a row for each solver: µs a frame, the limit, and the number of wires solved.
+    """Return one row per solver: time in µs per frame, limit, and number of wires solved.
 
-    The time is that of the mean frame, median over turns. The whole half-space moves when it is pressed, so
-    no scene moves only three wires; here the other wires give no resistances. Nothing is held: every frame is
-    solved.
+    The time is that of the mean frame, as a median over turns. A press moves the whole half-space, so no real
+    scene moves only three wires; here the other wires simply provide no resistances. No wire is held, so
+    every frame is solved.
     """
     skin = Skin(preset("staggered", 0.5))
     layout, rest = skin.layout, skin.rest_ohm

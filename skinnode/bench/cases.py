@@ -1,4 +1,4 @@
-"""The hard cases: streams that make solvers fail. A new one is added when it is found.
+"""Hard cases: streams that make solvers fail. New cases are added as they are found.
 
  1 symmetric layout, J rank-deficient         8 drift of the baseline, gain, contact resistance
  2 thick layers                               9 wrong roots with zero residual
@@ -8,8 +8,8 @@
  6 noise and code widths                     13 the wrong model
  7 open, shorted, missing, saturated
 
-A case is the patch as the solver knows it, the options that an informed user would set, and a stream of
-frames with its truth for every seed.
+A case consists of the patch as the solver knows it, the options that an informed user would set, and, for
+every seed, a stream of frames with its truth.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""Noise of about a 16-bit converter."""
+"""Noise of roughly a 16-bit converter."""
 STRIDE: Final = 4
-"""Samples of a path for each frame of a tracker."""
+"""Number of path samples per frame of a tracker."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error of the change of R in the wrong models of case 13. Measured on a 30 % press, staggered,
-h = 0.5: ‖ΔR‖ is wrong by 2.2 to 5 %, the change of one pair by 1 to 5 % in the median and 7 % at worst."""
+"""Relative error of the change in R in the wrong models of case 13. Measured on a 30 % press, staggered,
+h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; the change of one pair is off by 1 to 5 % in the median and 7 % at
+worst."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A hard case. ``make`` returns the stream of a seed's generator."""
+    """A hard case. ``make`` returns the stream for a seed's random generator."""
 
     number: int
     name: str
@@ -49,23 +50,23 @@ class Case:
     """Converter of the streams; the user knows its noise."""
     drift: str = "none"
     stride: int = 1
-    """Frames of the stream for each frame of a tracker; a path gets all of them."""
+    """Number of stream frames per frame of a tracker; a path gets all frames."""
     model_error: float = 0.0
-    """Relative error of the change of R that the user expects of the model."""
+    """Relative error of the change in R that the user expects from the model."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """Return a preset of 10 × 10 electrodes, ``height`` in pitches."""
+    """Return a preset of 10 × 10 electrodes; ``height`` in pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
 def narrowed(layout: PatchLayout) -> PatchLayout:
-    """Return both outer upper wires and three between them: a path solves wire by wire, so these suffice."""
+    """Return the two outer upper wires and three between them, enough because paths solve wire by wire."""
     return PatchLayout(layout.upper_m[[0, 2, 5, 8, 9]], layout.lower_m, layout.resistivity_ohm_per_m)
 
 
 def press_and_release(steps: int) -> Float:
-    """Return shares of the depth: at rest, down in equal steps, at rest."""
+    """Return fractions of the depth: at rest, down in equal steps, at rest."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 

@@ -1,7 +1,8 @@
-"""The dense kernels against LAPACK, in a process of its own in which LAPACK has one thread, as ours have.
+"""Dense kernels compared with LAPACK, in a process in which LAPACK has one thread, as our kernels do.
 
-LAPACK's worker threads go on spinning for a while after each call. If they share a core with the next
-candidate, that takes up to three times as long, and they wait for each other while the machine is busy.
+LAPACK's worker threads keep spinning for a while after each call. If they share a core with the next
+candidate, that candidate takes up to three times as long, and the threads wait for each other while the
+machine is busy.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ONE_THREAD: Final = {
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Return the rows of the benchmark, µs a call."""
+    """Return the rows of the benchmark, µs per call."""
     command = [sys.executable, "-m", "skinnode.bench.dense_kernels", str(rounds)]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, check=True)
     rows: list[dict[str, Any]] = json.loads(done.stdout)
@@ -33,9 +34,9 @@ def measure(rounds: int) -> list[dict[str, Any]]:
 
 
 def dense_pairs() -> dict[str, dict[str, Callable[[], object]]]:
-    """Return the dense kernels and their LAPACK peers, at the 300 unknowns of ten wires of ten electrodes.
+    """Return the dense kernels and their LAPACK peers, for the 300 unknowns of ten wires of ten electrodes.
 
-    Each has its own order of axes, and buffers to overwrite that are refilled in every call.
+    Each uses its own axis order and works in place on buffers that are refilled before every call.
     """
     from scipy.linalg import blas, lapack
 

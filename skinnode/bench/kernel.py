@@ -1,7 +1,7 @@
-"""The compiled kernels against NumPy and LAPACK.
+"""The compiled kernels compared with NumPy and LAPACK.
 
-Measured are F + J and one step of each operator, for one wire of the reference patch, and the dense kernels
-at the size of its posterior.
+The benchmark measures F + J and one step of each operator, for one wire of the reference patch, and the dense
+kernels at the size of the patch's posterior.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches a coordinate: far shorter than Newton's step, so that every operator must search."""
+"""Trust radius, pitches per coordinate: far below a Newton step, so that every operator must search."""
 
 
 class NumpyWire:
-    """Computes F and Jᵀ of one wire as fast as NumPy can: structure of arrays, into buffers made once.
+    """Computes F and Jᵀ of one wire as fast as NumPy can: a structure of arrays, with preallocated buffers.
 
-    Of the orders of axes and ways to sum that were tried, this is the fastest: 0.85 of the time of the
-    obvious way.
+    This is the fastest of the axis orders and summation methods that were tried; it takes 0.85 of the time of
+    the obvious method.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:
@@ -63,9 +63,9 @@ class NumpyWire:
 
 
 def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
-    """Evaluate, step, evaluate, as :func:`compiled_steps` does, and return r at the end.
+    """Evaluate, step and evaluate again, as :func:`compiled_steps` does, and return the final r.
 
-    The parameter of Levenberg-Marquardt, for which the compiled step searches, is given.
+    The Levenberg-Marquardt parameter, which the compiled step has to search for, is fixed here.
     """
     f, jt = wire(x)
     r, j = relative_residual(a, f), (jt * a).T
@@ -90,7 +90,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            augmented = np.zeros((r.size + n, n + 1))  # R and Qᵀr without Q: 0.7 of the time
+            augmented = np.zeros((r.size + n, n + 1))  # gives R and Qᵀr without Q, in 0.7 of the time
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
             np.fill_diagonal(augmented[r.size :], 0.1 * scale)
@@ -116,9 +116,9 @@ def _evaluate(x: Float, lower: Float, a: Float, r: Float, jt: Float) -> None:
 def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
     operator: int, start: Float, lower: Float, a: Float, w: Work, jt_trial: Float
 ) -> None:
-    """Take one step of every wire from ``start`` (U, n), with the compiled parts of the driver.
+    """Take one step of every wire from ``start`` (U, n), using the compiled parts of the driver.
 
-    The driver itself, limited to one step, would compute the next step before it checks the limit.
+    The driver itself, limited to one step, would compute a second step before checking the limit.
     """
     for u in range(start.shape[0]):
         for j in range(w.x.size):
@@ -133,7 +133,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Return the figures of the benchmark: µs a wire (dense kernels: µs a call) and ratios to ours."""
+    """Return the figures of the benchmark: µs per wire (dense kernels: per call) and ratios to ours."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)
@@ -179,7 +179,7 @@ def run(rounds: int) -> dict[str, Any]:
 
 
 def potential_of(x: Float, lower: Float) -> Float:
-    """Return F of one wire by the compiled kernel."""
+    """Return F of one wire, computed by the compiled kernel."""
     f, jt = np.empty(lower.shape[2]), np.empty((x.size, lower.shape[2]))
     potential_jacobian(x, lower, f, jt)
     return f

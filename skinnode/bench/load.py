@@ -1,9 +1,9 @@
-"""The load of ``skinnode bench pipeline``: frames of real nodes, replayed at their pace by another process.
+"""Load of ``skinnode bench pipeline``: frames of real nodes, replayed in real time by another process.
 
-The nodes are those of ``skinnode node`` with the simulator's patches in front of them. Their frames cross, in
-simulated time, a bus that arbitrates as CAN does: whenever the bus is free, the waiting frame with the lowest
-identifier goes, and takes as long as its bits do, stuff bits included. This file may import the simulator, as
-the demo may: frames made with the solver's own assumptions would prove nothing.
+The nodes are those of ``skinnode node``, measuring the simulator's patches. Their frames cross, in simulated
+time, a bus with CAN arbitration: whenever the bus is free, the waiting frame with the lowest identifier is
+sent and occupies the bus for the duration of its bits, stuff bits included. This file may import the
+simulator, as the demo may, because frames made with the solver's own assumptions would prove nothing.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Time between turns of the sender: two frames of a full bus at once, as from a USB adapter."""
+"""Time between turns of the sender: on a full bus two frames go out at once, as from a USB adapter."""
 LEAD_S: Final = 0.5
 """Time from :meth:`Generator.begin` to the first frame."""
 _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
 _Queued = tuple[int, int, bytes, bool]
-"""Time at which a node had a frame ready, ns; its COB-ID, data, and whether it is a CAN FD frame."""
+"""Time at which a node had a frame ready, ns; COB-ID, data, and whether it is a CAN FD frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,23 +51,23 @@ class Sent:
     """Figures of a replay."""
 
     frames: dict[str, int]
-    """Frames sent by bus, without the heartbeats before the start."""
+    """Number of frames sent per bus, excluding the heartbeats before the start."""
     bus_load: dict[str, float]
-    """Share of the simulated bus that the frames took."""
+    """Fraction of time that the simulated bus was occupied by the frames."""
     late_p99_ms: float
-    """Delay of the frames behind their time on the simulated bus, due to the generator itself."""
+    """Delay of the frames behind their times on the simulated bus, caused by the generator itself."""
     late_max_ms: float
     cpu_s: float
 
 
 class Generator:
-    """A process that replays the load of a hand, ready when the constructor returns.
+    """A process that replays the load of a hand; it is ready when the constructor returns.
 
     Args:
-        hand: The hand.
-        seconds: Length of the load.
-        touched: Whether all patches are pressed and stroked as in the demo, or none.
-        core: Processor core that the process keeps to; None: any.
+        hand: Hand to replay.
+        seconds: Duration of the load.
+        touched: Whether all patches are pressed and stroked as in the demo; otherwise none is touched.
+        core: Processor core to which the process is bound; None for any.
     """
 
     def __init__(self, hand: HandConfig, seconds: float, *, touched: bool, core: int | None) -> None:
@@ -84,7 +84,7 @@ class Generator:
         self._pipe.send(list(buses))
 
     def begin(self) -> int:
-        """Begin the replay :data:`LEAD_S` from now, and return that time, monotonic ns."""
+        """Start the replay :data:`LEAD_S` from now, and return its start time, monotonic ns."""
         t_ns = time.monotonic_ns() + round(LEAD_S * 1e9)
         self._pipe.send(t_ns)
         return t_ns
@@ -125,16 +125,16 @@ def _serve(pipe: Connection, hand: HandConfig, seconds: float, touched: bool, co
                 pipe.send(_play(pipe, hand, [(bus, streams[bus.name]) for bus in chosen]))
     except EOFError:
         return
-    except Exception as error:  # the parent raises it
+    except Exception as error:  # re-raised in the parent
         pipe.send(error)
 
 
-# --- beforehand
+# --- preparation
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """The frames of a bus in simulated time."""
+    """The frames on a bus in simulated time."""
 
     t_ns: list[int]
     """End of each frame, ns from the first SYNC, ascending."""
@@ -143,7 +143,7 @@ class Stream:
 
 
 def stream_of(hand: HandConfig, bus: BusConfig, seconds: float, *, touched: bool = True) -> Stream:
-    """Return the frames of ``bus`` in ``seconds`` of the hand's operation, with SYNC."""
+    """Return the frames on ``bus`` during ``seconds`` of the hand's operation, including SYNC."""
     scans = round(seconds / hand.sync.period_s)
     late_ns = round([each.name for each in hand.buses].index(bus.name) * hand.sync.stagger_s * 1e9)
     syncs = _syncs(hand, scans, late_ns)
@@ -164,7 +164,7 @@ def _syncs(hand: HandConfig, scans: int, late_ns: int) -> list[_Queued]:
 def _node_frames(
     hand: HandConfig, patch: PatchConfig, number: int, syncs: Sequence[_Queued], touched: bool
 ) -> list[_Queued]:
-    """Return the frames that the node of a patch has ready to send after these SYNCs."""
+    """Return the frames that a patch's node has ready to send after the given SYNCs."""
     bus, layout = hand.bus(patch.bus), patch.layout.build()
     profile = PatchProfile.from_config(patch, bus)
     source = SimulatedPatch(Scene(layout, hand.simulation, number))
@@ -213,7 +213,7 @@ def _node_frames(
 
 
 def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
-    """Return the time of each frame on the bus, ns."""
+    """Return the duration of each frame on the bus, ns."""
     ids = np.array([can_id for _, can_id, _, _ in frames])
     lengths = np.array([len(data) for _, _, data, _ in frames])
     durations = np.zeros(len(frames))
@@ -230,13 +230,13 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 
 
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
-    """Send all frames one after the other.
+    """Arbitrate the frames, which are sent one after the other.
 
     Frames of a node keep their order, as in the queue of its controller; among the first frames of all nodes
-    the lowest identifier goes.
+    the one with the lowest identifier is sent.
     """
     order = sorted(range(len(frames)), key=lambda i: frames[i][0])
-    waiting: dict[int, list[int]] = {}  # by node, the first last
+    waiting: dict[int, list[int]] = {}  # by node, in reverse order
     heads: list[tuple[int, int]] = []  # identifier and node
     times, packets = [], []
     now_ns = busy_ns = next_in = 0
@@ -261,7 +261,7 @@ def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: S
     return Stream(times, packets, busy_ns / max(1, now_ns))
 
 
-# --- at pace
+# --- replay in real time
 
 
 def _play(pipe: Connection, hand: HandConfig, loads: Sequence[tuple[BusConfig, Stream]]) -> Sent:
@@ -335,6 +335,6 @@ def _send(sock: socket.socket, packet: bytes) -> int:
         except OSError as error:
             if error.errno != errno.ENOBUFS:
                 raise
-            time.sleep(_FULL_S)  # a CAN interface whose queue is full
+            time.sleep(_FULL_S)  # the queue of the CAN interface is full
         else:
             return 1

@@ -1,4 +1,4 @@
-"""The solvers, set up for a case as an informed user would: from a stream to an estimate for each frame."""
+"""Solvers set up for a case as an informed user would; each turns a stream into one estimate per frame."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def set_up(case: Case, name: str) -> Method:
 
 
 def last_only(name: str) -> bool:
-    """Return whether the method solves the last frame only."""
+    """Return whether the method solves only the last frame."""
     return name.startswith("path ")
 
 
 def _path(case: Case, how: str, stream: Stream) -> Solved:
-    """Solve a path. ``how``: an operator along all samples, or ``adaptive``."""
+    """Solve a path. ``how`` is an operator, applied along all samples, or ``adaptive``."""
     adaptive = how == "adaptive"
     path = solve_path(
         case.skin.layout,
@@ -46,13 +46,13 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # an error may reach 5 deviations; the estimate is such an error
+    # an error may reach LIMIT standard deviations, and the estimate is an upper bound
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 
 
 def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -> list[FieldFrame]:
-    """Solve every frame of the stream with ``solver``, which :func:`solver_of` made under ``name``."""
+    """Solve every frame of the stream with ``solver``, which :func:`solver_of` created for ``name``."""
     solver.reset()
     noise = _noise_for_exact(case, stream) if name == "exact" else stream.noise
     frames = zip(stream.frames_ohm, stream.valid, noise, strict=True)
@@ -61,7 +61,7 @@ def fields(case: Case, name: str, solver: Tracker | Posterior, stream: Stream) -
 
 def solver_of(case: Case, name: str) -> Tracker | Posterior:
     """Return a solver for the case: ``exact``, ``posterior`` or ``auto``."""
-    # every frame comes with its own noise as well
+    # every frame also carries its own noise
     common: dict[str, Any] = {
         "relative_noise": case.converter.relative_std,
         "baseline_ohm": case.skin.rest_ohm,
@@ -78,7 +78,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """Return drift and model errors as noise: the exact inverse knows noise of single resistances only."""
+    """Return drift and model errors as noise of single resistances, all that the exact inverse models."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))

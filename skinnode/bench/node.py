@@ -1,9 +1,9 @@
-"""Punctuality and cost of a node: pacing of chunks, SYNC to first chunk, heartbeat on a full bus, µs a frame.
+"""Timing and cost of a node: chunk pacing, SYNC to first chunk, heartbeat on a full bus, µs per frame.
 
-Times are those at which the node hands a frame to its interface, by the monotonic clock that stamps SYNC.
-SYNC and load come from another endpoint in another thread of the same process: the interpreter's lock is part
-of the result. So is other work of the machine, which dominates if there is any; ``chrt -f 20 skinnode bench
-node`` shows an idle machine.
+A frame's time is when the node passes it to its interface, on the monotonic clock that also stamps SYNC. SYNC
+and load come from another endpoint in another thread of the same process, so the interpreter's lock affects
+the result. So does other work on the machine, which dominates if there is any; ``chrt -f 20 skinnode bench
+node`` gives the figures of an idle machine.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Frames/s of eight bytes at 1 Mbit/s."""
+"""Frames per second, with eight data bytes, that fill a bus at 1 Mbit/s."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
-_BURST_S: Final = 1e-3  # the load comes in bursts of a millisecond: no thread wakes 8000 times a second
-_MOST_S: Final = 5e-3  # what it missed longer ago is not made up for: no bus carries more than it can
+_BURST_S: Final = 1e-3  # one burst per millisecond, because no thread wakes 8000 times a second
+_MOST_S: Final = 5e-3  # frames overdue by more than this are dropped: a real bus cannot catch up
 
 Row = dict[str, Any]
 
@@ -53,7 +53,7 @@ class _Rig:
         layout = PatchLayout.preset("staggered")
         self.manager, self._port = CanPort(config), CanPort(config)
         self.sent: list[tuple[int, int]] = []
-        """COB-ID and time of every frame that the node sent."""
+        """COB-ID and time of every frame sent by the node."""
         node = PatchNode(NODE_ID, layout, _Still(layout), send=self._send, pacing=pacing)
         self.inhibit_ns = node.profile.default_inhibit_100us * 100_000
         self._runner = NodeRunner(self._port, [node])
@@ -79,7 +79,7 @@ class _Rig:
         return self._port.received
 
     def take(self) -> None:
-        """Discard the frames of the node: a full queue would stop it."""
+        """Discard the frames of the node; a full queue would stop it."""
         while self.manager.recv(0.0) is not None:
             pass
 
@@ -88,10 +88,10 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
     """Return all rows.
 
     Args:
-        seconds: Length of each measurement on the bus.
-        rounds: Times that each candidate is measured.
+        seconds: Duration of each measurement on the bus.
+        rounds: Number of measurements of each candidate.
         interface: python-can interface.
-        channel: Its channel; None: an unused name.
+        channel: Channel of the interface; None for an unused name.
     """
     config = BusConfig(interface=interface, channel=channel or uuid.uuid4().hex)
     with without_long_collections():
@@ -105,7 +105,7 @@ def run(seconds: float, rounds: int, interface: str, channel: str | None) -> dic
 
 
 def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row:
-    """Return the row for deviations from the nominal time, ns, of either sign."""
+    """Return the row for signed deviations from the nominal time, ns."""
     late_ms = np.abs(late_ns) / 1e6
     p50, p99, most = np.percentile(late_ms, [50, 99, 100]).tolist() if len(late_ms) else [None] * 3
     spread = {"p50_ms": p50, "p99_ms": p99, "max_ms": most}
@@ -113,7 +113,7 @@ def _row(what: str, late_ns: Float, goal_ms: float, load_hz: float = 0.0) -> Row
 
 
 def _scans(config: BusConfig, seconds: float, pacing: Pacing, name: str) -> list[Row]:
-    """Measure the time between chunks, and from SYNC to the first chunk."""
+    """Measure the time between chunks, and the time from SYNC to the first chunk."""
     gaps: list[int] = []
     first: list[int] = []
     with _Rig(config, pacing) as rig:
@@ -154,7 +154,7 @@ def _heartbeat(config: BusConfig, seconds: float, load_hz: int) -> Row:
 
 
 def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
-    """Send foreign frames, in bursts at an even rate."""
+    """Send foreign frames in bursts, at a constant mean rate."""
     start_s, sent = time.monotonic(), 0
     while not stop.is_set():
         due = int((time.monotonic() - start_s) * rate_hz)
@@ -166,9 +166,9 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return what a node without a bus does for a frame of each kind.
+    """Return one function per kind of frame that makes a node without a bus handle such a frame.
 
-    Each also asks for the next deadline, as the thread that drives a node does.
+    Each also queries the next deadline, as the thread that drives a node does.
     """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)
@@ -186,7 +186,7 @@ def handlers() -> dict[str, Callable[[], object]]:
             now_ns = node.next_deadline_ns() or now_ns
             node.on_timer(now_ns)
 
-    # TPDO3 carries the error register when asked.
+    # Map the error register to TPDO3, sent on remote request.
     sdo = od.sdo_request_cob_id(NODE_ID)
     for request in ("23021a0108000110", "2f021a0001000000", "2f021802fd000000", "2302180184030000"):
         give(sdo, bytes.fromhex(request))

@@ -1,20 +1,22 @@
-"""The paper's path experiments, by its protocol, beside its printed values (``paper.toml``).
+"""The paper's path experiments, repeated by its protocol next to its printed values (``paper.toml``).
 
-One upper wire of 10 electrodes, 30 unknowns; the other wires of the patch are left out. An experiment is a
-smooth press at random: a sphere of 6 to 12 mm on rubber, by Hertz's closed form with friction, somewhere in
-the middle of the patch, and the wire nearest to it. Of 1000 samples on the way down, n evenly spaced ones are
-used.
+Each uses one upper wire of 10 electrodes, 30 unknowns; the other wires of the patch are left out. An
+experiment is a smooth random press by a sphere of 6 to 12 mm on rubber, in Hertz's closed form with friction,
+somewhere in the middle of the patch; its wire is the one nearest to the press. Of 1000 samples on the way
+down, n evenly spaced samples are used.
 
 Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls more
-than F alone. Here F comes with J at about the cost of two F; ×31 is the cost by differences. Calls a step are
-means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS), its mean
-over the experiments that converged. The first-order optimality is that of r = a F − 1, dimensionless in
-pitches; MATLAB's would be of F, F² times as large in the unit of length, which the paper does not state.
+than F alone. Here F and J together cost about as much as two F; ×31 is the cost with differences. Calls per
+step are means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS),
+averaged over the experiments that converged. The first-order optimality is that of r = a F − 1,
+dimensionless with lengths in pitches; MATLAB's would be that of F, larger by F² in the unit of length, which
+the paper does not state.
 
 Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves
-10 of 10 at any number of steps. So the hardest ``aligned`` of that depth is h = 1, and Gauss-Newton fails as
-it did for the authors, at 5 and 10 steps but not from 20 on, at h = 0.7 and 30 % (h 0.3 … 1 and 15 … 30 %
-were searched: 6 and 2 of 10 fail; at h = 1 and 25 %, 5 and 3, but there levenberg_marquardt fails later too).
+10 of 10 at any number of steps. The hardest ``aligned`` setting of that depth is therefore h = 1.
+Gauss-Newton fails as it did for the authors, at 5 and 10 steps but not from 20 on, at h = 0.7 and 30 %
+(h 0.3 … 1 and 15 … 30 % were searched: 6 and 2 of 10 fail; at h = 1 and 25 %, 5 and 3 fail, but there
+levenberg_marquardt also fails at more steps).
 """
 
 from __future__ import annotations
@@ -56,13 +58,13 @@ LABELS: Final = {
 }
 UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
-"""Calls of F for F and J by forward differences."""
+"""Number of calls of F that give F and J by forward differences."""
 WRONG: Final = 1e-4
 """Minimum relative error at which a CONVERGED wire is wrong; exact data leave 1e-8 at worst."""
 
 
 def printed() -> dict[str, Any]:
-    """Return the printed values of the paper."""
+    """Return the paper's printed values."""
     text = resources.files("skinnode.bench").joinpath("paper.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
@@ -72,16 +74,16 @@ class Experiment:
     """One wire being pressed."""
 
     layout: PatchLayout
-    """Layout of the one wire."""
+    """Layout of the single wire."""
     samples_ohm: Float
     """(SAMPLES, 1, K), ohm."""
     truth_m: Float
-    """(1, N, 3), displacement at the last sample, metres."""
+    """(1, N, 3), true displacement at the last sample, metres."""
     patch: PatchLayout
     press: Press
 
     def solve(self, schedule: Schedule, operator: str = "dogleg", samples: int = SAMPLES) -> PathResult:
-        """Solve the path by ``samples`` evenly spaced samples."""
+        """Solve the path with ``samples`` evenly spaced samples."""
         chosen = self.samples_ohm[SAMPLES // samples - 1 :: SAMPLES // samples]
         with np.errstate(all="ignore"):
             return solve_path(self.layout, chosen, operator=operator, schedule=schedule)
@@ -123,7 +125,7 @@ def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experimen
 
 
 def run(count: int) -> dict[str, Any]:
-    """Return all figures of the benchmark, with ``count`` experiments for each setting."""
+    """Return all figures of the benchmark, with ``count`` experiments per setting."""
     settings = []
     for name, height, depth in SETTINGS:
         layout = preset(name, height)
@@ -166,7 +168,7 @@ def _setting(made: list[Experiment]) -> dict[str, Any]:
 
 
 def _row(made: list[Experiment], schedule: Schedule, operator: str, samples: int) -> dict[str, Any]:
-    """Return cost and accuracy of a step control, on average over the experiments."""
+    """Return the cost and accuracy of a step control, averaged over the experiments."""
     paths, times = [], []
     for one in made:
         start = time.perf_counter()
@@ -206,7 +208,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself: without the search for a cycle, second tries and checks."""
+    """Return the rows of the path itself, without the cycle search, second tries and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -216,7 +218,7 @@ def _final(path: PathResult) -> float:
 
 
 def _calls(made: list[Experiment], samples: int) -> list[float]:
-    """Return figure 8: mean calls of each step but the last."""
+    """Return figure 8: mean calls at each step but the last."""
     paths = [one.solve(Uniform(plain=True), samples=samples) for one in made]
     return [float(each) for each in np.mean([path.evaluations[: samples - 1, 0] for path in paths], axis=0)]
 
@@ -272,7 +274,7 @@ def _last_step(one: Experiment, periodic: bool) -> list[float]:
 
 
 def optimality(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """Return ‖Jᵀr‖∞ of r = a F − 1 with lengths in pitches, by the reference model."""
+    """Return ‖Jᵀr‖∞ of r = a F − 1 with lengths in pitches, from the reference model."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(r @ slopes).max())
 
@@ -284,16 +286,17 @@ def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
 
 
 def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Float, Float]:
-    """Return r and J of the one wire."""
+    """Return r and J of the single wire."""
     a = frame_ohm[0] / layout.resistivity_ohm_per_m
     r = a * potential_per_m(layout, upper_m)[0] - 1.0
     return r, jacobian(layout, upper_m)[0].reshape(len(a), -1) * a[:, None] * layout.pitch_m
 
 
 def _ten_steps() -> list[dict[str, Any]]:
-    """Return time and error of the ten-step path on ``staggered``.
+    """Return the time and error of the ten-step path on ``staggered``.
 
-    Rows are one wire alone, by each operator and by our own step control, and one wire of a patch of ten.
+    The rows are one wire alone, with each operator and with our own step control, and one wire in a patch of
+    ten.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
@@ -325,9 +328,9 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Return figure 13: the whole patch of the hardest setting, heights in µm.
+    """Return figure 13: heights in µm of the whole patch at the hardest setting.
 
-    It is solved by 5 and by 20 samples as in the paper, and by our step control.
+    The patch is solved with 5 and 20 samples as in the paper, and with our step control.
     """
     name, height, depth = SETTINGS[-1]
     layout = preset(name, height)
@@ -367,11 +370,11 @@ Say = Callable[[str], None]
 
 
 def print_all(figures: dict[str, Any], say: Say) -> None:
-    """Print the tables and the data of the figures, each beside the value in the paper."""
+    """Print the tables and the data of the figures, each next to the paper's value."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second try.")
-    say("Tol_X: the largest correction still to come, pitches. Times: medians of the call for the one wire.")
+    say("Tol_X: the largest remaining correction, pitches. Times: medians of the call for the one wire.")
     say("Ten-step path of one wire (paper: 2.03 s)")
     for row in figures["ten_steps"]:
         say(f"  {row['what']:32}{row['ms']:6.2f} ms, error {100 * row['error']:.0e} %")
@@ -401,7 +404,7 @@ def _rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _accuracy(row: dict[str, Any], count: int) -> str:
-    """Return the mean of the converged experiments, and how many did not converge."""
+    """Return the mean over the converged experiments, and how many did not converge."""
     if row["failed"] == count:
         return f"failed {count}/{count}"
     text = f"{row['accuracy_percent']:.0e} %"
@@ -418,7 +421,7 @@ def _figure(value: float | None, form: str) -> str:
 
 def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int, say: Say) -> None:
     calls, errors = paper["table2_function_calls_per_step"], paper["table3_accuracy_percent"]
-    say(f"\n{'tables 2 and 3':20}{'':>6}{'calls a step':>26}{'':>26}accuracy")
+    say(f"\n{'tables 2 and 3':20}{'':>6}{'calls per step':>26}{'':>26}accuracy")
     say(
         f"{'':20}{'steps':>6}{'F with J':>9}{'×31':>8}{'paper':>8}{'ours':>7}{'×31':>7}"
         f"  {'as in the paper':<23}{'paper':>8}  ours"
@@ -444,7 +447,7 @@ def _print_operators(setting: dict[str, Any], paper: dict[str, Any], count: int,
 
 def _print_dogleg(setting: dict[str, Any], paper: dict[str, Any], count: int, say: Say) -> None:
     table = paper["table4_dogleg"]
-    say(f"\n{'table 4':22}{'':>6}{'calls a step':>29}{'Tol_X':>20}{'time a path':>22}{'accuracy':>17}")
+    say(f"\n{'table 4':22}{'':>6}{'calls per step':>29}{'Tol_X':>20}{'time per path':>22}{'accuracy':>17}")
     say(
         f"{'':22}{'steps':>6}{'F with J':>10}{'×31':>10}{'paper':>9}{'here':>10}{'paper':>10}"
         f"{'here':>12}{'paper':>10}  {'here':<24}{'paper':>8}"
@@ -481,10 +484,10 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
     section = paper["section5"]
     say(
         f"  the paper's T at 1e-4 and 50 samples: {section['cycle_at_50_steps_tol_1e-4']}. Its optimality is "
-        f"of F, {setting['unscaled']:.0f} times ours were its unit the pitch."
+        f"of F, which would be {setting['unscaled']:.0f} times ours if its unit of length were the pitch."
     )
     totals, printed_totals = setting["figure11"], paper["figure11_iterations"]
-    say("figure 11, iterations of a path")
+    say("figure 11, iterations per path")
     for label, n, key, theirs in (
         ("uniform, 20 samples", "20", "uniform", printed_totals["uniform_20_steps"]),
         ("uniform, 100 samples", "100", "uniform", printed_totals["uniform_100_steps"]),

@@ -1,7 +1,7 @@
-"""Throughput and latency of a host, and CPU by group of threads, by number of buses and patches.
+"""Throughput and latency of a host, and CPU per thread group, by number of buses and patches.
 
-The host is that of ``skinnode host``, as guest of a robot whose master and nodes are a replay in another
-process (:mod:`skinnode.bench.load`). Frames arrive by UDP, through SocketCAN's reader (see
+The host is that of ``skinnode host``, a guest of a robot whose master and nodes are replayed by another
+process (:mod:`skinnode.bench.load`). Frames arrive over UDP, through SocketCAN's reader (see
 :mod:`skinnode.transport.datagram`), or on a real CAN interface.
 """
 
@@ -33,10 +33,10 @@ from skinnode.transport.datagram import DatagramPort, free_channel
 
 PATCHES_A_BUS: Final = 4
 CLASSIC_MS: Final = 50
-"""Four patches of 101 frames in 50 ms are 8,080 frames/s beside SYNC and heartbeats."""
+"""SYNC period of classic CAN: four patches of 101 frames give 8,080 frames/s plus SYNC and heartbeats."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Milliseconds from the SYNC of a bus to the SYNC of the next, if they are staggered: four patches are then
+"""Offset in ms between the SYNCs of successive buses, if staggered; the four patches of one bus are then
 solved before the next four are due."""
 SCENES: Final = (
     (False, True, 0.0),
@@ -46,9 +46,9 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""CAN FD, touched, and the stagger in ms."""
+"""CAN FD, touched, and the offset between SYNCs in ms."""
 DEADLINE_US: Final = 1000
-"""Deadline of a field. An exact inverse takes 200 µs, and 13 ms if the posterior has to check it."""
+"""Deadline of a field. An exact inverse takes 200 µs, or 13 ms if the posterior has to check it."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -69,11 +69,11 @@ def run(  # noqa: PLR0913 - the options of the command
     """Run all hands.
 
     Args:
-        seconds: Length of each measurement.
+        seconds: Duration of each measurement.
         short: Run only the rows that have a requirement.
         interface: ``udp`` or ``socketcan``.
-        channel: Channel of socketcan.
-        all_cores: Do not keep the host to one core and the load to another.
+        channel: Channel for socketcan.
+        all_cores: Do not bind host and load to one core each.
         report: Called with each row when it is ready.
 
     Returns:
@@ -149,13 +149,13 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
             "stream": {"capacity_fields": 100_000},
         }
     )
-    # Not validated: a bus this full is refused, because frames of maximum length do not fit.
+    # Skip validation, which refuses a bus this full: frames of maximum length would not fit.
     full = tuple(bus.model_copy(update={"max_load": 2.0}) for bus in hand.buses)
     return hand.model_copy(update={"buses": full})
 
 
 def _part(hand: HandConfig, buses: int) -> HandConfig:
-    """Return the hand with the first ``buses`` of its buses."""
+    """Return the hand with only the first ``buses`` of its buses."""
     kept = hand.buses[:buses]
     patches = tuple(patch for patch in hand.patches if patch.bus in {bus.name for bus in kept})
     return hand.model_copy(update={"buses": kept, "patches": patches})
@@ -167,7 +167,7 @@ def _measure(hand: HandConfig, generator: Generator) -> Row:
     generator.send_heartbeats(names)
     with Host.from_config(hand, open_port=open_port) as host, _Reader(host.fields()) as reader:
         begin_ns = generator.begin()
-        time.sleep(LEAD_S / 2)  # the last of the heartbeats before it have come
+        time.sleep(LEAD_S / 2)  # the last heartbeats before the start have arrived
         read_before = _read(host)
         before, begin_s = _cpu_s(), time.monotonic()
         sent = generator.wait()
@@ -229,14 +229,14 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Return the requirements on the fullest hands with touched patches, and whether they are reached."""
+    """Return the requirements on the fullest hands with touched patches, and whether they are met."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:
             continue
         asked = [("lost", lost(row), 0.0), ("latency p99, ms", row["published_ms"]["p99"], LATENCY_MS)]
         if not row["fd"]:
-            asked.append(("received to assembled, µs a frame", row["receive_us"], RECEIVE_US))
+            asked.append(("received to assembled, µs per frame", row["receive_us"], RECEIVE_US))
         for what, got, most in asked:
             reached = got is not None and got <= most
             said = f"{hand_name(row)}: {what}"
@@ -245,7 +245,7 @@ def _must(rows: list[Row]) -> list[Row]:
 
 
 class _Reader:
-    """A program that reads fields, and notes when it got each."""
+    """A program that reads fields and records when it received each."""
 
     def __init__(self, fields: Subscription) -> None:
         self._stamps: list[tuple[ScanStamp, int]] = []
@@ -253,7 +253,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return ms from last frame to field, and to reading it, for scans that ended after ``begin_ns``."""
+        """Return ms from last frame to field and to reading it, for scans that ended after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]
@@ -291,14 +291,14 @@ def _settle(host: Host) -> None:
 
 
 def _cpu_s() -> dict[str, float]:
-    """Return the CPU time of each group of threads of this process, s."""
+    """Return the CPU time of each thread group of this process, s."""
     used: dict[str, float] = defaultdict(float)
     names = {thread.native_id: thread.name.split()[0] for thread in threading.enumerate()}
     for task in os.listdir("/proc/self/task"):
         group = names.get(int(task), "other")
         try:
             text = Path(f"/proc/self/task/{task}/schedstat").read_text()
-        except OSError:  # it has ended
+        except OSError:  # the thread has ended
             continue
         used[group if group in _GROUPS else "other"] += int(text.split()[0]) * 1e-9
     return used
@@ -307,18 +307,18 @@ def _cpu_s() -> dict[str, float]:
 HEAD: Final = (
     f"{'':39}{'frames/s':>9}{'load':>6}{'sent':>9}{'received':>9}{'lost':>6}{'scans/s':>8}{'skipped':>8}"
     f"{'published, ms':>20}{'read, ms':>14}{'µs':>6}{'receive':>9}{'mainline':>9}{'solve':>7}{'load':>6}"
-    f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'share of a core':>24}"
+    f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'fraction of a core':>24}"
 )
 LEGEND: Final = (
-    "lost: frames, chunks and scans, wherever. published, read: from the last frame of a scan, by kernel\n"
-    "time, to its field, and to its field in the hands of a program. µs: of threads receive and mainline,\n"
-    "their waking included. load: of the bus; of the process that replays. The scans of a SYNC end at the\n"
-    "same time on all patches, but where the SYNCs of the buses are some ms apart."
+    "lost: frames, chunks and scans, wherever. published, read: time from the last frame of a scan (kernel\n"
+    "timestamp) to its field, and to the delivery of that field. µs: of threads receive and mainline,\n"
+    "including wake-ups. load: of the bus; of the process that replays. The scans of a SYNC end at the same\n"
+    "time on all patches, except where the SYNCs of the buses are some ms apart."
 )
 
 
 def line(row: Row) -> str:
-    """Return a row as a line."""
+    """Return a row as one line of text."""
 
     def ms(spread: dict[str, float | None], *names: str) -> str:
         return "".join("     -" if spread[name] is None else f"{spread[name]:6.1f}" for name in names)

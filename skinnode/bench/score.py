@@ -1,8 +1,9 @@
-"""Compares decoded fields with the truth: error, reported uncertainty, and the bound set by the codes.
+"""Scores decoded fields against the truth: error, reported uncertainty, and the bound set by the codes.
 
-The bound is the Cramér-Rao bound of one scan: with S the deviations of the relative residuals F/b − 1 and J
-their Jacobian at the true position, no unbiased estimate of a wire's electrodes has a covariance below
-J⁻¹ S Sᵀ J⁻ᵀ. It is computed here from the NumPy reference model, independently of the solver.
+The bound is the Cramér-Rao bound of one scan: with S the standard deviations of the relative residuals
+F/b − 1 and J their Jacobian at the true position, no unbiased estimate of a wire's electrodes has a
+covariance below J⁻¹ S Sᵀ J⁻ᵀ. The bound is computed here from the NumPy reference model, independently of
+the solver.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
-"""An error beyond this many reported deviations is a fault. A run scores some 1e5 coordinates, of which a
-normal distribution puts 2e-4 beyond six deviations: one false alarm in 5,000 runs."""
+"""Error in reported standard deviations beyond which there is a fault. A run scores about 1e5 coordinates; a
+normal distribution puts 2e-4 of a coordinate beyond six standard deviations: one false alarm in 5,000
+runs."""
 
 EXCESS_LIMIT = 1.15
-"""Maximum RMS error over RMS reported deviation of a run, required by this project."""
+"""Maximum RMS error over RMS reported standard deviation of a run, as required by this project."""
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:

@@ -1,12 +1,12 @@
-"""Soak a hand under random faults: does the host survive, do all patches recover, are all sums exact?
+"""Soak of a hand under random faults: does the host survive, do all patches recover, are all sums exact?
 
 Simulated nodes with faults and the host share this process and two virtual buses. A round injects one to
-three faults into one patch or all, including drops of frames of every kind, clears them, and waits until
-every patch is operational and streaming again; subscribers come and go meanwhile. In some rounds other
-processes occupy the processor. Memory is compared between two idle instants, one after a warm-up and one
-at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would show a leak of one object
-a scan) and resident memory. This file may import the simulator, as the demo may, because it needs a source of
-faults.
+three faults, including drops of frames of every kind, into one patch or into all. It then clears them and
+waits until every patch is operational and streaming again; subscribers come and go meanwhile. In some rounds
+other processes occupy the processor. Memory is compared between two idle instants, one after a warm-up and
+one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a leak of one
+object per scan) and resident memory. This file may import the simulator, as the demo may, because it needs a
+source of faults.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import REMEMBERED_READINGS
 
 WARM_UP: Final = 0.25
-"""Share of the time after which memory is measured for the first time."""
+"""Fraction of the run after which memory is measured for the first time."""
 BLOCKS: Final = 2000
-"""Maximum growth in blocks: a few hundred come and go; a leak of one block a scan makes 10,000 in three
+"""Maximum growth in blocks. A few hundred come and go; a leak of one block per scan adds 10,000 in three
 minutes."""
 RESIDENT_MB: Final = 8.0
-"""Maximum growth of resident memory, which C's allocator returns at its own pace."""
+"""Maximum growth of resident memory in MB; C's allocator returns memory at its own pace."""
 BACK_S: Final = 15.0
-"""Seconds after which a stream that is not back counts as lost. It should take one second; a loaded machine
-may need more."""
+"""Seconds after which a stream that has not resumed counts as lost. It should take one second; a loaded
+machine may need more."""
 SLOW_S: Final = 1.0
 """Seconds after which a round is reported as slow."""
 STARVED: Final = 0.1
-"""Share of the rounds in which other processes occupy the processor."""
+"""Fraction of the rounds in which other processes occupy the processor."""
 STARVED_S: Final = 3.0
 TARED: Final = 0.2
-"""Share of the rounds in which a patch is tared."""
+"""Fraction of the rounds in which a patch is tared."""
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Minimum number of simultaneous faults that a line counts instead of naming."""
+"""Number of simultaneous faults from which a line gives their count instead of their names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -141,10 +141,10 @@ def warm_up() -> None:
 
 
 def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Soak a hand, and return the figures. Raises as :meth:`Host.from_config`.
+    """Soak a hand and return the figures. Raises as :meth:`Host.from_config`.
 
     Args:
-        minutes: Length of the soak.
+        minutes: Duration of the soak.
         seed: Seed of the faults.
         report: Called with each line of progress.
     """
@@ -153,11 +153,11 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     counter = sums.FrameCounter([bus.name for bus in hand.buses])
     kept = logging.getLogger("skinnode")
     level = kept.level
-    kept.setLevel(logging.CRITICAL)  # injected faults log thousands of warnings
+    kept.setLevel(logging.CRITICAL)  # injected faults cause thousands of warnings
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # it grows up to that
+            for k in range(REMEMBERED_READINGS):  # fill it, so that it does not grow during the soak
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}
@@ -174,7 +174,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
                     *sums.injected_otherwise(stats, injected),
                     *sums.received_otherwise(fleet, counter, before),
                 ]
-            time.sleep(CALM_S)  # lets the host's last frames reach the nodes
+            time.sleep(CALM_S)  # time for the host's last frames to reach the nodes
         wrong += sums.sent_otherwise(fleet, counter)
     finally:
         kept.setLevel(level)
@@ -253,7 +253,7 @@ def _soak(
             if chance.random() < TARED:
                 what += f"; {_tare(host, chance.choice(names))}"
             if hungry:
-                what += f" with {round_.enter_context(starved_processor())} processes on the processor"
+                what += f" with {round_.enter_context(starved_processor())} processes occupying the processor"
             with host.fields(capacity=2) as abandoned:
                 callback = host.on_field(_broken if rounds % 2 else _patient, capacity=4)
                 abandoned.get(0.1)
@@ -289,7 +289,7 @@ def _soak(
 
 
 def _all_at_once(host: Host, fleet: Fleet, names: list[str]) -> None:
-    """Bring every patch up at the same time, for the maximum number of threads."""
+    """Bring up all patches at the same time, to reach the maximum number of threads."""
     fleet.inject(Faults(unplugged=True))
     time.sleep(CALM_S)
     _calm(fleet)
@@ -313,7 +313,7 @@ def _inject(fleet: Fleet, chance: random.Random, names: list[str]) -> str:
 
 
 def _tare(host: Host, name: str) -> str:
-    """Tare a patch if it is running. Returns the outcome in words."""
+    """Tare a patch if it is running. Returns the outcome as text."""
     try:
         host.tare(name)
     except BusError:  # includes NodeError, raised if the patch is not operational
@@ -328,10 +328,10 @@ def _calm(fleet: Fleet) -> None:
 
 
 def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
-    """Wait until every patch is operational and has published a field of a SYNC sent after the call.
+    """Wait until every patch is operational and has published a field for a SYNC sent after the call.
 
     Returns:
-        The time in s, and the last patch waited for with the reason.
+        The time in s, and the last patch waited for, with the reason.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 
@@ -351,7 +351,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
 
 
 def _not_operational(host: Host) -> list[str]:
-    """Return a line for each patch that is not operational, with the reason."""
+    """Return one line per patch that is not operational, with the reason."""
     healths = (host.health(patch.name) for patch in host.hand.patches)
     return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
 
@@ -365,7 +365,7 @@ def _patient(field: FieldFrame) -> None:
 
 
 def _standing_still(host: Host) -> HostStats:
-    """Return the counters when they have stopped changing."""
+    """Return the counters once they have stopped changing."""
     last, stats = None, host.stats()
     for _ in range(100):
         now = (
@@ -383,7 +383,7 @@ def _standing_still(host: Host) -> HostStats:
 def _size() -> _Size:
     for _ in range(3):
         gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:
         trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])

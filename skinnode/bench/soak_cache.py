@@ -1,4 +1,4 @@
-"""A damaged copy of the kernel cache, for a soak to start with."""
+"""A damaged copy of the kernel cache for a soak to start with."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import Final
 
 CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
 _DAMAGED: Final = 4
-"""Number of cache files to damage; each costs a compilation of up to a few seconds."""
+"""Number of cache files to damage; each costs a recompilation of up to a few seconds."""
 _COMPILE_S: Final = 600.0
-"""Maximum time to compile all kernels, on a slow machine."""
+"""Maximum time to compile all kernels on a slow machine, s."""
 
 
 def fill(folder: Path) -> None:
     """Fill a cache below ``folder`` with the kernels that a soak needs.
 
-    They are copied from the user's cache, or compiled in a child process if the user has none. The user's
+    They are copied from the user's cache, or compiled in a child process if that cache is empty. The user's
     cache is not changed.
 
     Raises:
-        subprocess.SubprocessError: The child fails.
+        subprocess.SubprocessError: The child process fails.
     """
     from skinnode.compiled.jit import cache_dir, is_cold
 
@@ -43,9 +43,9 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage files of the cache below ``folder``, alternately cut in half and overwritten with random bytes.
+    """Damage cache files below ``folder``, alternately truncating one and filling one with random bytes.
 
-    The same seed damages the same files. Returns a line for each file.
+    The same seed damages the same files. Returns one line per file.
     """
     chance = random.Random(seed)
     files = sorted(file for file in folder.rglob("*.nb[ci]") if file.stat().st_size > 1)

@@ -1,4 +1,4 @@
-"""Starves a soak of processor time for a while, with child processes that spin."""
+"""Starvation of a soak: spinning child processes take its processor time for a while."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from typing import Final
 
 _NICE: Final = -5
-"""Nice value of the children if this process may set it; otherwise they inherit that of the soak."""
+"""Nice value of the children if this process may set it; otherwise they inherit the soak's."""
 _CHILDREN_PER_PROCESSOR: Final = 3
 _LONGEST_S: Final = 30.0
-"""Maximum lifetime of a child, which also exits as soon as its parent has gone."""
+"""Maximum lifetime of a child, s; it also exits as soon as its parent has exited."""
 
 _BUSY: Final = """
 import os, sys, time

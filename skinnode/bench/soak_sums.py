@@ -1,4 +1,4 @@
-"""Compares, kind by kind, the frames that the nodes of a soak sent and dropped with the host's counts."""
+"""Comparison, kind by kind, of the frames that a soak's nodes sent and dropped with the host's counts."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from vcan_sim.tally import Kind, kind_of
 class FrameCounter:
     """Counts the frames that a host receives and sends, by bus and kind.
 
-    It is a :class:`~skinnode.host.tap.HostTap`.
+    Implements :class:`~skinnode.host.tap.HostTap`.
     """
 
     def __init__(self, buses: Sequence[str]) -> None:
         self.received_on: dict[str, Counter[Kind]] = {bus: Counter() for bus in buses}
         self.sent_on: dict[str, Counter[Kind]] = {bus: Counter() for bus in buses}
-        self._counting = threading.Lock()  # several threads send
+        self._counting = threading.Lock()  # several threads send frames
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Count a batch."""
+        """Count a batch of frames."""
         counter = self.received_on[bus]
         for frame in frames:
             if not (frame.error or frame.extended):
@@ -57,11 +57,11 @@ class KindSums:
 
     kind: str
     wanted: int
-    """Frames that the senders wanted to send, including those added by faults."""
+    """Frames to send, including those added by faults."""
     dropped: int
-    """Frames that a fault dropped on their way."""
+    """Frames dropped in transit by a fault."""
     held_back: int
-    """Frames that a node which was silent, unplugged, deaf or off the bus did not send or hear."""
+    """Frames not sent or not received because the node was silent, unplugged, deaf or bus-off."""
     arrived: int
 
 
@@ -81,7 +81,7 @@ def of_nodes(fleet: Fleet) -> list[KindSums]:
 def of_host(fleet: Fleet) -> list[KindSums]:
     """Return the sums of frames from the host to the nodes, by kind.
 
-    A frame counts once for each node that could hear it.
+    A frame counts once for each node that could receive it.
     """
     sums = []
     for kind in Kind:
@@ -99,13 +99,13 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Return a line for each sum of frames from nodes to host that does not agree.
+    """Return one line per sum of frames from nodes to host that does not agree.
 
     Call while the nodes are silent.
 
     Args:
-        fleet: The nodes.
-        counter: Counts of the host.
+        fleet: Fleet of the nodes.
+        counter: Counts made by the host.
         before: Frames that each bus carried before the host opened it.
     """
     found = []
@@ -123,7 +123,7 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Return a line for each sum of frames from host to nodes that does not agree, in total and by node.
+    """Return one line per sum of frames from host to nodes that does not agree, in total and by node.
 
     Call after the host has closed and the nodes have stopped.
     """
@@ -147,7 +147,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
 
 
 def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
-    """Return a line for each counter of the host that differs from the injected faults."""
+    """Return one line per host counter that differs from the injected faults."""
     found = [
         f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
         for name, each in injected.items()

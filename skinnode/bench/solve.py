@@ -1,8 +1,7 @@
-"""One wire of the reference patch to 1e-9 from a near start: our solvers and their peers on the same F and J.
+"""One wire of the reference patch solved to 1e-9 from a nearby start, by us and by peers on the same F and J.
 
-The start is the sample before the last of a ten-step path to a 10 % press. Every peer runs at the loosest
-tolerance that brings the displacement to 1e-9; a peer that no tolerance brings there is listed without a
-time.
+The start is the second-to-last sample of a ten-step path to a 10 % press. Every peer runs at the loosest
+tolerance that brings the displacement to 1e-9; a peer that never gets there is listed without a time.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ Solve = Callable[["Case", float], Float]
 
 
 class Case:
-    """One wire: r = a F − 1 and its Jacobian for any solver, its start and its truth."""
+    """One wire: r = a F − 1 and its Jacobian for any solver, with its start and its truth."""
 
     def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
         self.wire, self.a, self.start, self.truth = wire, a, start, truth
@@ -54,7 +53,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return r at the point of the last Jacobian, computed with it."""
+        """Return r at the point of the last Jacobian, with which it was computed."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
@@ -165,7 +164,7 @@ def ceres() -> Solve:
 
     def solve(case: Case, tolerance: float) -> Float:
         x = case.start.copy()
-        options.function_tolerance = tolerance**2  # of the sum of squares
+        options.function_tolerance = tolerance**2  # tolerance of the sum of squares
         options.gradient_tolerance = tolerance
         options.parameter_tolerance = tolerance
         problem = pyceres.Problem()
@@ -183,7 +182,7 @@ def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Return the figures of the benchmark: µs a wire, ratio to our dogleg, error."""
+    """Return the figures of the benchmark: µs per wire, ratio to our dogleg, error."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     cases = []

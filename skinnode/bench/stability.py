@@ -1,4 +1,4 @@
-"""Every hard case over many seeds: error, reported deviation, status and verdict of each method."""
+"""Every hard case solved with many seeds: error, reported deviation, status and verdict of each method."""
 
 from __future__ import annotations
 
@@ -21,19 +21,17 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Streams on which ``auto`` must equal another method bit for bit before it is no longer run itself."""
+"""Number of streams on which ``auto`` must equal another method bit for bit before it is no longer run."""
 
 
 @contextlib.contextmanager
 def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of ``jobs`` processes, which end at once if the ``with`` block is left by an exception."""
+    """Yield a pool of ``jobs`` processes, which are killed if an exception leaves the ``with`` block."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, spawn) as pool:
         try:
             yield pool
-        except (
-            BaseException
-        ):  # nothing is cancelled: Python 3.11 prints a traceback about it when a process dies
+        except BaseException:  # do not cancel: Python 3.11 would print a traceback when a process dies
             for process in multiprocessing.active_children():
                 process.kill()
             raise
@@ -50,10 +48,10 @@ def run(
     """Solve the hard cases.
 
     Args:
-        seeds: Streams of each case.
-        cases: The cases; default: all.
-        only: The methods; default: all of each case.
-        jobs: Processes that solve all cases in parallel; the streams, and so the rows, do not depend on it.
+        seeds: Number of streams per case.
+        cases: Cases to solve; default: all.
+        only: Methods to use; default: all methods of each case.
+        jobs: Number of processes that solve cases in parallel; it does not affect the streams or the rows.
         report: Called with each row when it is ready.
 
     Returns:
@@ -82,17 +80,17 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of a case by number: a case has closures, which cannot be sent to a process."""
+    """Return the rows of a case given by number, because its closures cannot be sent to a process."""
     return _rows(all_cases()[number], only, seeds)
 
 
 def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
-    """Return one row for each method; all methods get the same streams."""
+    """Return one row per method; all methods get the same streams."""
     chosen = [name for name in case.methods if only is None or name in only]
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}
     twins = [other for other in ("exact", "posterior") if "auto" in chosen and other in chosen]
-    name_code = zlib.crc32(case.name.encode())  # adding or moving a case leaves the streams of the others
+    name_code = zlib.crc32(case.name.encode())  # adding or moving a case does not change the others' streams
     for seed in range(seeds):
         stream = case.make(np.random.default_rng([seed, name_code]))
         tracked = stream.every(case.stride)
@@ -120,14 +118,15 @@ HEAD = (
 
 
 LEGEND = (
-    "# is the number of the hard case; error and reported deviation are shares of the displacement of the\n"
-    "CONVERGED wires in the deepest frame, the worst that of any frame. Wires of all frames are accurate,\n"
-    "flagged (not CONVERGED), or wrong: CONVERGED and off by more than chance and the deviation allow."
+    "# is the number of the hard case. error and reported standard deviation are relative to the\n"
+    "displacement of the CONVERGED wires in the deepest frame; the worst error is that of any frame.\n"
+    "Wires of all frames are accurate, flagged (not CONVERGED), or wrong: CONVERGED, but off by more\n"
+    "than chance and the reported standard deviation allow."
 )
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row of the table."""
+    """Return a row of the table as text."""
     method = row["method"] if row["same_as"] is None else f"{row['method']} = {row['same_as']}"
     return (
         f"{row['number']:2} {row['case']:46}{method:22}{share(row['median_error']):>11}"
@@ -137,7 +136,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def share(value: float) -> str:
-    """Return a share as a percentage or, if that is unreadable, as a power of ten; a dash for NaN."""
+    """Return a fraction as a percentage or, if that is unreadable, as a power of ten; a dash for NaN."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "inf"
     if 1e-4 <= value < 1:

@@ -1,4 +1,4 @@
-"""Fair times on a shared machine: candidates take turns, and ratios are formed within a turn."""
+"""Fair timing on a shared machine: candidates take turns, and ratios are computed within a round."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.files.output_file import write_text
 ROUNDS: Final = 31
 """Default number of rounds; odd, so that the median is a measured time."""
 TURN_S: Final = 4e-3
-"""Length of a turn: long compared with the clock's resolution, short compared with other load."""
+"""Duration of a turn, s: long compared with the clock's resolution, short compared with other load."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _calls_in_a_turn(function: Callable[[], object]) -> int:
 
 
 def machine() -> dict[str, str]:
-    """Return the versions and the processor that the figures were measured with."""
+    """Return the library versions and the processor with which the figures were measured."""
     import numba
     import numpy
     import scipy

@@ -1,9 +1,9 @@
-"""The truth with which benchmarks compare the solvers, made without any assumption of the solvers.
+"""Truth for scoring the solvers in benchmarks, made without any assumption of the solvers.
 
 Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
-they have no grid and come from no prior. Resistances come from :class:`Skin`, which can differ from what the
-solver expects: electrodes of finite size, rubber whose resistivity depends on strain, another thickness, a
-contact resistance in series. Converters add noise and codes as real ones do.
+they have no grid and do not depend on a prior. Resistances come from :class:`Skin`, which can differ from the
+solver's model: electrodes of finite size, rubber whose resistivity depends on strain, a different thickness,
+a contact resistance in series. Converters add noise and codes as real converters do.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise given to a tracker for data without noise: the tolerance to which it solves."""
+"""Relative noise passed to a tracker for noiseless data; sets the tolerance to which it solves."""
 RING: Final = 4
-"""Points on the rim of a finite electrode; a pair of electrodes has 16 distances."""
+"""Number of points on the rim of a finite electrode, giving 16 distances per pair of electrodes."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """A sphere at its deepest; lengths in metres. ``share`` is always a share of the depth."""
+    """A sphere at full depth; lengths in metres. ``share`` is always a fraction of the depth."""
 
     center_m: tuple[float, float]
     radius_m: float
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Only the traction along the surface: the contact with friction less the same contact without."""
+    """Whether only the traction along the surface acts: the contact with friction minus the one without."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
         """Return the closed forms, each with its sign."""
@@ -63,14 +63,14 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A real patch; the solver knows only its ``layout``.
+    """A real patch, of which the solver knows only ``layout``.
 
     Args:
-        layout: The layout that the solver gets.
-        height: True height of the upper layer as a share of the layout's.
+        layout: Layout passed to the solver.
+        height: True height of the upper layer, as a fraction of the layout's.
         electrode: Radius of every electrode, pitches; 0 is the point that the solver assumes.
-        strain: β of ρ d (1 + β (d/d₀ − 1)), d₀ the distance at rest.
-        series: Contact resistance in series with each pair of wires, as a share of its R₀.
+        strain: β in ρ d (1 + β (d/d₀ − 1)), where d₀ is the distance at rest.
+        series: Contact resistance in series with each pair of wires, as a fraction of its R₀.
         points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
         axes: Axes (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
     """
@@ -102,7 +102,7 @@ class Skin:
 
     @functools.cached_property
     def rest_ohm(self) -> Float:
-        """Resistances (U, K) at rest, without noise: the baseline that the solver gets."""
+        """Resistances (U, K) at rest, without noise: the baseline passed to the solver."""
         return self.resistance_ohm(np.zeros(self.layout.upper_m.shape))
 
     def resistance_ohm(self, displacement_m: Float) -> Float:
@@ -121,7 +121,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Return the same as :func:`skinnode.model.forward.resistance_ohm`, in a fifth of its time."""
+        """Return the result of :func:`skinnode.model.forward.resistance_ohm` in a fifth of its time."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -162,10 +162,10 @@ class Skin:
 
 @dataclass(frozen=True)
 class Converter:
-    """A converter: noise of every reading (``sigma``, relative) and, unless ``bits`` is 0, codes of R/R₀.
+    """A converter with noise in every reading (``sigma``, relative) and, unless ``bits`` is 0, codes of R/R₀.
 
-    Codes are those of the protocol: from ``lo`` to ``hi``, with three reserved; 16 and 24 bits are written
-    and read by the protocol's own codec.
+    Codes are those of the protocol: they span ``lo`` to ``hi`` and include three reserved codes. Codes of 16
+    and 24 bits are encoded and decoded by the protocol's own codec.
     """
 
     sigma: float = 0.0
@@ -175,12 +175,12 @@ class Converter:
 
     @property
     def exact(self) -> bool:
-        """Whether a reading is the resistance itself."""
+        """Whether a reading equals the resistance."""
         return self.sigma == 0.0 and self.bits == 0
 
     @property
     def relative_std(self) -> float:
-        """Relative standard deviation of a reading at rest, which its user knows."""
+        """Relative standard deviation of a reading at rest, known to the user."""
         if self.exact:
             return EXACT_NOISE
         rounding = (self.hi - self.lo) / ((1 << self.bits) - 4) / math.sqrt(12.0) if self.bits else 0.0
@@ -189,7 +189,7 @@ class Converter:
     def read(
         self, resistance: Float, rest: Float, rng: np.random.Generator
     ) -> tuple[Float, NDArray[np.bool_], Float]:
-        """Return the readings, their validity and their relative standard deviations, all of one shape."""
+        """Return the readings, their validity and relative standard deviations, all of the same shape."""
         if self.exact:
             return resistance, np.ones(resistance.shape, bool), np.full(resistance.shape, EXACT_NOISE)
         noisy = resistance * (1.0 + self.sigma * rng.standard_normal(resistance.shape))
@@ -212,7 +212,7 @@ class Converter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """The input of a solver, and the truth."""
+    """Input of a solver, with the truth."""
 
     frames_ohm: Float
     """(T, U, K), ohm; not finite where not valid."""
@@ -221,9 +221,9 @@ class Stream:
     noise: Float
     """(T, U, K), relative standard deviation of the converter."""
     truth_m: Float
-    """(T, U, N, 3), displacement in metres; NaN in frames that no skin can produce."""
+    """(T, U, N, 3), true displacement in metres; NaN in frames that no skin can produce."""
     force_n: Float
-    """(T, 3), sum of all loads in newtons; NaN as above."""
+    """(T, 3), sum of all loads in newtons; NaN in the same frames as ``truth_m``."""
     presses: tuple[Press, ...] = ()
 
     def every(self, stride: int) -> Stream:
@@ -246,15 +246,15 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Return the stream of presses at shares of their depth.
+    """Return the stream of presses at fractions of their depth.
 
     Args:
-        skin: The patch.
-        presses: The presses, superposed.
-        shares: Shares (T,) of the depth, one for each frame.
+        skin: Patch that is pressed.
+        presses: Superposed presses.
+        shares: Fractions (T,) of the depth, one per frame.
         converter: Converter that reads the resistances.
-        rng: Source of noise.
-        gain: Factors (T, U, K), or broadcast to it, of the resistances.
+        rng: Random generator of the noise.
+        gain: Factors of the resistances, (T, U, K) or broadcastable to it.
     """
     truth = np.stack([skin.displacement_m(presses, share) for share in shares])
     resistance = np.stack([skin.resistance_ohm(moved) for moved in truth])
@@ -278,13 +278,13 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
     """Return a random press by a sphere.
 
     Args:
-        rng: Source of chance.
-        layout: The patch.
+        rng: Random generator.
+        layout: Patch to press.
         depth: Depth in heights.
-        radius: Range of the radius, pitches.
+        radius: Range of the sphere's radius, pitches.
         shear: Maximum friction.
         margin: Distance from the centre to the border of the patch, pitches.
-        where: ``inside``; or the centre on the border in x (``edge``), or half a contact radius outside
+        where: ``inside``; or the centre on the border in x (``edge``), or half a contact radius outside it
             (``half off``).
     """
     pitch = layout.pitch_m

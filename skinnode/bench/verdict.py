@@ -1,23 +1,23 @@
-"""Verdict on solved wires by the truth: accurate, flagged or wrong.
+"""Verdicts on solved wires against the truth: accurate, flagged or wrong.
 
-A wire of a frame is
+A wire in a frame is
 
-flagged    if its status is not CONVERGED: nothing was claimed
+flagged    if its status is not CONVERGED, so that nothing was claimed
 accurate   if it is CONVERGED and every coordinate is within the reported uncertainty
-wrong      if it is CONVERGED with too large an error in a coordinate, or not finite under any status
+wrong      if it is CONVERGED and a coordinate has too large an error, or not finite, whatever its status
 
-With noise an error may reach 5 reported deviations; chance alone puts 6e-7 of all coordinates beyond. Chance
-must neither condemn a long run nor excuse a fault, so two conditions must hold in each row, both with a
-probability of 1e-4 for an honest Gaussian:
+With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
+beyond that. Chance must neither condemn a long run nor excuse a fault, so two conditions must hold in each
+row. For errors that are Gaussian with the reported standard deviation, each fails with a probability of 1e-4:
 
-- no coordinate is beyond z(n), the number of deviations that one of n independent coordinates exceeds with
-  probability 1e-4, but at least 5. z is 5.7 for 9,000 coordinates, 6.4 for 1e6 (Bonferroni's bound:
-  correlation only makes it safer)
-- no more seeds have a coordinate beyond 5 than a binomial allows whose probability is the expected number of
-  such coordinates a seed (again a bound); seeds are independent even though coordinates are not
+- no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)
+  standard deviations with probability 1e-4. z is 5.7 for 9,000 coordinates and 6.4 for 1e6 (Bonferroni's
+  bound: correlation only makes it safer)
+- the number of seeds with a coordinate beyond 5 is within a binomial limit whose probability is the expected
+  number of such coordinates per seed (again a bound); seeds are independent even though coordinates are not
 
 If the second condition fails, every wire beyond 5 is wrong. With exact data nothing is left to chance: the
-limit is 5 reported deviations or 1e-6 of the wire's largest displacement, whichever is larger.
+limit is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from numpy.typing import NDArray
 from skinnode.model.layout import Float
 
 LIMIT: Final = 5.0
-"""Maximum error in reported deviations."""
+"""Maximum error, in reported standard deviations."""
 CHANCE: Final = 1e-4
-"""Probability that an honest row is called wrong: with 350 rows, one false alarm in 30 runs."""
+"""Probability that a correct row is called wrong: with 350 rows per run, one false alarm in 30 runs."""
 EXACT_SHARE: Final = 1e-6
-"""Tolerance with exact data, as a share of the wire's largest displacement."""
+"""Tolerance with exact data, relative to the wire's largest displacement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Estimates of a method for the frames of a stream."""
+    """A method's estimates for the frames of a stream."""
 
     displacement_m: Float
     """(F, U, N, 3)"""
@@ -52,7 +52,7 @@ class Solved:
     """(F, U)"""
 
     def equals(self, other: Solved) -> bool:
-        """Return whether both are the same, bit for bit."""
+        """Return whether both are equal, bit for bit."""
         return (
             np.array_equal(self.displacement_m, other.displacement_m, equal_nan=True)
             and np.array_equal(self.std_m, other.std_m, equal_nan=True)
@@ -61,12 +61,12 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that a normal variable is more than ``deviations`` from its mean."""
+    """Return the probability that a normal variable is over ``deviations`` sigma from its mean."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 
 def limit_of(coordinates: int) -> float:
-    """Return z(n) of the module's docstring for n ``coordinates``."""
+    """Return z(n), as defined in the module docstring, for n ``coordinates``, but at least 5."""
     from scipy.special import ndtri
 
     if coordinates == 0:
@@ -75,7 +75,7 @@ def limit_of(coordinates: int) -> float:
 
 
 def allowed_seeds(coordinates: int, seeds: int) -> int:
-    """Return the maximum number of seeds with a coordinate beyond 5 that chance explains."""
+    """Return the maximum number of seeds with a coordinate beyond 5 that chance can explain."""
     from scipy.stats import binom
 
     if seeds == 0:
@@ -85,7 +85,7 @@ def allowed_seeds(coordinates: int, seeds: int) -> int:
 
 @dataclass
 class Tally:
-    """Accumulates one row: a case solved by one method over the seeds."""
+    """Accumulates one row: a case solved by one method with all seeds."""
 
     exact: bool
     seeds: int = 0
@@ -97,10 +97,10 @@ class Tally:
     _reported: list[float] = field(default_factory=list)
     _worst_error: float = math.nan
     _deviations: list[tuple[float, int, int, int]] = field(default_factory=list)
-    """(deviations, seed, frame, wire) of every wire beyond 5; inf for one that is not finite."""
+    """(deviations, seed, frame, wire) of every wire beyond 5; inf for a wire that is not finite."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
-        """Add a seed. ``truth_m`` (F, U, N, 3) is the truth of the frames; frames of NaN are left out."""
+        """Add a seed. ``truth_m`` (F, U, N, 3) is the truth of the frames; NaN frames are left out."""
         self.seeds += 1
         kept = np.flatnonzero(np.isfinite(truth_m).all(axis=(1, 2, 3)))
         truth_m, moved, std = truth_m[kept], solved.displacement_m[kept], solved.std_m[kept]
@@ -121,9 +121,10 @@ class Tally:
         self._shares(np.where((converged & finite)[..., None, None], error, np.nan), std, truth_m)
 
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
-        """Add error and deviation of the converged wires in the deepest frame, as shares of the displacement.
+        """Add the relative error and standard deviation of the converged wires in the deepest frame.
 
-        The worst error is that of any frame, as a share of the displacement in the deepest frame.
+        Both are relative to the displacement. The worst error is that of any frame, relative to the
+        displacement in the deepest frame.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
         used = np.isfinite(error[deepest])
@@ -139,7 +140,7 @@ class Tally:
             self._worst_error = float(np.fmax(self._worst_error, worst))
 
     def row(self) -> dict[str, Any]:
-        """Return the figures, with the verdict."""
+        """Return the figures and the verdict."""
         limit = LIMIT if self.exact else limit_of(self._coordinates)
         hit = {seed for _, seed, _, _ in self._deviations}
         by_count = self.exact or len(hit) > allowed_seeds(self._coordinates, self.seeds)
@@ -169,7 +170,7 @@ class Tally:
 def named(row: Mapping[str, Any]) -> str:
     """Return one line about a wrong row: what is wrong, by how much, and how to reproduce it."""
     worst = row["worst"]
-    far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} deviations"
+    far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} standard deviations"
     return (
         f"{row['case']} by {row['method']}: {row['wrong']} of {row['wires']} wires wrong, worst {far} "
         f"(seed {worst['seed']}, frame {worst['frame']}, wire {worst['wire']})"

@@ -1,4 +1,4 @@
-"""Accuracy in one picture: the Pareto fronts, error against noise and codes, coverage, time a frame."""
+"""One picture of the accuracy: Pareto fronts, error against noise and codes, coverage, time per frame."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
         axes.axis("off")
     for axes, panel in zip(grid[0], figures["front"], strict=False):
         _front(axes, panel)
-    grid[0, 0].set_ylabel("error, share of the displacement")
+    grid[0, 0].set_ylabel("error / displacement")
     grid[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
     _noise(grid[1, 0], figures["noise"], "exact")
     _noise(grid[1, 1], figures["noise"], "posterior")
     _codes(grid[1, 2], figures["codes"])
-    _honesty(grid[2, 0], figures["coverage"], "coverage", (0.90, 0.98), "share within the 95 % interval")
-    _honesty(grid[2, 1], figures["coverage"], "ratio", (0.0, 1.15), "RMS error over RMS reported deviation")
+    _honesty(grid[2, 0], figures["coverage"], "coverage", (0.90, 0.98), "fraction within the 95 % interval")
+    _honesty(grid[2, 1], figures["coverage"], "ratio", (0.0, 1.15), "RMS error / RMS reported std. dev.")
     _time(grid[2, 2], figures["time"])
     reached = sum(row["reached"] for row in figures["must"])
     figure.suptitle(
-        f"skinnode bench accuracy, {figures['scenes']} random scenes a line: "
-        f"{reached} of {len(figures['must'])} lines reached"
+        f"skinnode bench accuracy, {figures['scenes']} random scenes per line: "
+        f"{reached} of {len(figures['must'])} requirements met"
     )
     save_figure("--plot", file, figure, 100)
 
@@ -71,7 +71,7 @@ def _front(axes: Any, panel: dict[str, Any]) -> None:
     axes.set_yscale("log")
     axes.set_xlim(15, 2e4)
     axes.set_title(f"four wires, no noise, {panel['scene']}", fontsize=10)
-    axes.set_xlabel("µs a wire")
+    axes.set_xlabel("µs per wire")
     axes.grid(color="0.9", lw=0.5)
 
 
@@ -114,7 +114,7 @@ def _codes(axes: Any, rows: list[dict[str, Any]]) -> None:
     axes.set_xticks(sorted({row["bits"] for row in rows}))
     axes.set_xlabel("bits of a code")
     axes.set_ylabel("error, share")
-    axes.set_title("10% press behind codes, h=0.5", fontsize=10)
+    axes.set_title("10% press with codes, h=0.5", fontsize=10)
     axes.grid(color="0.9", lw=0.5)
     axes.legend(fontsize=8, frameon=False)
 
@@ -128,7 +128,7 @@ def _honesty(
     for shift, (method, colour) in enumerate((("exact", "0.6"), ("posterior", "tab:orange"))):
         values = [np.nan if row[key] is None else row[key] for row in rows if row["method"] == method]
         axes.bar(np.arange(len(labels)) + 0.4 * shift - 0.2, values, 0.38, color=colour, label=method)
-    axes.axhspan(*limits, color="tab:green", alpha=0.15, lw=0, zorder=0, label="wanted of the posterior")
+    axes.axhspan(*limits, color="tab:green", alpha=0.15, lw=0, zorder=0, label="required of the posterior")
     axes.set_xticks(range(len(labels)), labels, fontsize=8)
     axes.set_ylim((0.8, 1.05) if key == "coverage" else (0.0, 1.7))
     axes.set_title(f"random scenes: {title}", fontsize=10)
@@ -144,6 +144,6 @@ def _time(axes: Any, rows: list[dict[str, Any]]) -> None:
     axes.set_xscale("log")
     axes.set_xlim(50, 1e4)
     axes.invert_yaxis()
-    axes.set_xlabel("µs a frame")
+    axes.set_xlabel("µs per frame")
     axes.set_title("time of a tracked frame, staggered h=0.5", fontsize=10)
     axes.legend(fontsize=8, frameon=False, loc="upper right", markerscale=0.4)

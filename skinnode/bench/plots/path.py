@@ -1,4 +1,4 @@
-"""Plot of ``skinnode bench path``: figures 8 to 13 of the paper in our own form."""
+"""Plot of ``skinnode bench path``: figures 8 to 13 of the paper, redrawn."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def _draw_calls(axes: Any, setting: dict[str, Any]) -> None:
         at = np.arange(1, len(calls) + 1) / int(steps)
         axes.plot(at, calls, "o-", ms=3, color=colour, label=f"{steps} steps")
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("place of the step on the path (share of the press)")
-    axes.set_ylabel("function calls a step")
+    axes.set_xlabel("position of the step on the path (fraction of the press)")
+    axes.set_ylabel("function calls per step")
     axes.set_title("Calls at each step (figure 8)")
     axes.legend(frameon=False, ncols=2)
 
 
 def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Draw the iterations summed up along the path of the first press."""
+    """Draw the cumulative iterations along the path of the first press."""
     for colour, marker, size, steps in ((COLOURS[0], "s", 8, "50"), (COLOURS[1], "o", 4, "100")):
         data = setting["figure11"][steps]
         each = np.array(data["uniform_each"])
@@ -63,7 +63,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
         solves = np.cumsum(data["periodic_each"])
         axes.plot(kept, solves, f"{marker}--", ms=size, mfc="none", color=colour, label=label)
     theirs = paper["figure11_iterations"]
-    axes.set_xlabel("place on the path (share of the press)")
+    axes.set_xlabel("position on the path (fraction of the press)")
     axes.set_ylabel("iterations so far")
     axes.set_title(
         "Iterations, uniform and periodic (figure 11)\n"
@@ -73,7 +73,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
 
 
 def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Draw the time of a path over its steps, beside the paper's."""
+    """Draw the time per path against the number of steps, next to the paper's."""
     table = paper["table4_dogleg"]
     axes.loglog(table["steps"], table["runtime_s"], "s-", color="0.5", label="paper (dogleg)")
     for colour, key, label in (
@@ -87,7 +87,7 @@ def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> No
     axes.loglog([1], [adaptive], "*", ms=11, color=COLOURS[2], label="Adaptive, last sample alone")
     axes.set_xlabel("steps")
     axes.set_ylabel("time of one path of one wire (s)")
-    axes.set_title("Time of a path (table 4)")
+    axes.set_title("Time per path (table 4)")
     axes.legend(frameon=False, loc="upper left")
     axes.set_ylim(top=1e5)
 
@@ -104,7 +104,7 @@ def _draw_optimality(figure: Any, setting: dict[str, Any]) -> None:
     by_tolerance.set_title("50 samples (figure 10)")
     lowest = min(min(values) for values in setting["figure10"].values())
     for axes in (by_samples, by_tolerance):
-        axes.set_xlabel("place on the path (share of the press)")
+        axes.set_xlabel("position on the path (fraction of the press)")
         axes.set_ylabel("‖Jᵀr‖∞ (r relative, lengths in pitches)")
         axes.set_ylim(1e-3 * max(1e-18, lowest), 1e-1)
         axes.legend(frameon=False, loc="lower right", ncols=2)
@@ -141,7 +141,7 @@ def _draw_surface(figure: Any, surface: dict[str, Any]) -> None:
     for axes, (title, depth, converged) in zip(maps, shown, strict=True):
         image = axes.imshow(depth, origin="lower", cmap="viridis", vmin=low, vmax=0.0)
         axes.set_title(title, fontsize="medium")
-        axes.set_xlabel("electrode of the wire")
+        axes.set_xlabel("electrode on the wire")
         for wire, solved in enumerate(converged):
             if not solved:
                 axes.axhspan(wire - 0.5, wire + 0.5, fill=False, hatch="//", edgecolor="tab:red", lw=0)
@@ -150,7 +150,7 @@ def _draw_surface(figure: Any, surface: dict[str, Any]) -> None:
 
 
 def _length(um: float) -> str:
-    """Return a length with a unit that suits it."""
+    """Return a length in a suitable unit."""
     if not um < 1e6:
         return "beyond 1 m"
     if um >= 1e3:

@@ -1,4 +1,4 @@
-"""Bars of ``skinnode bench pipeline``: latency and CPU of each hand."""
+"""Bar chart of ``skinnode bench pipeline``: latency and CPU load for each hand."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
         latency.barh(
             heights, [row["published_ms"][quantile] or 0 for row in rows], color=shade, label=quantile
         )
-    latency.axvline(LATENCY_MS, color="black", linestyle=":", label="asked of p99")
+    latency.axvline(LATENCY_MS, color="black", linestyle=":", label="limit for p99")
     latency.set_yticks(heights, names, fontsize="small")
     latency.invert_yaxis()
-    latency.set_xlabel("last frame of a scan to its field, ms")
+    latency.set_xlabel("last frame of a scan to field, ms")
     latency.legend(fontsize="small")
     left = [0.0] * len(rows)
     for group, colour in _GROUPS.items():

@@ -1,4 +1,4 @@
-"""The hard cases in one picture: verdicts of every case and method, error against reported deviation."""
+"""One picture of the hard cases: verdicts by case and method, error against reported uncertainty."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLUMNS: Final = (
 VERDICTS: Final = (("accurate", "#3a9e6e"), ("flagged", "#e3b23c"), ("wrong", "#c8322b"))
 COLOURS: Final = {"path": "0.5", "exact": "tab:blue", "posterior": "tab:orange", "auto": "tab:purple"}
 LEAST: Final = 1e-13
-"""Lower end of both axes; smaller errors and deviations are drawn there."""
+"""Lower end of both axes; smaller errors and standard deviations are drawn at this value."""
 
 
 def draw(file: Path, figures: dict[str, Any]) -> None:
@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Draw a bar for each case and method: the shares of the verdicts, with wrong shares made visible."""
+    """Draw a bar per case and method with the fraction of each verdict; wrong fractions are enlarged."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:
@@ -81,7 +81,7 @@ def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
 
 
 def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Draw the median error of each row over its median reported deviation, as shares of the displacement."""
+    """Draw each row's median error against its median reported standard deviation, both / displacement."""
     for kind, colour in COLOURS.items():
         points = [
             (max(row["reported"], LEAST), max(row["median_error"], LEAST), row["wrong"] > 0)
@@ -103,19 +103,19 @@ def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
     axes.text(1e-9, 1e-7, f"{LIMIT:g} times reported", fontsize=8, ha="right")
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlabel("reported deviation, share of the displacement (median over seeds)")
-    axes.set_ylabel("error, share of the displacement (median over seeds)")
+    axes.set_xlabel("reported standard deviation / displacement (median over seeds)")
+    axes.set_ylabel("error / displacement (median over seeds)")
     axes.set_aspect("equal")
     axes.grid(color="0.9", lw=0.5)
     axes.legend(loc="lower right", frameon=False, fontsize=8)
 
 
 def _list(axes: Any, wrong: list[dict[str, Any]], most: int) -> None:
-    """List the worst rows in words."""
+    """List the worst rows as text."""
     axes.axis("off")
     worst = sorted(wrong, key=lambda row: -row["wrong"] / row["wires"])
     lines = [named(row) for row in worst[:most]]
     if len(worst) > most:
-        lines.append(f"and {len(worst) - most} rows more")
+        lines.append(f"and {len(worst) - most} more rows")
     text = "\n".join(lines) if lines else "Nothing converged and wrong."
     axes.text(-0.1, 1.0, text, va="top", fontsize=6.5, transform=axes.transAxes)

@@ -1,9 +1,9 @@
-"""Prints every message that the programs can show, one a line, for an editor to read at one sitting::
+"""Prints every message that the programs can show, one per line, for an editor to read in one sitting::
 
     python tools/messages.py [FOLDER...]
 
 A message is a string that contains a space and is not a docstring; this includes help texts of options.
-Braces mark the values that an f-string fills in.
+Braces mark values that an f-string fills in.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ FOLDERS = ("skinnode", "vcan_sim")
 
 
 class Message(NamedTuple):
-    """A string of the source that a user may read."""
+    """A string in the source that a user may read."""
 
     place: str
-    """File and line."""
+    """File and line number."""
     text: str
 
 
 def messages(folder: Path) -> Iterator[Message]:
-    """Yield the messages of all modules below ``folder``, file by file."""
+    """Yield the messages in all modules below ``folder``, file by file."""
     for file in sorted(folder.rglob("*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))
         silent = {id(node) for node in _docstrings(tree)}
@@ -42,14 +42,14 @@ def messages(folder: Path) -> Iterator[Message]:
 
 
 def _docstrings(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield strings that stand alone: docstrings, including those of variables."""
+    """Yield standalone strings: docstrings, including those of variables."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             yield node.value
 
 
 def _text(node: ast.AST) -> str | None:
-    """Return a string literal with its placeholders; None for other nodes."""
+    """Return a string literal with its placeholders, or None for other nodes."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):

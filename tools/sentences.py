@@ -1,7 +1,7 @@
 """Draw sentences of the project at random, for an editor to grade: ``python -m tools.sentences --seed 1``.
 
-Draws from docstrings, comments, messages (other strings of at least five words) and pages. Leaves out tests,
-the changelog, code blocks and tables.
+Sentences come from docstrings, comments, messages (other strings of at least five words) and pages. Tests,
+the changelog, code blocks and tables are left out.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LEAST_WORDS = 5
 
 
 class Sentence(NamedTuple):
-    """A sentence and where it stands."""
+    """A sentence and its location."""
 
     place: str
     kind: str
@@ -81,7 +81,7 @@ def _of_page(path: Path) -> Iterator[Sentence]:
 
 
 def _split(text: str) -> Iterator[str]:
-    """Yield sentences: paragraphs and list items, cut after full stops."""
+    """Yield the sentences of paragraphs and list items, which end at full stops."""
     for paragraph in re.split(r"\n\s*\n|\n\s*[-*] |\n\s*\d+\. ", text):
         plain = " ".join(paragraph.split())
         if re.search(r"={4,}|-{4,}|::", plain):  # tables and drawings
@@ -92,7 +92,7 @@ def _split(text: str) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print the sentences drawn, one a line, with their places."""
+    """Print the drawn sentences, one per line, with their locations."""
     parser = argparse.ArgumentParser(description="Draw sentences of the project at random.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=50)

@@ -70,7 +70,7 @@ def press_and_release(steps: int) -> Float:
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 
-def pressing(  # noqa: PLR0913 - one argument for each way to change a stream
+def pressing(  # noqa: PLR0913 - one argument per way to change a stream
     skin: Skin,
     depth: float,
     converter: Converter,
@@ -86,10 +86,10 @@ def pressing(  # noqa: PLR0913 - one argument for each way to change a stream
         skin: The patch.
         depth: Depth of the press in heights.
         converter: Converter that reads the resistances.
-        shares: Shares (T,) of the depth, one for each frame.
-        spoil: Changes the stream.
-        gain: Returns factors (T, U, K), or broadcast to it, of the resistances.
-        presses: Returns the presses in place of one random press.
+        shares: Fractions (T,) of the depth, one per frame.
+        spoil: Returns a modified stream.
+        gain: Returns factors of the resistances, (T, U, K) or broadcastable to it.
+        presses: Returns the presses that replace the single random press.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -101,7 +101,7 @@ def pressing(  # noqa: PLR0913 - one argument for each way to change a stream
 
 
 def all_cases() -> list[Case]:
-    """Return every case, in the order of the list."""
+    """Return every case, in the order of the module docstring's list."""
     return [
         *_symmetric_and_thick(),
         *_deep(),
@@ -225,14 +225,14 @@ def _spoilt(taken: Stream, frames: Float, valid: np.ndarray) -> Stream:
 
 
 def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Break a lower wire during the press, and mend it before the end."""
+    """Break a lower wire during the press, and repair it before the end."""
     frames, valid, k = taken.frames_ohm.copy(), taken.valid.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k], valid[2:5, :, k] = np.nan, False
     return _spoilt(taken, frames, valid)
 
 
 def _shorted_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Short a wire without marking it: 0 ohm."""
+    """Short a lower wire to 0 ohm without marking it invalid."""
     frames, k = taken.frames_ohm.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k] = 0.0
     return _spoilt(taken, frames, taken.valid)
@@ -245,7 +245,7 @@ def _open_upper(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Lose five random chunks of three codes in every frame."""
+    """Drop five random chunks of three codes in every frame."""
     frames, valid = taken.frames_ohm.copy(), taken.valid.copy()
     for t in range(len(frames)):
         flat, lost = valid[t].reshape(-1), rng.choice(valid[t].size // 3, 5, replace=False)
@@ -255,7 +255,7 @@ def _missing_chunks(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stre
 
 
 def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Put in zero, negative, infinite and NaN values, not marked, in the middle of the press."""
+    """Insert zero, negative, infinite and NaN values, not marked invalid, in the middle of the press."""
     frames = taken.frames_ohm.copy()
     for t in (2, 3, 4):
         where = rng.choice(frames[t].size, 4, replace=False)
@@ -264,7 +264,7 @@ def _impossible(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _garbage(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Put in one frame that no deformation explains."""
+    """Insert one frame that no deformation explains."""
     frames = taken.frames_ohm.copy()
     frames[4] = skin.rest_ohm * rng.uniform(0.3, 1.2, skin.layout.shape)
     return _spoilt(taken, frames, taken.valid)
@@ -310,7 +310,7 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Turn two neighbours on a wire half round about their middle: F ends as it began."""
+    """Rotate two neighbours on a wire by 180° about their midpoint, so that F ends as it began."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share
@@ -323,7 +323,7 @@ def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
 
 
 def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Move one electrode through the lower layer to its mirror image: F ends as it began."""
+    """Move one electrode through the lower layer to its mirror image, so that F ends as it began."""
     moved = np.zeros(layout.upper_m.shape)
     wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
     moved[wire, electrode, 2] = -2 * share * layout.height_m
@@ -335,7 +335,7 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return frames of a motion that no skin can make, ending at the resistances of rest; then a real press.
+    """Return a stream of a motion impossible for skin that ends at the rest resistances, then a real press.
 
     The detour has no truth: F does not distinguish a wire from the same wire with two electrodes relabelled
     or mirrored.
@@ -349,7 +349,7 @@ def _after_detour(
         frames, valid, noise = converter.read(resistance, skin.rest_ohm, rng)
         press = (random_press(rng, skin.layout, 0.2),)
         after = stream(skin, press, np.array([0.3, 0.6, 1.0, 0.0]), converter, rng)
-        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # it ends at the resistances of rest
+        odd[0], odd[1:-1], odd[-1] = 0.0, np.nan, 0.0  # the detour ends at the rest resistances
         return Stream(
             np.concatenate([frames, after.frames_ohm]),
             np.concatenate([valid, after.valid]),
@@ -448,7 +448,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # one electrode a wire: no pitch along it, so the patch is as narrow as the wire is short
+        # one electrode per wire has no pitch along the wire, so the patch is a narrow line
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

@@ -1,12 +1,12 @@
 """Compare the results of two commits bit by bit: ``python -m tools.compare OLD [NEW]``.
 
 NEW is the working tree by default. The old commit makes the inputs: streams of resistances on five layouts,
-with two noises, with and without faults, and recordings of simulated hands. Both commits then run over them:
-forward model, every method of the tracker, path following with every operator, systems of equations, replay
-of the recordings, generated files. Each part is reported with a hash of all its arrays in either commit; each
-array that differs, with the largest relative difference.
+with two noise levels, with and without faults, and recordings of simulated hands. Both commits then process
+them: forward model, every method of the tracker, path following with every operator, systems of equations,
+replay of the recordings, generated files. The report gives, for each part, a hash of all its arrays in either
+commit and, for each array that differs, the largest relative difference.
 
-Exit status 0 if all arrays are equal, or differ by ``--rtol`` at most if they are of floats; else 1.
+Exit status 0 if all arrays are equal, or are float arrays that differ by at most ``--rtol``; otherwise 1.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HERE: Final = Path(__file__).parent
 
 
 def tree_of(commit: str | None, folder: Path) -> Path:
-    """Return a folder with the files of ``commit``, or the working tree."""
+    """Return a folder with the files of ``commit``; None selects the working tree."""
     if commit is None:
         return ROOT
     folder.mkdir()
@@ -38,7 +38,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script of this folder with the packages of ``tree``."""
+    """Run a script of this folder with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"
@@ -48,9 +48,10 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 
 
 def relative_difference(old: Any, new: Any) -> float:
-    """Return the largest difference of two arrays over the largest finite number of the old one.
+    """Return the largest difference of two arrays, relative to the largest finite value of the old array.
 
-    It is inf if shape, type or the places of NaN and infinity differ, and for arrays that are not of floats.
+    Returns inf if shape, type or the positions of NaN and infinity differ, and for arrays of other types than
+    float.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":
         return np.inf
@@ -63,7 +64,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield the lines of the report, and whether what a line says is allowed."""
+    """Yield the lines of the report, each with whether the result that it reports is allowed."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]
@@ -92,11 +93,11 @@ def main() -> int:
     parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
     parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
     parser.add_argument(
-        "--rtol", type=float, default=0.0, help="relative difference allowed of floats; default 0"
+        "--rtol", type=float, default=0.0, help="allowed relative difference of floats; default 0"
     )
-    parser.add_argument("--part", action="append", default=[], help="of the comparison; default all")
+    parser.add_argument("--part", action="append", default=[], help="part to compare; default all")
     parser.add_argument(
-        "--folder", type=Path, help="keep trees, inputs and outputs here, and use those there"
+        "--folder", type=Path, help="keep trees, inputs and outputs in this folder, and reuse its contents"
     )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:

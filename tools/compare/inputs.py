@@ -1,9 +1,9 @@
 """Inputs for a comparison of two commits: streams of resistances, and recordings of simulated hands.
 
-Both commits read the same files, so they must not depend on either. The displacements are sums of Gaussian
-bumps, not solutions of the elastic model; the noise has a fixed seed.
+Both commits read the same files, so the files must not depend on either commit. The displacements are sums of
+Gaussian bumps, not solutions of the elastic model; the noise has a fixed seed.
 
-Run in the tree of the old commit: ``python inputs.py FOLDER``. Uses the public API only.
+Run in the tree of the old commit with ``python inputs.py FOLDER``. Uses only the public API.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ RECORDINGS = {
 
 
 def layouts() -> dict[str, sk.PatchLayout]:
-    """Reference patches of two presets, one bent round a cylinder, and one with other numbers of wires."""
+    """Return patches of two presets, one bent round a cylinder, and two with other numbers of wires."""
     flat = sk.PatchLayout.preset("staggered")
     middle, radius_m = flat.upper_m[..., 0].mean(), 25e-3
 
@@ -79,7 +79,7 @@ def layouts() -> dict[str, sk.PatchLayout]:
 
 
 def displacements(layout: sk.PatchLayout) -> Float:
-    """(T, U, N, 3) metres: rest, a press that grows and slides with some shear, a second one, release."""
+    """Return (T, U, N, 3) metres: rest, a growing and sliding press with shear, a second press, release."""
     pitch, height = layout.pitch_m, layout.height_m
     x, y = layout.upper_m[..., 0], layout.upper_m[..., 1]
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -98,7 +98,7 @@ def displacements(layout: sk.PatchLayout) -> Float:
 
 
 def streams() -> dict[str, Float]:
-    """``LAYOUT/NOISE/ohm`` (T, U, K) and ``…/faulty``, the same with invalid and false resistances."""
+    """Return ``LAYOUT/NOISE/ohm`` (T, U, K) and ``…/faulty``, the same with invalid and false resistances."""
     made: dict[str, Float] = {}
     for number, (name, layout) in enumerate(layouts().items()):
         exact = np.array([sk.resistance_ohm(layout, layout.upper_m + d) for d in displacements(layout)])
@@ -119,7 +119,7 @@ def streams() -> dict[str, Float]:
 
 
 def record(folder: Path, name: str) -> None:
-    """Record a simulated hand by the commands a user would use."""
+    """Record a simulated hand with the commands that a user would use."""
     method, faults = RECORDINGS[name]
     group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
     hand = folder / f"{name}.toml"

@@ -1,4 +1,4 @@
-"""Reference of the commands: arguments and options, read from the Typer applications."""
+"""Reference of the commands, with arguments and options read from the Typer applications."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vcan_sim.cli import app as vcan_sim
 
 
 def commands() -> str:
-    """Make one section for each command."""
+    """Return one section per command."""
     programs = {"skinnode": get_command(skinnode), "vcan-sim": get_command(vcan_sim)}
     return "\n\n".join(text for name, command in programs.items() for text in _sections(name, command))
 

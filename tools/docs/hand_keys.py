@@ -1,4 +1,4 @@
-"""Reference of hand.toml: purpose, type, unit, default and range of each key, from its models."""
+"""Reference of hand.toml: purpose, type, unit, default and range of each key, read from its models."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _UNITS: Final = {
 
 
 def keys_of_a_hand() -> str:
-    """Make one section for each table of the file, in the order of the models."""
+    """Return one section per table of the file, in the order of the models."""
     return "\n\n".join(_sections("", HandConfig, listed=False))
 
 
@@ -64,7 +64,7 @@ def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
 
 
 def _kind(annotation: Any) -> str:
-    """Name the type as TOML does."""
+    """Return the TOML name of a type."""
     origin, inside = get_origin(annotation), [part for part in get_args(annotation) if part is not type(None)]
     if origin in (Union, types.UnionType, Annotated):
         return _kind(inside[0])

@@ -1,4 +1,4 @@
-"""Tables of the conditions of a patch and of the faults of a simulated node, read from their definitions."""
+"""Tables of a patch's conditions and of a simulated node's faults, read from their definitions."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from skinnode.host.health import Condition
 from vcan_sim.faults import OF_CHUNKS, OF_SCANS, OF_WIRES, Faults
 
 _PLAIN: Final = {
-    "NEVER_SEEN": "No frame has arrived from it since the host started.",
+    "NEVER_SEEN": "No frame from the patch has arrived since the host started.",
     "OPERATIONAL": "All is well.",
 }
-"""Meanings of the members that have no docstring."""
+"""Meanings of members that have no docstring."""
 
 
 def conditions() -> str:
@@ -29,18 +29,18 @@ def _without_reference(text: str) -> str:
 
 
 def faults() -> str:
-    """Make the table of the faults that `vcan-sim --fault` can inject."""
+    """Return the table of the faults that `vcan-sim --fault` can inject."""
     docs = md.member_docs(Faults)
     kinds = {"bool": "on or off", "int": "integer", "int | None": "integer"}
     rows = []
     for name, kind in inspect.get_annotations(Faults).items():
-        value = kinds.get(str(kind), "share of the frames")
+        value = kinds.get(str(kind), "fraction of the frames")
         if name in (*OF_CHUNKS, *OF_SCANS):
-            value = "share of the chunks" if name in OF_CHUNKS else "share of the scans"
+            value = "fraction of the chunks" if name in OF_CHUNKS else "fraction of the scans"
         elif name in OF_WIRES:
             value = "number of a wire"
         elif name.endswith("_s"):
-            value = "seconds" if name.startswith("restart") else "a second"
+            value = "seconds" if name.startswith("restart") else "per second"
         rows.append((md.code(name), value, docs.get(name, "Does not arrive.")))
     return md.table(("fault", "value", "what happens"), rows)
 

@@ -1,5 +1,5 @@
-"""Hooks of the documentation: replace a line `<!-- generated: NAME -->` by the table of that name, made from
-the code when the site is built. A name that no table has, or that no page uses, ends the build."""
+"""Documentation hooks, which replace a line `<!-- generated: NAME -->` by the table NAME, made from the code
+when the site is built. A name without a table, or a table that no page uses, ends the build."""
 
 from __future__ import annotations
 

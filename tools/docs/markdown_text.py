@@ -1,4 +1,4 @@
-"""Markdown helpers of the generators."""
+"""Markdown helpers for the generators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Make a pipe table; bars are escaped in cells, except in code."""
+    """Return a pipe table; bars in cells are escaped, except in code."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
 
@@ -26,18 +26,18 @@ def code(text: object) -> str:
 
 
 def prose(docstring: str) -> str:
-    """Turn a docstring into one line of Markdown; roles and double backticks become code."""
+    """Convert a docstring to one line of Markdown; roles and double backticks become code."""
     text = re.sub(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`", r"`\1`", docstring)
     return " ".join(text.replace("``", "`").split())
 
 
 def c_hex(value: int, digits: int = 4) -> str:
-    """Write a number as 0x and capital digits."""
+    """Format a number as 0x and upper-case digits."""
     return f"0x{value:0{digits}X}"
 
 
 def member_docs(kind: type) -> dict[str, str]:
-    """Read the docstring below each member of a class from its source."""
+    """Return the docstring below each member of a class, read from the source."""
     (body,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(body, ast.ClassDef)
     docs: dict[str, str] = {}

@@ -28,14 +28,14 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 of nearly every object. Left out: the rows below it show the same."""
+"""Name of sub-index 0 of nearly every object; left out, because the rows below it give the same number."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
-"""Maximum number of equal entries that are listed one by one."""
+"""Maximum number of equal entries that are listed individually."""
 
 
 def cob_ids() -> str:
-    """List the identifiers of a patch, lowest first: the order in which they win the bus."""
+    """List a patch's identifiers, lowest first, which is the order of their priority on the bus."""
     rows = (
         ("NMT command", od.NMT_COB_ID, od.NMT_COB_ID, "NMT master → node", 2),
         ("SYNC", od.SYNC_COB_ID, od.SYNC_COB_ID, "producer → node", "1 (counter)"),
@@ -91,15 +91,15 @@ def formats() -> str:
         "data sheet",
         "codes per chunk",
         "frames per scan",
-        "ms per scan, at worst",
-        "scans/s, bus full",
+        "worst-case ms per scan",
+        "scans/s on a full bus",
         "step",
     )
     return md.table(head, rows)
 
 
 def example_scan() -> str:
-    """Show the frames of one press as bytes, made by the codec."""
+    """Show the frames of one press as bytes, encoded by the codec."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -181,7 +181,7 @@ def emergencies() -> str:
         for code in EmcyCode
         if code
     )
-    return md.table(("code", "meaning", "bit of 0x1001, beside bit 0"), rows)
+    return md.table(("code", "meaning", "bit of 0x1001, besides bit 0"), rows)
 
 
 def aborts() -> str:
@@ -217,12 +217,12 @@ def _shape(item: Object) -> list[tuple[object, ...]]:
 
 
 def _family(item: Object) -> str:
-    """Name of an object without its final number, such as `Codes of upper wire`."""
+    """Return the name of an object without its final number, such as `Codes of upper wire`."""
     return item.name.rstrip("0123456789")
 
 
 def _dictionary(objects: Iterable[Object]) -> str:
-    """Make a row for each entry; equal neighbours share a row, and so do equal neighbouring objects."""
+    """Return one row per entry; equal neighbouring entries, or equal neighbouring objects, share a row."""
     runs: list[list[Object]] = []
     for item in objects:
         if runs and _family(item) == _family(runs[-1][-1]) and _shape(item) == _shape(runs[-1][0]):
@@ -249,7 +249,7 @@ def _dictionary(objects: Iterable[Object]) -> str:
 
 
 def _and_on(first: str, last: str) -> str:
-    """Join two names that differ in their last word."""
+    """Combine two names that differ only in their last word."""
     return f"{first} … {last.rpartition(' ')[2]}"
 
 

@@ -1,4 +1,4 @@
-"""Show the roles of docstrings (:class:`~skinnode.model.frames.FieldFrame`) as code."""
+"""Rendering of docstring roles (:class:`~skinnode.model.frames.FieldFrame`) as code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ROLE = re.compile(r":[a-z]+:`~?(?:[\w.]+\.)?([\w.]+)`")
 
 
 class Roles(griffe.Extension):
-    """Rewrites each docstring when it is loaded."""
+    """Rewrites each docstring as it is loaded."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:

@@ -1,4 +1,4 @@
-"""Table of the solver's tuning constants, made from the modules of ``skinnode.solve``."""
+"""Table of the solver's tuning constants, read from the modules of ``skinnode.solve``."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _NOT_TUNED: Final = {
     *("PREDICT", "HOLD", "COVARIANCE", "SKIP", "REUSE", "TASKS"),
     *("ROWS", "TILE", "REST", "TINY", "SQUARE_FLOOR", "A_MIN", "A_MAX", "NOISE_MAX"),
 }
-"""Names of task flags, tile sizes and overflow limits: no result depends on their values."""
+"""Names of task flags, tile sizes and overflow limits, whose values do not affect any result."""
 
 
 def constants() -> str:
-    """Make one row for each numeric constant, or accuracy, that has a docstring."""
+    """Return one row per numeric constant, or accuracy, that has a docstring."""
     rows = [
         (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), value, text)
         for module in _modules()

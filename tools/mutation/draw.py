@@ -1,11 +1,12 @@
 """Draw mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
 The operators are those of cosmic-ray. A draw picks places in the source, each equally likely, and then one
-mutation at each place: drawn by mutation instead, a ``+`` would weigh eleven times as much as a ``not``.
+mutation at each place; if mutations were drawn instead, a ``+`` would weigh eleven times as much as a
+``not``.
 
 A mutant is identified by its change (file, function, operator, text before and after), never by a line
-number, and is drawn by a digest of its place and the seed. A list therefore stays valid when code moves, and
-an edit elsewhere does not change which mutants are drawn.
+number, and is drawn by a digest of its place and the seed. A list of mutants therefore stays valid when code
+moves, and an edit elsewhere does not change which mutants are drawn.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Packages of ``skinnode`` by the group that a draw is made from."""
+"""Packages of ``skinnode`` in each group that mutants are drawn from."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 
@@ -48,21 +49,21 @@ class Mutant:
     """One change to one file."""
 
     file: str
-    """Path from the root of the repository."""
+    """Path relative to the root of the repository."""
     function: str
     """Qualified name of the innermost function or class around the change, or ``<module>``."""
     operator: str
-    """cosmic-ray's name of the operator."""
+    """Operator name in cosmic-ray."""
     before: str
     """Lines that the change removes."""
     after: str
     """Lines that the change adds."""
     nth: int
-    """Number of earlier mutants in this file with equal fields."""
+    """Number of earlier mutants in this file with the same fields."""
 
     @property
     def name(self) -> str:
-        """Ten hexadecimal digits derived from the fields."""
+        """Name of ten hexadecimal digits, derived from the fields."""
         return _digest(self.file, self.function, self.operator, self.before, self.after, self.nth)[:10]
 
     @property
@@ -84,7 +85,7 @@ class _Candidate:
 
 
 class _OnlyBehaviour(ast.NodeTransformer):
-    """Remove what tests need not check: annotations, texts, and decorators that only speed a function up."""
+    """Removes what tests need not check: annotations, texts, and decorators that only affect speed."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         node.annotation = ast.Constant(0)
@@ -116,7 +117,7 @@ class _OnlyBehaviour(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> Any:
         if isinstance(node.func, ast.Name) and node.func.id == "dataclass":
-            node.keywords = []  # frozen and slots guard against mistakes that mypy reports first
+            node.keywords = []  # frozen and slots guard against mistakes that mypy reports anyway
         return self.generic_visit(node)
 
     def visit_If(self, node: ast.If) -> Any:
@@ -133,9 +134,9 @@ def _for_speed(decorator: ast.expr) -> bool:
 
 
 def _behaviour(source: str) -> str | None:
-    """Return the observable behaviour of ``source`` as text; None if Python cannot compile it."""
+    """Return a text that represents the behaviour of ``source``, or None if Python cannot compile it."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # such as "is" with a literal
+        with warnings.catch_warnings(action="ignore"):  # for example "is" with a literal
             compile(source, "mutant", "exec")
     except (SyntaxError, ValueError):
         return None
@@ -143,7 +144,7 @@ def _behaviour(source: str) -> str | None:
 
 
 def _functions(source: str) -> dict[int, str]:
-    """Return the qualified name of the innermost function or class at each line that has one."""
+    """Return the qualified name of the innermost function or class for each line inside one."""
     names: dict[int, str] = {}
 
     def walk(node: ast.AST, prefix: str) -> None:
@@ -177,7 +178,7 @@ def _candidates(source: str, operators: dict[str, Any]) -> Iterator[_Candidate]:
 
 
 def mutated(source: str, operator: str, occurrence: int) -> str:
-    """Return ``source`` with one mutation. Raises LookupError if there is no such place."""
+    """Return ``source`` with one mutation. Raises LookupError if the occurrence does not exist."""
     code = mutate_code(source, _operators()[operator], occurrence)
     if code is None:
         raise LookupError(f"{operator}: no occurrence {occurrence}")
@@ -192,7 +193,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Identify a mutation as a mutant; counts the equal mutations before it."""
+    """Return a mutation as an identified mutant, after counting the equal mutations before it."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
@@ -208,7 +209,7 @@ def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
 
 
 def find(mutant: Mutant, source: str) -> str:
-    """Return ``source`` with ``mutant`` applied. Raises LookupError if the code it changes has gone."""
+    """Return ``source`` with ``mutant`` applied. Raises LookupError if the code to change has gone."""
     functions = _functions(source)
     nth = 0
     for each in _candidates(source, {mutant.operator: _operators()[mutant.operator]}):
@@ -223,7 +224,7 @@ def find(mutant: Mutant, source: str) -> str:
 
 
 def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
-    """Draw ``count`` mutants of a group's packages, at as many places."""
+    """Draw ``count`` mutants in a group's packages, each at a different place."""
     sources: dict[str, str] = {}
     places: dict[str, list[tuple[str, _Candidate]]] = defaultdict(list)
     folders = [root / "skinnode" / package for package in GROUPS[group]]
@@ -260,12 +261,12 @@ def draw(group: str, count: int, seed: int, root: Path = ROOT) -> list[Mutant]:
 
 
 def read() -> list[Mutant]:
-    """Read the stored list."""
+    """Read the stored list of mutants."""
     return [Mutant(**entry) for entry in json.loads(LIST.read_text("utf-8"))["mutants"]]
 
 
 def write(mutants: list[Mutant]) -> None:
-    """Store ``mutants``, in the order of groups and files."""
+    """Store ``mutants``, ordered by group and file."""
     mutants = sorted(
         mutants, key=lambda each: (list(GROUPS).index(each.group), each.file, each.function, each.name)
     )
@@ -276,7 +277,7 @@ def write(mutants: list[Mutant]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Draw mutants again; those of other groups are kept.")
+    parser = argparse.ArgumentParser(description="Draw new mutants; mutants of other groups are kept.")
     parser.add_argument("--package", choices=GROUPS, action="append")
     packages = parser.parse_args().package or list(GROUPS)
     kept = [each for each in read() if each.group not in packages] if LIST.exists() else []

@@ -2,10 +2,11 @@
 
 Each mutant is applied to a private copy of the repository, and the stages of ``stages.toml`` run on it, each
 until its first failure. A failure of a real-time test counts only if the test also fails when run alone. A
-stage that exceeds its time limit also kills the mutant. Verdicts are written to ``results.json`` at once; the
-next run skips those mutants, except survivors with ``--again``.
+stage that exceeds its time limit also kills the mutant. Verdicts are written to ``results.json`` immediately;
+the next run skips the mutants listed there, except survivors with ``--again``.
 
-One process imports the libraries and forks for every run of pytest: importing takes longer than most tests.
+One process imports the libraries and forks for every pytest run, because importing takes longer than most
+tests.
 """
 
 from __future__ import annotations
@@ -46,26 +47,26 @@ _KERNELS: Final = (
 _MEMORY_BYTES: Final = 8 << 30
 _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
-"""Time limit of one test."""
+"""Time limit of one test, s."""
 _GRACE_S: Final = 60.0
-"""Time limit of a stage in s, in addition to six times its unmutated duration."""
+"""Time limit of a stage beyond six times its unmutated duration, s."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one run of pytest."""
+    """Outcome of one pytest run."""
 
     status: int | None
     """Exit status, or None for a run that was stopped at its time limit."""
     failed: tuple[str, ...]
-    """Tests that failed."""
+    """Names of the tests that failed."""
     took_s: float
 
 
 class Tree:
-    """A private copy of the repository, and the kernels compiled from it."""
+    """A private copy of the repository with the kernels compiled from it."""
 
     def __init__(self, folder: Path) -> None:
         self.source, self.cache, self.warm = folder / "tree", folder / "cache", folder / "warm"
@@ -74,7 +75,7 @@ class Tree:
         self.log = folder / "log"
         self._copy()
         if self.warm.exists() and not (self.warm / "skinnode" / self._leaf()).exists():
-            shutil.rmtree(self.warm)  # compiled from other sources
+            shutil.rmtree(self.warm)  # compiled from different sources
 
     def _copy(self) -> None:
         listed = subprocess.run(
@@ -99,10 +100,10 @@ class Tree:
             shutil.copy2(here, there)
 
     def put(self, mutant: Mutant) -> None:
-        """Apply a mutant to the copy, and keep the compiled kernels that it does not affect.
+        """Apply a mutant to the copy, keeping the compiled kernels that it does not affect.
 
-        numba recompiles a kernel if its own file has changed; kernels of files that import that file are
-        removed here.
+        numba recompiles a kernel if its own file has changed; this method removes the kernels of files that
+        import that file.
         """
         path = self.source / mutant.file
         found = path.stat()
@@ -126,7 +127,7 @@ class Tree:
                 kept.unlink()
 
     def _leaf(self) -> str:
-        """Return the name of the folder that holds the compiled kernels of the present copy."""
+        """Return the name of the folder that holds the compiled kernels of the current copy."""
         code = "from skinnode.compiled.jit import cache_dir; print(cache_dir().name)"
         with tempfile.TemporaryDirectory() as folder:
             environment = os.environ | {"PYTHONPATH": str(self.source), "SKINNODE_CACHE_DIR": folder}
@@ -136,7 +137,7 @@ class Tree:
             ).stdout.strip()
 
     def _reached(self, file: str) -> set[str]:
-        """Return the names of the files with kernels that import ``file``, directly or indirectly."""
+        """Return the names of files with kernels that import ``file``, directly or indirectly."""
         package = ROOT / "skinnode"
         imports: dict[str, set[str]] = {}
         for path in (path for pattern in _KERNELS for path in package.glob(pattern)):
@@ -169,7 +170,7 @@ class Tree:
 
 
 class _Failures:
-    """pytest plugin that notes which tests failed."""
+    """pytest plugin that records the failed tests."""
 
     def __init__(self) -> None:
         self.failed: list[str] = []
@@ -184,7 +185,7 @@ class _Failures:
 
 
 def run_tests(tree: Tree, arguments: Sequence[str], limit_s: float) -> Outcome:
-    """Run pytest in its own process group, and end all processes that it started."""
+    """Run pytest in its own process group, then end all processes that it started."""
     answer, begin_s = tree.log.with_name("answer"), time.monotonic()
     answer.unlink(missing_ok=True)
     child = os.fork()
@@ -232,7 +233,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
         failures = _Failures()
         options = ["-q", "-n", "0", "--tb=short", "-p", "no:cacheprovider", "-o", f"timeout={_TEST_S}"]
         options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        options += ["-W", "ignore::SyntaxWarning"]  # such as "is" with a literal: no test would notice
+        options += ["-W", "ignore::SyntaxWarning"]  # for example "is" with a literal: no test would notice
         status = int(pytest.main([*options, *arguments], plugins=[failures]))
         answer.write_text(json.dumps(failures.failed), "utf-8")
     except BaseException:
@@ -244,7 +245,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
 
 
 def _end_children(group: int) -> None:
-    """Kill a process group, and processes that left it: orphans become children of this process."""
+    """Kill a process group, and processes that left it, which become children of this process as orphans."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     for _ in range(100):
@@ -259,7 +260,7 @@ def _end_children(group: int) -> None:
 
 
 def _stages(mutant: Mutant, table: dict[str, Any]) -> list[list[str]]:
-    """Return the test files for a mutant, stage by stage, each file once."""
+    """Return the test files for a mutant by stage, each file once."""
     group = table[mutant.group]
     first = group.get("first", {}).get(Path(mutant.file).stem, [])
     stages, seen = [], set[str]()
@@ -279,7 +280,7 @@ def _expand(pattern: str) -> list[str]:
 
 
 class Session:
-    """Runs on one tree, with its unmutated results."""
+    """Test runs on one tree, with its unmutated results."""
 
     def __init__(self, tree: Tree, table: dict[str, Any], *, quick: bool) -> None:
         self._tree, self._table, self._quick = tree, table, quick
@@ -288,8 +289,8 @@ class Session:
         self._kept = tree.log.with_name("unmutated.json")
 
     def measure(self, mutants: Sequence[Mutant], *, trust: bool) -> None:
-        """Run the test files of ``mutants`` unmutated, to find how long each takes and which tests fail and
-        therefore prove nothing."""
+        """Run the test files of ``mutants`` unmutated, to measure their durations and to find the tests that
+        fail and therefore prove nothing."""
         if self._kept.exists() and trust:
             self._known = json.loads(self._kept.read_text("utf-8"))
         files = {path: None for each in mutants for stage in self._stages(each) for path in stage}
@@ -305,9 +306,9 @@ class Session:
                 )
             failed = [
                 test for test in run.failed if run_tests(self._tree, [test], 900.0).status != _PASSED
-            ]  # a test that passes alone failed because of load
+            ]  # a test that passes when run alone failed because of load
             for test in failed:
-                print(f"left out, fails without a mutant: {test}", flush=True)
+                print(f"left out because it fails without a mutant: {test}", flush=True)
             self._known[path] = {"took_s": run.took_s, "failed": failed}
             self._kept.write_text(json.dumps(self._known, indent=1), "utf-8")
         if missing:
@@ -345,7 +346,7 @@ class Session:
                     return "killed", run.failed[0]
                 if run_tests(self._tree, [run.failed[0]], limit_s).status != _PASSED:
                     return "killed", run.failed[0]
-                print(f"{mutant.name}: failed once only: {run.failed[0]}", flush=True)
+                print(f"{mutant.name}: failed only once: {run.failed[0]}", flush=True)
                 left_out.append(run.failed[0])
         return ("open", "") if self._quick else ("survived", "")
 
@@ -359,13 +360,13 @@ def _equivalent() -> dict[str, str]:
 
 
 def show(mutant: Mutant) -> str:
-    """Return a mutant in a few lines."""
+    """Return a description of a mutant in a few lines."""
     before, after = mutant.before.replace("\n", "\n  - "), mutant.after.replace("\n", "\n  + ")
     return f"{mutant.name} {mutant.file}, {mutant.function}\n  - {before}\n  + {after}"
 
 
 def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
-    """Return a line for every group, then each survivor that is not equivalent."""
+    """Return one line per group, then each survivor that is not equivalent."""
     equivalent, lines = _equivalent(), []
     verdict = {each.name: results.get(each.name, {}).get("verdict", "not run") for each in mutants}
     verdict |= dict.fromkeys(equivalent, "equivalent")
@@ -382,7 +383,7 @@ def summary(mutants: Sequence[Mutant], results: dict[str, Any]) -> str:
 
 
 def _preload() -> None:
-    """Import slow libraries, which are not mutated."""
+    """Import slow libraries that are not mutated."""
     import can  # noqa: F401
     import canopen  # noqa: F401
     import hypothesis  # noqa: F401
@@ -397,10 +398,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--package", choices=GROUPS, action="append", help="default: all")
     parser.add_argument(
-        "--only", action="append", metavar="NAME", help="run this mutant, whatever its verdict"
+        "--only", action="append", metavar="NAME", help="run this mutant even if it has a verdict"
     )
     parser.add_argument("--again", action="store_true", help="run survivors again")
-    parser.add_argument("--trust", action="store_true", help="do not measure the unmutated tests again")
+    parser.add_argument("--trust", action="store_true", help="reuse earlier measurements of unmutated tests")
     parser.add_argument(
         "--quick", action="store_true", help="run the first stage only; its survivors stay undecided"
     )
@@ -429,7 +430,7 @@ def main() -> None:
             try:
                 result = session.judge(each)
             except LookupError as error:
-                print(f"{error}; draw again", flush=True)
+                print(f"{error}; draw the mutants again", flush=True)
                 continue
             if result["verdict"] != "open":
                 results = _load(RESULTS) | {each.name: result}

@@ -1,5 +1,5 @@
-"""The exact tracker of a live stream: each frame is solved from the frame before, wire by wire.
+"""Exact tracker of a live stream, which solves each wire of a frame from the previous frame.
 
-``tracker`` runs the stages, ``stream`` holds the arrays of a stream and decides which roots count,
-``recover`` bridges wires that failed, ``leave_out`` solves for fewer unknowns.
+``tracker`` runs the stages, ``stream`` stores the arrays of a stream and accepts roots, ``recover`` retries
+wires that failed, and ``leave_out`` reduces the number of unknowns.
 """

@@ -1,18 +1,19 @@
-"""Two options of the exact tracker that leave unknowns out, and the standard deviation of what is left out.
+"""Options of the exact tracker that omit unknowns, and standard deviations of the omitted coordinates.
 
-``normal_only``: x and y of every electrode stay at rest. ``active_only``: the electrodes that no contact
-moves stay at rest. A wire starts with all electrodes at rest. If χ² refuses that, the electrode that explains
-most of the residual joins the unknowns with its neighbours, until χ² accepts, or more than half have joined
-and the rest follow. All are at rest again when that explains the frame. The standard deviation of a
-coordinate left out is the move at which χ² would have noticed its electrode, were it the only one, in first
-order at rest: √(quantile − degrees of freedom) σ / ‖its column of J outside the range of the unknowns and of
-the electrode's other columns‖.
+With ``normal_only``, x and y of every electrode stay at rest. With ``active_only``, electrodes that no
+contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the electrode
+that explains most of the residual joins the unknowns together with its neighbours; once more than half have
+joined, all do. All electrodes return to rest when the rest position explains the frame. The standard
+deviation of an omitted coordinate is the move at which χ² would notice its electrode if no other moved, to
+first order at
+rest: √(quantile − degrees of freedom) σ / ‖its column of J outside the range of the unknowns and of the
+electrode's other columns‖.
 
-Both are claims about the skin, and the standard deviations of the unknowns hold if the claim does. χ² checks
-the claim of active_only. It checks that of normal_only less well: a smooth shear looks like a slope of z. On
-staggered h = 0.5, noise 1e-5, a Hertzian press with a shear of 0.3 of its depth is refused if it is strong;
-if not, z is off by up to 16 of its small standard deviations, 0.2 % of h. To allow for it would cost more
-than to solve for it.
+Both options are assumptions about the skin, and the standard deviations of the unknowns are valid only if the
+assumption is. χ² tests the assumption of active_only well. It tests that of normal_only less well, because a
+smooth shear resembles a slope of z. On staggered, h = 0.5, noise 1e-5, a strong Hertzian press with a shear
+of 0.3 of its depth is rejected; a weaker press is accepted with errors of z up to 16 of its small standard
+deviations, or 0.2 % of h. Allowing for this would cost more than solving for the shear.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
-"""Normal deviate of the quantile, 1 − 1e-4, of χ² at which electrodes join: a long press at 100 frames/s
-gains one by chance in 100 s."""
+"""Normal quantile of the χ² probability, 1 − 1e-4, at which electrodes join; at 100 frames/s, a long press
+gains one electrode by chance every 100 s."""
 TINY: Final = 1e-200
-"""Least square of a slope: far below any real one, and a quotient by it does not overflow."""
+"""Smallest squared slope used as a divisor: far below real slopes, yet large enough to avoid overflow."""
 
 
 class LeftOut:
-    """The electrodes without unknowns on the wires of a stream, and how far they may move unnoticed."""
+    """Electrodes of a stream that have no unknowns, and the moves of them that would go unnoticed."""
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -52,7 +53,7 @@ class LeftOut:
         # ∂r/∂x at rest of every coordinate, (U, 3N, K)
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * problem.a_rest[:, :, None]).transpose(0, 2, 1))
-        # (U, 3N) what a coordinate may move by unnoticed, pitches a unit of σ, and (U, K) at which weights
+        # (U, 3N) unnoticed move of each coordinate, pitches per unit of σ, and its weights (U, K)
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
         # limits of χ² by degrees of freedom
@@ -62,7 +63,7 @@ class LeftOut:
         )
 
     def reset(self) -> None:
-        """Start anew; with ``active_only`` from no electrode that moves."""
+        """Forget the stream; with ``active_only``, start with all electrodes at rest."""
         self._unnoticed_weight[:] = 0.0
         if self._active_only:
             for u in range(self._layout.shape[0]):
@@ -74,7 +75,7 @@ class LeftOut:
             self._set_electrodes(u, np.arange(self._layout.unknowns // 3))
 
     def leave_out(self, sigma: float) -> None:
-        """Put wires to rest if that explains the frame; write standard deviations of what is not unknown."""
+        """Return wires to rest if that explains the frame; write the std of omitted coordinates."""
         solver, arrays = self._stream.solver, self._stream.arrays
         if self._active_only:
             a_rest = self._stream.problem.a_rest
@@ -85,7 +86,7 @@ class LeftOut:
             known = (chi2 <= self._chi2_hold[count]) & (count >= solver.each * self._layout.unknowns // 3)
             for u in np.flatnonzero(known & (solver.free > 0)).tolist():
                 self._set_electrodes(u, np.arange(0))
-                self._unnoticed_weight[u] = 0.0  # to be measured below
+                self._unnoticed_weight[u] = 0.0  # measured below
         arrays.unknowns[:] = self._stream.unknowns
         if solver.each * solver.free.min() < self._layout.unknowns:
             for u in np.flatnonzero(_changed(arrays.used, self._unnoticed_weight)).tolist():
@@ -93,7 +94,7 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Let electrodes join the unknowns of wires that had a turn and are not explained; return those (U,).
+        """Add electrodes to the unknowns of processed wires that are unexplained; return these wires (U,).
 
         Sets ``turns`` (U,) to False for wires reached after the deadline.
         """
@@ -104,16 +105,16 @@ class LeftOut:
         return unexplained
 
     def _set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Give unknowns to these electrodes of wire u only."""
+        """Make exactly these electrodes of wire u unknowns."""
         solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
         arrays.predictable[u] = len(electrodes) == 0
-        if arrays.predictable[u]:  # then rest is known to be the solution, without noise
+        if arrays.predictable[u]:  # then the solution is the rest position, without noise
             arrays.x[u], arrays.a_solved[u] = problem.rest[u], problem.a_rest[u]
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
-        """Write how far each coordinate that is not unknown moves before χ² notices, pitches a unit of σ."""
+        """Write the unnoticed move of each omitted coordinate, pitches per unit of σ."""
         solver, (_, lower) = self._stream.solver, self._layout.shape
         self._unnoticed_weight[u] = weight
         unnoticed = self._unnoticed[u].reshape(-1, 3)
@@ -132,11 +133,11 @@ class LeftOut:
             if most:
                 seen = _outside(slopes[group, :most].reshape(-1, lower), unknown).reshape(-1, most, lower)
                 power, direction = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
-                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # rounding is no knowledge
+                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # below this, power is only rounding
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
-        """Return the wires (U,) whose root or minimum noise explains, and those with no electrode to add."""
+        """Return the wires (U,) whose residual is within noise or that have no more electrodes to add."""
         solver = self._stream.solver
         spare = solver.report[:, wires.SPARE]
         limit = np.where(solver.free > 0, self._chi2_widen[spare], self._chi2_hold[spare])
@@ -145,7 +146,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Let electrodes of wire u join until they explain the frame; undo it if not even all do."""
+        """Add electrodes of wire u until they explain the frame; undo this if all of them do not."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:
@@ -154,7 +155,7 @@ class LeftOut:
                 break
             electrodes = np.arange(most)
             near = not stream.problem.out_of_reach(solver.x)[u]
-            if near and solver.measure[u, wires.CHI2] < np.inf:  # a minimum, if not low enough
+            if near and solver.measure[u, wires.CHI2] < np.inf:  # a minimum, although χ² is too large
                 joined = np.union1d(solver.electrodes(u), self._most_explaining(u))
                 electrodes = electrodes if 2 * len(joined) > most else joined
             self._set_electrodes(u, electrodes)
@@ -170,7 +171,7 @@ class LeftOut:
             solver.std[u, left_out] = frame.sigma * self._unnoticed[u, left_out]
 
     def _most_explaining(self, u: int) -> Index:
-        """Return the electrode at rest that explains most of the residual of wire u, and its neighbours."""
+        """Return the resting electrode that explains most of the residual of wire u, and its neighbours."""
         solver, arrays = self._stream.solver, self._stream.arrays
         each, (_, lower), most = solver.each, self._layout.shape, self._layout.unknowns // 3
         slopes = (self._slopes[u] * arrays.used[u]).reshape(most, 3, lower)[:, 3 - each :]
@@ -185,11 +186,11 @@ class LeftOut:
 
 
 def _changed(weight: Float, before: Float) -> NDArray[np.bool_]:
-    """Return the wires (U,) with a weight that changed by more than the factor ``STALE``."""
+    """Return the wires (U,) with a weight that changed by more than a factor of ``STALE``."""
     return np.asarray(((weight > STALE * before) | (before > STALE * weight)).any(axis=1))
 
 
 def _outside(rows: Float, others: Float) -> Float:
-    """Return ``rows`` (n, K) less their projection on the rows ``others`` (m, K)."""
+    """Return ``rows`` (n, K) minus their projection onto the rows ``others`` (m, K)."""
     q = np.linalg.qr(others.T)[0]
     return np.asarray(rows - (rows @ q) @ q.T)

@@ -1,8 +1,9 @@
-"""A second try for the wires of a frame that no solve brought to an acceptable root.
+"""Recovery of wires for which no solve of a frame found an acceptable root.
 
-bridge     R interpolated from the last trusted frame to the new one, solved substep by substep
-restart    the same from the rest position
-give up    a wire that still fails keeps its last trusted position, with an infinite deviation and a status
+bridge     interpolates R from the last trusted frame to the new frame and solves each substep
+restart    bridges from the rest position
+give up    keeps the last trusted position of a wire that still fails, with an infinite standard deviation and
+           a status
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Substeps of the bridges tried in turn. On staggered, h = 0.5, from rest: 3 bring every wire through
-a 50 % press between two frames, 5 all but one of 24 through 70 %. Steps halved and doubled, and held to the
-trusted branch, do worse: the straight line crosses singular points that the press does not."""
+"""Number of substeps of successive bridges. On staggered, h = 0.5, from rest, 3 substeps solve every wire of
+a 50 % press between two frames, and 5 solve all but one of 24 at 70 %. Adaptive steps restricted to the
+trusted branch do worse, because the straight line crosses singular points that the press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
-"""Tolerance of the substeps of a bridge: the paper's intermediate tolerance."""
+"""Tolerance of bridge substeps: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20
-"""Maximum steps of a substep."""
+"""Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
-"""Maximum steps of all bridges of a frame together, about 15 ms: a broken frame must not stop the stream."""
-# Levenberg-Marquardt is the sturdiest across a gap, whatever operator the stream has.
+"""Maximum total steps of all bridges of a frame, about 15 ms; a broken frame must not stall the stream."""
+# Levenberg-Marquardt is the most robust operator for gaps, whatever the operator of the stream.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 
@@ -39,8 +40,8 @@ def recover_lost(
 ) -> None:
     """Recover the wires that are not at a root; write ``good`` and ``status`` of the stream's arrays.
 
-    Gives up wires that fail, and the ``exhausted`` (U,), for which nothing is left to try. A wire reached
-    after the deadline has had no turn: ``turns`` (U,) becomes False.
+    Gives up wires that fail, and ``exhausted`` wires (U,), for which all attempts have been made. Sets
+    ``turns`` (U,) to False for wires reached after the deadline.
     """
     solver, arrays = stream.solver, stream.arrays
     good, status = arrays.good, arrays.status
@@ -57,7 +58,7 @@ def recover_lost(
         ended = int(solver.report[u, wires.STATUS])
         status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
     solver.std[~good] = np.inf
-    arrays.predictable &= ~(lost | exhausted)  # what was not tried keeps its inverse
+    arrays.predictable &= ~(lost | exhausted)  # other wires keep their inverse
 
 
 def recover(stream: StreamState, u: int, frame: Frame) -> bool:
@@ -82,10 +83,10 @@ def recover(stream: StreamState, u: int, frame: Frame) -> bool:
 def _bridge(  # noqa: PLR0913 - both ends of the bridge
     stream: StreamState, u: int, x_from: Float, a_from: Float, frame: Frame, substeps: int
 ) -> bool:
-    """Solve wire u along the straight line of its resistances from ``a_from`` (K,) to those of the frame.
+    """Solve wire u along a straight line from its resistances ``a_from`` (K,) to those of the frame.
 
-    Only the last point counts: the line is no deformation of rubber, so the points between may lie on any
-    branch. The outcome is the solver's report of the wire. Returns False if the deadline cut it short.
+    Only the last point counts: the line is not a deformation of rubber, so intermediate points may lie on any
+    branch. The outcome is in the solver's report of the wire. Returns False if the deadline interrupts it.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

@@ -1,8 +1,8 @@
-"""The state that all of the exact tracker works on: solver, arrays and rest position of one patch.
+"""State shared by the parts of the exact tracker: solver, arrays and rest position of one patch.
 
-A root counts only on the branch the skin can reach: the determinant of J keeps the sign it has at rest, and
-no electrode moves farther than its clearance from the lower layer. A system with more equations than unknowns
-has no determinant; there χ² of the residual must be one that noise can cause.
+A root is accepted only on the branch that the skin can reach: the determinant of J has the same sign as at
+rest, and no electrode moves farther than its clearance from the lower layer. A system with more equations
+than unknowns has no determinant; instead, χ² of the residual must be compatible with noise.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance of r and, in pitches, of x: four orders below a 24-bit converter, and one Newton step from
-1e-5."""
+"""Tolerance of r and, in pitches, of x: four orders of magnitude below a 24-bit converter, and one Newton
+step from 1e-5."""
 FRAME_STEPS: Final = 12
-"""Maximum steps of a solve: quadratic convergence from within the trust region takes 3 to 6."""
+"""Maximum steps per solve; quadratic convergence from within the trust region takes 3 to 6."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Tasks of every solve that may be the last of its frame."""
+"""Tasks of every solve that may be the last one of a frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """Noise, order and deadline of the frame at hand."""
+    """Noise, order and deadline of the current frame."""
 
     sigma: float
-    """Least standard deviation of its resistances, relative."""
+    """Smallest relative standard deviation of the resistances."""
     order: Index
-    """(U,) the wires in the order in which they have their turn."""
+    """(U,) wires in processing order."""
     until: float
-    """Deadline, s of ``perf_counter``; inf for none."""
+    """Deadline as a time of ``perf_counter``, s; inf for none."""
 
     @property
     def expired(self) -> bool:
-        """Whether the deadline is over."""
+        """Whether the deadline has passed."""
         return self.until < math.inf and perf_counter() >= self.until
 
 
 class StreamState:
-    """The solver and the arrays of one stream, which the tracker and its parts write to in place. One owner.
+    """Solver and arrays of one stream, modified in place by parts of the tracker. Not shared between owners.
 
     Args:
-        problem: the patch in the units of the solver.
-        operator: number of the operator.
-        normal_only: only z is unknown.
-        first: HOLD or PREDICT, what to do with a wire that can be predicted.
+        problem: The patch in solver units.
+        operator: Operator code.
+        normal_only: Whether only z is unknown.
+        first: HOLD or PREDICT, the action for a wire that can be predicted.
     """
 
     def __init__(self, problem: PatchProblem, operator: int, normal_only: bool, first: int) -> None:
@@ -71,7 +71,7 @@ class StreamState:
         self.options = solve_options(operator, TASKS, TOLERANCE, TOLERANCE, FRAME_STEPS)
 
     def reset(self) -> None:
-        """Go back to the rest position."""
+        """Return to the rest position."""
         solver, arrays = self.solver, self.arrays
         arrays.x[:], arrays.a_solved[:] = self.problem.rest, self.problem.a_rest
         solver.inverse[:] = self._rest_inverse
@@ -83,7 +83,7 @@ class StreamState:
 
     @property
     def unknowns(self) -> NDArray[np.int64]:
-        """(U,) unknowns of each wire."""
+        """(U,) number of unknowns of each wire."""
         return np.asarray(self.solver.each * self.solver.free)
 
     def solve(
@@ -99,10 +99,10 @@ class StreamState:
 
         Args:
             todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
-            frame: σ and order of the wires.
-            a: (U, K) resistances in place of the frame's.
-            options: in place of those of the stream.
-            units: as in :meth:`PatchSolver.solve`.
+            frame: Frame with σ and the order of the wires.
+            a: (U, K) resistances; default those of the frame.
+            options: Solver options; default those of the stream.
+            units: As in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(
             todo,
@@ -115,7 +115,7 @@ class StreamState:
         )
 
     def only(self, u: int) -> NDArray[np.uint8]:
-        """Return what to do (U,): solve wire u, leave the others."""
+        """Return actions (U,) that solve wire u and leave the others."""
         todo = np.full(len(self.solver.x), wires.LEAVE, np.uint8)
         todo[u] = wires.SOLVE
         return todo
@@ -139,5 +139,5 @@ class StreamState:
         return np.asarray(relative_residual(a, (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))))
 
     def a_at(self, x: Float) -> Float:
-        """Return the a (K,) of a wire whose root is ``x`` (3N,), pitches."""
+        """Return the a (K,) of a wire that has its root at ``x`` (3N,), pitches."""
         return np.asarray(1.0 / (1.0 + self.relative_residual(x, np.ones(self.problem.layout.shape[1]))))

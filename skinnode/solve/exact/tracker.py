@@ -1,13 +1,13 @@
-"""The exact tracker: a live stream of frames, each solved from the frame before, as the paper follows a path.
+"""Exact tracker: solves each frame of a live stream from the previous frame, as the paper follows a path.
 
-hold       a wire whose resistances have not changed beyond their noise keeps its position (see ``hold``)
-predict    x + (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which the covariance needed anyway
-follow     simplified Newton steps with the same J⁻¹, while it is still nearly that of the position
-correct    the operator, where it is not, to a tolerance far below any noise
-widen      an electrode left out that is seen to move joins the unknowns (see ``leave_out``)
-recover    a wire that fails is bridged, or given up (see ``recover``)
+hold       keep the position of a wire whose resistances changed no more than their noise (see ``hold``)
+predict    move by (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which the covariance needed anyway
+follow     take simplified Newton steps with the same J⁻¹ while it is still accurate enough
+correct    otherwise iterate the operator, to a tolerance far below any noise
+widen      add an omitted electrode that seems to move to the unknowns (see ``leave_out``)
+recover    bridge a wire that fails, or give it up (see ``recover``)
 
-Which roots are acceptable is decided in :mod:`skinnode.solve.roots`.
+The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
 """
 
 from __future__ import annotations
@@ -35,31 +35,32 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Maximum time of an evaluation of F and J with the step from there, s. As many wires as certainly fit into
-the time left are solved in one call: ten calls instead of one cost as much as the ten wires."""
+"""Maximum time of one evaluation of F and J with its step, s. Each call solves as many wires as certainly fit
+into the remaining time, because ten calls instead of one cost as much as solving ten wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
-"""Maximum evaluations of a wire for a frame."""
+"""Maximum cost of a wire per frame, in evaluations."""
 
 
 class ExactTracker:
-    """Follows one patch by the exact inverse of each wire, frame by frame.
+    """Tracks one patch by the exact inverse of each wire.
 
-    One owner; the compiled part holds no GIL.
+    Not shared between owners; compiled code releases the GIL.
 
     Args:
-        layout: the patch, K ≥ 3N, or K ≥ N where ``normal_only``.
+        layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
-        relative_noise: standard deviation of R relative to R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest; the resistivity and the gain then cancel.
-        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; fields have forces if it is given.
-        hold: keep the position of a wire whose resistances have not changed beyond their noise.
-        deadline_us: an update returns after this time and at most one more solve of a wire. A wire that had
-            no turn is DEADLINE with an infinite standard deviation; it is first in the next frame.
-        normal_only: only z is unknown.
-        active_only: only the electrodes that contacts move are unknown.
-        codes: meaning of the codes that :meth:`update_codes` takes.
+        relative_noise: Standard deviation of R relative to R, a number or (U, K).
+        baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
+        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; if given, fields contain forces.
+        hold: Whether to keep the position of a wire whose resistances changed no more than their noise.
+        deadline_us: Time limit of an update, µs; the update may exceed it by one solve of a wire. Wires not
+            processed by then are DEADLINE with an infinite standard deviation; they come first in the next
+            frame.
+        normal_only: Whether only z is unknown.
+        active_only: Whether only electrodes that contacts move are unknown.
+        codes: Meaning of the codes passed to :meth:`update_codes`.
 
-    Compiles its kernels on construction. Raises ValueError for arguments of the wrong shape or range.
+    The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or range.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments of the public interface
@@ -82,7 +83,7 @@ class ExactTracker:
         unknowns = layout.unknowns // 3 if normal_only else layout.unknowns
         if layout.shape[1] < unknowns:
             raise ValueError(
-                f"layout: got {layout.shape[1]} lower wires for {unknowns} unknowns an upper wire, "
+                f"layout: got {layout.shape[1]} lower wires for {unknowns} unknowns per upper wire, "
                 "must be at least as many"
             )
         self.layout = layout
@@ -100,13 +101,13 @@ class ExactTracker:
         )
         self._left_out = LeftOut(self._stream, active_only)
         self.arrays = self._stream.arrays
-        """The stream and the frame at hand."""
+        """Arrays of the stream and of the current frame."""
         if codes is not None:
             self.arrays.set_codes(codes)
         self.invalid_codes = 0
-        """Number of codes in the last scan that were no measurement."""
+        """Number of invalid codes in the last scan."""
         self.reset()
-        self.update(problem.a_rest / problem.gain)  # compiles what has not been, before a stream
+        self.update(problem.a_rest / problem.gain)  # compiles the kernels before a stream starts
         self.reset()
 
     def reset(self) -> None:
@@ -121,19 +122,20 @@ class ExactTracker:
         """Return the displacement field of one frame.
 
         Args:
-            frame_ohm: (U, K) resistances, ohm; a value that is not positive and finite is not used.
-            valid: (U, K) bool, False where a chunk or wire is missing; default all.
-            relative_noise: as in the constructor, for this frame only; a resistance whose noise is not
-                positive and finite is not used.
+            frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
+            valid: (U, K) bool, False if a chunk or wire is missing; default all True.
+            relative_noise: As in the constructor, for this frame only; resistances whose noise is not
+                positive and finite are ignored.
 
-        Never raises for numbers. A wire with fewer usable resistances than unknowns is ILL_CONDITIONED, or
-        NON_FINITE where resistances not marked as missing were unusable. Such a wire, and one that no solve
-        brings to a root, holds its last trusted position with an infinite standard deviation; its residual is
-        taken there, and is inf if the deadline left no time. Raises ValueError for wrong shapes.
+        No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
+        ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
+        any wire that no solve brings to a root, keeps its last trusted position with an infinite standard
+        deviation; its residual is computed there, or is inf if the deadline left no time. Raises ValueError
+        if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays
-        # copied, because the kernel has the addresses of these arrays
+        # copied because the kernel uses the addresses of these arrays
         arrays.ohm[:] = require_array("frame_ohm", frame_ohm, self.layout.shape, finite=False)
         arrays.noise[:] = (
             self._noise if relative_noise is None else broadcast_noise(relative_noise, self.layout)
@@ -144,8 +146,8 @@ class ExactTracker:
     def update_codes(self, codes: NDArray[np.uint32]) -> FieldFrame:
         """Return the field of a scan of codes (U, K), as :meth:`update` does for resistances.
 
-        Afterwards :attr:`arrays` has the resistances, and :attr:`invalid_codes` is the number of codes that
-        were no measurement. Raises ValueError if ``codes`` has another shape or is not uint32.
+        Afterwards :attr:`arrays` contains the resistances and :attr:`invalid_codes` the number of invalid
+        codes. Raises ValueError if ``codes`` has another shape or is not uint32.
         """
         start = perf_counter()
         self.arrays.codes[:] = checked_codes(codes, self.layout)
@@ -162,7 +164,7 @@ class ExactTracker:
         if until < math.inf:
             units = max(WIRE_UNITS, (until - perf_counter()) / UNIT_S)
         stages |= stage.CHOOSE
-        if not self._active_only:  # all wires have as many unknowns
+        if not self._active_only:  # all wires have the same number of unknowns
             stages |= stage.SOLVE | stage.ACCEPT | stage.STORE
         sigma, found = self._call_stages(stages, sigma, units)
         easy = found & stage.ALL_GOOD != 0
@@ -193,7 +195,7 @@ class ExactTracker:
         )
 
     def _call_stages(self, stages: int, sigma: float, units: float) -> tuple[float, int]:
-        """Run ``stages`` of the frame as :meth:`PatchSolver.advance` does; return σ and what was found."""
+        """Run ``stages`` of the frame with :meth:`PatchSolver.advance`; return σ and the flags found."""
         sigma, invalid, found = self._stream.solver.advance(
             stages, self.arrays, self._stream.options, sigma, units
         )
@@ -202,13 +204,13 @@ class ExactTracker:
         return sigma, found
 
     def _rescue(self, frame: Frame) -> Float:
-        """Try what is left to try on wires that are not at a root; return the residuals (U,).
+        """Make the remaining attempts for wires that are not at a root; return the residuals (U,).
 
         Writes ``good`` and ``status`` of :attr:`arrays`.
         """
         solver, arrays = self._stream.solver, self.arrays
         turns = solver.report[:, wires.TURN] == 1
-        exhausted = np.zeros_like(turns)  # whatever could be tried has been
+        exhausted = np.zeros_like(turns)  # all attempts have been made
         if self._active_only:
             exhausted = self._left_out.widen(frame, turns)
         recover_lost(self._stream, frame, turns, exhausted)
@@ -216,14 +218,14 @@ class ExactTracker:
         for u in np.flatnonzero(~arrays.good).tolist():
             known = arrays.status[u] != DEADLINE and not frame.expired
             residual[u] = self._held_residual(u) if known else math.inf
-        # wires that wait come first, in the order of waiting
+        # unprocessed wires come first, in their previous order
         self._waiting = not turns.all()
         order = arrays.order
         order[:] = order[np.argsort(turns[order], kind="stable")] if self._waiting else self._in_order
         return residual
 
     def _complete(self) -> None:
-        """Write the a that missing equations of solved wires would have had."""
+        """Write the a that the missing equations of solved wires would have."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -231,10 +233,10 @@ class ExactTracker:
             arrays.a_solved[u, missing] = stream.a_at(arrays.x[u])[missing]
 
     def adopt(self, wires_: NDArray[np.bool_], displacement_m: Float) -> None:
-        """Continue from these displacements (U, N, 3) on the wires (U,), as if they had been solved."""
+        """Continue from these displacements (U, N, 3) of the wires (U,) as if they had been solved."""
         stream, arrays = self._stream, self.arrays
         moved = (displacement_m / self.layout.pitch_m).reshape(arrays.x.shape)
-        if self._active_only:  # with every electrode an unknown again, as the displacement has them all
+        if self._active_only:  # make every electrode an unknown again
             self._left_out.take_in(wires_)
         for u in np.flatnonzero(wires_).tolist():
             arrays.x[u] = stream.problem.rest[u] + moved[u]
@@ -248,7 +250,7 @@ class ExactTracker:
         arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
-        """Solve the wires that need it, at least one: with none the stream would never go on."""
+        """Solve the wires that need it, but at least one, so that the stream always makes progress."""
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)
@@ -257,7 +259,7 @@ class ExactTracker:
             self._solve_remaining(frame)
 
     def _solve_remaining(self, frame: Frame) -> None:
-        """Solve the wires that had no turn, while there is time."""
+        """Solve the unprocessed wires while time remains."""
         todo, report = self.arrays.todo, self._stream.solver.report
         while True:
             todo[report[:, wires.TURN] == 1] = wires.LEAVE

@@ -1,5 +1,5 @@
 """Dense linear algebra for kernels.
 
-``vectors``, ``lu``, ``qr`` and ``bidiagonal`` are for the Jacobian of one wire; ``cholesky``, with triangular
-solves and products, is for a whole patch.
+``vectors``, ``lu``, ``qr`` and ``bidiagonal`` process the Jacobian of one wire; ``cholesky``, with triangular
+solves and products, processes a whole patch.
 """

@@ -1,7 +1,7 @@
-"""Bidiagonal form of a small matrix, in which a damped step costs little whatever the damping.
+"""Bidiagonal form of a small matrix, in which damped steps are cheap for any damping.
 
-Levenberg-Marquardt tries several dampings of one Jacobian; each costs of the order of n here, and of the
-order of n³ in J itself.
+Levenberg-Marquardt tries several dampings per Jacobian. Each costs O(n) operations here, but O(n³) with J
+itself.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 ) -> None:
     """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with orthogonal P and Q and B upper bidiagonal (n, n).
 
-    ``a`` (n + 3, whole lanes of m) is A with zeros around it: four rows at a time and whole vectors then need
-    no special cases. B is left in ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the
-    reflectors I − β v vᵀ of Q in the rows of ``a`` with β in ``across`` (n,), those of P in the rows of
+    ``a`` (n + 3, whole lanes of m) is A padded with zeros, so that loops over four rows and whole vectors
+    need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the
+    reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and those of P to the rows of
     ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch as long as a row of ``a``.
     Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows for columns).
     """
@@ -47,7 +47,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
         for j in range(0, column.size, LANES):
             store(column, j, LANES, splat(0.0))
         square = 0.0
-        for i in range(k + 1, n, 4):  # reflect the rows, and sum up what the column's reflector needs of them
+        for i in range(k + 1, n, 4):  # reflect the rows and accumulate the column's reflector
             t0, t1, t2, t3 = a[i], a[i + 1], a[i + 2], a[i + 3]
             s0, s1, s2, s3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
             for j in range(first, end, LANES):
@@ -87,7 +87,7 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
 
 @njit_part
 def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
-    """Replace ``b`` by (I − β v vᵀ) b with reflector ``k`` of :func:`bidiagonalise`."""
+    """Replace ``b`` with (I − β v vᵀ) b for reflector ``k`` of :func:`bidiagonalise`."""
     row, end, along = rows[k], b.size, splat(0.0)
     first = k - k % LANES
     for j in range(first, end, LANES):
@@ -101,15 +101,15 @@ def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
 def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     diagonal: Float, upper: Float, b: Float, lam: float, inverse: Float, ru: Float, x: Float
 ) -> None:
-    """Solve [B; √lam I] x = [``b``; 0] in the least squares sense, B from :func:`bidiagonalise`.
+    """Solve [B; √lam I] x = [``b``; 0] in the least-squares sense, B from :func:`bidiagonalise`.
 
-    By Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
+    Uses Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
     1977).
 
-    R of BᵀB + lam = RᵀR is bidiagonal too: 1 / its diagonal is left in ``inverse`` (n,), what is above it in
-    ``ru`` (n,). Squares of lam and B must not underflow together.
+    R of BᵀB + lam = RᵀR is bidiagonal too. Writes 1 / its diagonal to ``inverse`` (n,) and its superdiagonal
+    to ``ru`` (n,). The squares of lam and B must not both underflow.
     """
-    below, rest = lam, 0.0  # under row i of B: the square of its one element, and its right side
+    below, rest = lam, 0.0  # row below row i of B: square of its only element, and its right-hand side
     for i in range(x.size):
         radius = 1.0 / (diagonal[i] * diagonal[i] + below)
         inverse[i] = math.sqrt(radius)
@@ -117,7 +117,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
         c, t = diagonal[i] * inverse[i], root * inverse[i]
         ru[i] = c * upper[i]
         x[i] = c * b[i] + t * rest
-        filled = -t * upper[i]  # the row under it now, to be rotated into the next of the damping
+        filled = -t * upper[i]  # fill-in, to be rotated into the next damping row
         below = lam + below * radius * (upper[i] * upper[i])
         rest = (c * rest - t * b[i]) * (filled / math.sqrt(below))
     bidiagonal_solve(inverse, ru, x)
@@ -125,7 +125,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
 
 @njit_part
 def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
-    """Replace ``x`` (n,) by R⁻¹ x; R has 1 / ``inverse`` on and ``upper`` above the diagonal."""
+    """Replace ``x`` (n,) with R⁻¹ x; R has 1 / ``inverse`` on and ``upper`` above the diagonal."""
     last = 0.0
     for i in range(x.size - 1, -1, -1):
         last = (x[i] - upper[i] * last) * inverse[i]
@@ -134,7 +134,7 @@ def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
 
 @njit_part
 def bidiagonal_solve_transposed(inverse: Float, upper: Float, x: Float) -> None:
-    """Replace ``x`` (n,) by R⁻ᵀ x for the same R."""
+    """Replace ``x`` (n,) with R⁻ᵀ x, R as in :func:`bidiagonal_solve`."""
     carried = 0.0
     for i in range(x.size):
         value = (x[i] - carried) * inverse[i]

@@ -1,13 +1,13 @@
-"""Dense kernels for some hundred unknowns: Cholesky, triangular solves, products.
+"""Dense kernels for a few hundred unknowns: Cholesky, triangular solves, products.
 
-LAPACK is not used because the last bits of OpenBLAS depend on its number of threads, and the same frames must
-give the same field. Here each element of a result is one sum in the order of its index, so neither the number
-of threads nor a split of the columns changes it.
+LAPACK is not used because the last bits of OpenBLAS results depend on its number of threads, and equal frames
+must give equal fields. Here each element of a result is one sum in index order, so neither the number of
+threads nor a split of the columns changes it.
 
-Everything is one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, which
-costs 8 loads for every 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix
-multiplication, 2008). Arrays are C-ordered float64; of buffers bigger than the problem the leading n rows and
-columns are used. Nothing is allocated.
+All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs,
+which takes 8 loads per 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix
+multiplication, 2008). Arrays are C-ordered float64; buffers may be larger than the problem, in which case the
+leading n rows and columns are used. Nothing is allocated.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skinnode.compiled.simd import LANES, fma, load, splat, store, total
 from skinnode.model.layout import Float
 
 ROWS: Final = 6
-"""Rows of a tile: with 2 vectors a row, 12 sums, 2 loads and a factor fit the 16 registers of AVX2."""
+"""Rows of a tile; with 2 vectors per row, 12 sums, 2 loads and a factor fit the 16 registers of AVX2."""
 TILE: Final = 2 * LANES
 """Columns of a tile."""
 
@@ -31,9 +31,9 @@ TILE: Final = 2 * LANES
 def _tile(  # noqa: PLR0913 - the bounds of a tile
     c: Float, r: int, rows: int, a: Float, b: Float, low: int, high: int, col: int, count: int, subtract: bool
 ) -> None:
-    """``c``[r:r+rows, tile] = Σ_k ``a``[r:r+rows, k] ``b``[k, tile], low ≤ k < high, or is reduced by it.
+    """Set ``c``[r:r+rows, tile] to Σ_k ``a``[r:r+rows, k] ``b``[k, tile], low ≤ k < high, or subtract it.
 
-    The tile is ``count`` ≤ TILE columns from ``col`` on; rows ≤ ROWS.
+    The tile consists of ``count`` ≤ TILE columns from ``col`` on; rows ≤ ROWS.
     """
     zero = splat(0.0)
     right = col + LANES
@@ -92,7 +92,7 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 def _forward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` by those of L⁻¹ B; rows low to r are done."""
+    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻¹ B, after rows low to r."""
     _tile(b, r, rows, l, b, low, r, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -111,11 +111,11 @@ def _forward(  # noqa: PLR0913 - the bounds of a tile
 
 @njit
 def cholesky(a: Float, n: int) -> int:
-    """Replace the symmetric ``a`` (n, n) by its Cholesky factor: L on and below the diagonal, Lᵀ above it.
+    """Replace the symmetric ``a`` (n, n) with its Cholesky factor: L on and below the diagonal, Lᵀ above.
 
-    Reads only the diagonal and what is above it. Returns 1, or 0 if ``a`` is not positive definite.
+    Reads only the diagonal and the upper triangle. Returns 1, or 0 if ``a`` is not positive definite.
     """
-    first: Any = np.int64(0)  # a literal 0 would have what it is given to compiled once more
+    first: Any = np.int64(0)  # a literal 0 would compile the callee once more
     for r in range(0, n, ROWS):
         rows = min(ROWS, n - r)
         end = r + rows
@@ -145,7 +145,7 @@ def cholesky(a: Float, n: int) -> int:
 
 @njit
 def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
-    """Replace the leading (n, cols) of ``b`` by L⁻¹ B; reads only the lower triangle of ``l``."""
+    """Replace the leading (n, cols) of ``b`` with L⁻¹ B; reads only the lower triangle of ``l``."""
     first: Any = np.int64(0)
     for col in range(0, cols, TILE):
         for r in range(0, n, ROWS):
@@ -156,7 +156,7 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 def _backward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` by those of L⁻ᵀ B; rows r + rows to n are done."""
+    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻ᵀ B, after rows r + rows to n."""
     _tile(b, r, rows, l, b, r + rows, n, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -175,7 +175,7 @@ def _backward(  # noqa: PLR0913 - the bounds of a tile
 
 @njit
 def solve_lower_transposed(l: Float, b: Float, n: int, cols: int) -> None:
-    """Replace the leading (n, cols) of ``b`` by L⁻ᵀ B; reads Lᵀ in the upper triangle of ``l``."""
+    """Replace the leading (n, cols) of ``b`` with L⁻ᵀ B; reads Lᵀ in the upper triangle of ``l``."""
     for col in range(0, cols, TILE):
         for r in range((n - 1) // ROWS * ROWS, -1, -ROWS):
             _backward(l, b, r, min(ROWS, n - r), n, col, min(TILE, cols - col))
@@ -183,7 +183,7 @@ def solve_lower_transposed(l: Float, b: Float, n: int, cols: int) -> None:
 
 @njit
 def solve_lower_vector(l: Float, v: Float, n: int) -> None:
-    """Replace the leading n of ``v`` by L⁻¹ v."""
+    """Replace the leading n elements of ``v`` with L⁻¹ v."""
     for i in range(n):
         row = l[i]
         even, odd = splat(0.0), splat(0.0)
@@ -196,7 +196,7 @@ def solve_lower_vector(l: Float, v: Float, n: int) -> None:
 
 @njit
 def solve_lower_transposed_vector(l: Float, v: Float, n: int) -> None:
-    """Replace the leading n of ``v`` by L⁻ᵀ v."""
+    """Replace the leading n elements of ``v`` with L⁻ᵀ v."""
     for i in range(n - 1, -1, -1):
         row = l[i]
         value = v[i] / row[i]
@@ -233,7 +233,7 @@ def multiply_vector(a: Float, v: Float, out: Float) -> None:
 def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
     """Write ``a`` (m, k) · ``b``ᵀ into ``c`` (m, n), ``b`` (n, k); ``work`` (k, n) is scratch.
 
-    If Bᵀ is at hand, :func:`multiply` does the same.
+    If Bᵀ is available, use :func:`multiply` instead.
     """
     for j in range(b.shape[0]):
         row = b[j]
@@ -244,7 +244,7 @@ def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
 
 @njit
 def inverse_diagonal(l: Float, work: Float, out: Float, n: int) -> None:
-    """Write the diagonal of (L Lᵀ)⁻¹ into the leading n of ``out``: out_j = Σ_i (L⁻¹)_ij².
+    """Write the diagonal of (L Lᵀ)⁻¹ into the leading n elements of ``out``: out_j = Σ_i (L⁻¹)_ij².
 
     Leaves L⁻¹ in the lower triangle of ``work`` (n, n).
     """

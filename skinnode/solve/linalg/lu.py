@@ -1,8 +1,8 @@
 """LU factorisation of a small square matrix, for the Jacobian of one wire.
 
-Written by hand because at 30 unknowns a LAPACK call costs more than the arithmetic, and ``numpy.linalg``
-inside compiled code costs seconds of compile time. The LU is taken of Jᵀ, which is how the kernels store J:
-every inner loop then runs through a contiguous row and no sum has to be reordered to vectorise (Golub & Van
+Hand-written because at 30 unknowns a LAPACK call costs more than the arithmetic, and ``numpy.linalg``
+inside compiled code costs seconds of compile time. Kernels store J as Jᵀ, and Jᵀ is what is factored:
+every inner loop then runs along a contiguous row, and vectorising reorders no sum (Golub & Van
 Loan, Matrix Computations, 4th ed., 3.4).
 """
 
@@ -18,10 +18,10 @@ from skinnode.solve.linalg.vectors import Index
 
 @njit_part
 def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a time
-    """Factor A (n, n) in place, row exchanges in ``pivot`` (n,); return the sign of det A, 0 if singular.
+    """Factor A (n, n) in place with row exchanges in ``pivot`` (n,); return sign of det A, 0 if singular.
 
-    ``a`` (n + 3, whole lanes of n) is A with zeros around it: four rows share the loads of the pivot row, and
-    whole vectors need no special cases at the ends.
+    ``a`` (n + 3, whole lanes of n) is A padded with zeros, so that four rows at a time can share loads of the
+    pivot row and whole vectors need no special cases at the ends.
     """
     n, end = pivot.size, a.shape[1]
     sign, top, p = 1, 0.0, 0

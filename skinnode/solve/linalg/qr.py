@@ -1,7 +1,7 @@
 """Householder QR of a small tall matrix, for the Jacobian of a wire with fewer unknowns than equations.
 
-Normal equations are avoided: they square the condition number (Golub & Van Loan, Matrix Computations, 4th
-ed., 5.2, 5.3).
+Normal equations are avoided because they square the condition number (Golub & Van Loan, Matrix Computations,
+4th ed., 5.2, 5.3).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from skinnode.solve.linalg.vectors import dot
 def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> int:  # noqa: C901 - loops
     """Factor J = ``jt``ᵀ (m, n), m ≥ n, by reflectors; return 0 if R has a zero on its diagonal, else 1.
 
-    R is left above the diagonal of ``a`` (m, n) with its own diagonal in ``diagonal`` (n,); the reflectors
-    I − β v vᵀ on and below it with β in ``beta`` (n,). ``w`` (n,) is scratch.
+    Writes R above the diagonal of ``a`` (m, n), with the diagonal of R in ``diagonal`` (n,), and the
+    reflectors I − β v vᵀ on and below the diagonal, with β in ``beta`` (n,). ``w`` (n,) is scratch.
     """
     n, m = jt.shape
     for j in range(n):
@@ -54,7 +54,7 @@ def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> in
 
 @njit_part
 def qr_project(a: Float, beta: Float, b: Float) -> None:
-    """Replace ``b`` (m,) by Qᵀ b."""
+    """Replace ``b`` (m,) with Qᵀ b."""
     m, n = a.shape
     for k in range(n):
         total = 0.0
@@ -88,7 +88,7 @@ def qr_inverse(a: Float, diagonal: Float, beta: Float, v: Float, inverse: Float)
     for k in range(n - 1, -1, -1):
         for i in range(m):
             v[i] = a[i, k] if i >= k else 0.0
-        for j in range(k, n):  # the rows above do not meet this reflector
+        for j in range(k, n):  # this reflector does not affect the rows above
             row = inverse[j]
             share = beta[k] * dot(row, v)
             for i in range(k, m):

@@ -1,4 +1,4 @@
-"""Vectors for kernels: sums, norms, and rows padded to whole vector registers."""
+"""Vector operations for kernels: sums, norms, and rows padded to whole vector registers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Index = NDArray[np.int64]
 
 
 def padded(rows: int, size: int) -> Float:
-    """Return zeros (rows, ≥ size) whose rows are whole vector registers, aligned to cache lines."""
+    """Return zeros (rows, ≥ size) with rows padded to whole vector registers and aligned to cache lines."""
     size = -(-size // LANES) * LANES
     room = np.zeros(rows * size + 8)
     first = (-room.ctypes.data // room.itemsize) % 8
@@ -22,7 +22,7 @@ def padded(rows: int, size: int) -> Float:
 
 @njit_part
 def dot(a: Float, b: Float) -> float:
-    """Return a·b, in four partial sums: as exact as one, with a quarter of the latency."""
+    """Return a·b from four partial sums: as accurate as one sum, with a quarter of the latency."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     whole = a.size - a.size % 4
     for i in range(0, whole, 4):

@@ -156,7 +156,7 @@ class Faults:
     def __post_init__(self) -> None:
         for name in _SHARES:
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ConfigError(name, getattr(self, name), "a share from 0 to 1")
+                raise ConfigError(name, getattr(self, name), "a fraction from 0 to 1")
         for names in (OF_CHUNKS, OF_SCANS):
             total = math.fsum(getattr(self, name) for name in names)
             if total > 1.0 + 1e-9:

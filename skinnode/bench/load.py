@@ -107,7 +107,7 @@ class Generator:
             answer = self._pipe.recv()
         except EOFError:
             self._process.join()
-            raise BusError("the load generator ended by itself") from None
+            raise BusError("the load generator ended unexpectedly") from None
         if isinstance(answer, Exception):
             raise answer
         return answer

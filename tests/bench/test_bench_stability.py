@@ -63,7 +63,7 @@ def test_chance_in_a_long_run_is_no_fault_and_a_gross_error_is_one() -> None:
     row = tally.row() | {"case": "a case", "method": "a method"}
     assert row["wrong"] == 1
     assert row["worst"] == {"deviations": pytest.approx(10.0), "seed": 50, "frame": 2, "wire": 4}
-    assert named(row).startswith("a case by a method: 1 of 3060 wires wrong, worst 10 deviations (seed 50,")
+    assert named(row).startswith("a case by a method: 1 of 3060 wires wrong, worst 10 standard deviations")
 
 
 def test_tails_too_heavy_are_wrong_though_none_is_far_out() -> None:

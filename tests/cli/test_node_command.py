@@ -147,7 +147,7 @@ def test_a_node_of_the_users_own_source(
     assert (process.returncode, err) == (1, "")  # the source failed
     *seconds, fault = [json.loads(line) for line in out.splitlines()]
     assert fault == {
-        "note": "fault: 1 failure of the source, the last: source.read(): OSError: "
+        "note": "fault: 1 failure of the source, most recently: source.read(): OSError: "
         "the converter does not answer"
     }
     for second in seconds:
@@ -301,7 +301,7 @@ def test_another_node_with_the_same_node_id_is_a_fault(
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=20)
         assert (process.returncode, err) == (1, "")
-        assert "fault: 1 boot-up or heartbeat of another node with this node-ID" in out
+        assert "fault: 1 boot-up or heartbeat from another node with this node-ID" in out
 
 
 def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -> None:

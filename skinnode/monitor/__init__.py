@@ -1,4 +1,4 @@
-"""The full-screen view behind ``skinnode monitor``, of a running host or a recording.
+"""Full-screen view of a running host or a recording: ``skinnode monitor``.
 
 Data flows one way: ``source`` takes snapshots of a host or a recording without delaying it, ``view_model``
 condenses snapshots into a frozen view, ``touches`` finds contacts in a field, ``field_map`` draws fields,

@@ -1,4 +1,4 @@
-"""The full-screen application: shows the newest view several times a second and handles keys."""
+"""Full-screen application that shows the newest view several times per second and handles keys."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between pictures."""
 SHARE: Final = 0.2
-"""Maximum share of a processor for drawing; slow pictures are drawn less often."""
+"""Maximum fraction of one processor spent on drawing; slow pictures are drawn less often."""
 SLOWEST_S: Final = 0.5
 
 _LOG_LINES: Final = 500
@@ -38,7 +38,7 @@ _MESSAGE_S: Final = 5.0
 HELP: Final = """\
  1 … 9, ← →, tab   select a patch
  z, enter          show that patch alone, or all (also esc)
- t, T              tare it, or all patches: the present reading becomes zero
+ t, T              tare it, or all patches: the current reading becomes zero
  r                 start or stop a recording
  space             freeze the picture; the host continues
  a                 show or hide shear arrows on the maps
@@ -49,7 +49,7 @@ HELP: Final = """\
  without colours is out of date: its patch sends nothing."""
 
 _SHOWN_AS_EVENTS: Final = ("skinnode.host.supervisor", "skinnode.host.health")
-"""Loggers whose warnings the event log shows already."""
+"""Loggers whose warnings already appear in the event log."""
 
 
 class MonitorApp(App[None]):
@@ -59,7 +59,7 @@ class MonitorApp(App[None]):
         source: Host or recording; the caller closes it.
         folder: Folder of recordings.
         colours: Colours of the terminal.
-        over: Called on each turn; True ends the monitor.
+        over: Called on each update; True ends the monitor.
         seconds: Maximum duration; None for no limit.
     """
 
@@ -68,7 +68,7 @@ class MonitorApp(App[None]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("q,ctrl+c,ctrl+q", "leave", "quit", priority=True),
         Binding("right,tab,l", "choose(1)", "next patch", priority=True),
-        Binding("left,shift+tab,h", "choose(-1)", "patch before", priority=True),
+        Binding("left,shift+tab,h", "choose(-1)", "previous patch", priority=True),
         *[Binding(str(number), f"choose_number({number})", "patch") for number in range(1, 10)],
         Binding("z,enter", "zoom", "zoom"),
         Binding("escape", "unzoom", "back"),
@@ -106,7 +106,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Result of each tare, with its level."""
+        """Result of each tare, with its severity."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
@@ -117,31 +117,31 @@ class MonitorApp(App[None]):
         yield self.canvas
 
     def on_mount(self) -> None:
-        """Begin to draw."""
+        """Start drawing."""
         logging.getLogger().addHandler(self._records)
         self._begun_s = time.monotonic()
         self._cpu_s = time.thread_time()
         self._turn()
 
     def on_unmount(self) -> None:
-        """Give log messages back to the program."""
+        """Return log messages to the program."""
         logging.getLogger().removeHandler(self._records)
 
     @property
     def terminal_is_deaf(self) -> bool:
-        """Whether the terminal did not take the last output before the end."""
+        """Whether the terminal did not accept the final output."""
         return isinstance(self._driver, PatientDriver) and self._driver.deaf
 
     @property
     def view(self) -> View:
-        """The view on the screen; there is one from the first turn on."""
+        """View on the screen; available after the first update."""
         assert self._view is not None
         return self._view
 
     # --- the picture
 
     def _turn(self) -> None:
-        """Take the newest view, draw it, and schedule the next turn."""
+        """Get the newest view, draw it, and schedule the next update."""
         now_s = time.monotonic()
         driver = self._driver
         gone = isinstance(driver, PatientDriver) and driver.gone
@@ -164,7 +164,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns())
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # at start every patch becomes operational
+            if not begins:  # at start-up every patch becomes operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -172,7 +172,7 @@ class MonitorApp(App[None]):
             self._scale.update(view.t_ns, view.deepest_m)
 
     def _draw(self) -> None:
-        """Draw the view, unless the terminal is still busy with the last picture."""
+        """Draw the view, unless the terminal is still busy with the previous picture."""
         driver = self._driver
         if isinstance(driver, PatientDriver):
             if driver.busy:
@@ -249,7 +249,7 @@ class MonitorApp(App[None]):
         self.push_screen(Dialog(HELP, question=False))
 
     def action_tare(self, everything: bool) -> None:
-        """Ask, then tare the selected patch or all patches."""
+        """Ask for confirmation, then tare the selected patch or all patches."""
         names = self._names if everything else [self._names[self._selected]]
         if not self._source.live:
             self._say("a recording cannot be tared", "bad")
@@ -302,7 +302,7 @@ class MonitorApp(App[None]):
 
 
 class _Records(logging.Handler):
-    """Shows logged warnings in the event log; written to the terminal they would destroy the picture."""
+    """Shows logged warnings in the event log, because output to the terminal would corrupt the picture."""
 
     def __init__(self, lines: deque[LogLine]) -> None:
         super().__init__(logging.WARNING)

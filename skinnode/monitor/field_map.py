@@ -1,7 +1,7 @@
 """Draws a displacement field as characters: depth as brightness, shear as arrows. Pure functions.
 
 The x axis, along the upper wires, points right; the y axis, across them, points up. Two pixels, one above the
-other, make a character, so a pixel is about square. Without colours, a character shows the mean of its two
+other, form a character, so a pixel is roughly square. Without colours, a character shows the mean of its two
 pixels as a sign; a denser sign means deeper.
 """
 
@@ -28,36 +28,36 @@ Colours = Literal["rgb", "ansi", "none"]
 """Colours of the terminal: 256 or more, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
-"""A line of the screen, or a part of a line."""
+"""Line of the screen, or part of a line."""
 
 # Five points of matplotlib's "magma" (CC0): equal steps of depth look like equal steps of brightness.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
-"""Number of shades. More could not be distinguished and would take longer to draw and to transmit."""
+"""Number of shades. More shades would be indistinguishable and take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
 """Level of skin without a measurement."""
 _SIGNS: Final = "·:-=+*#%@"
-"""Signs from untouched to deep, each denser than the one before."""
+"""Signs from untouched to deep, in order of increasing density."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
 SURE: Final = 4.0
 """Minimum shear drawn, in standard deviations."""
 _SHORT: Final = 0.15
-"""Minimum shear drawn as an arrow, as a share of the full scale."""
+"""Minimum shear drawn as an arrow, as a fraction of full scale."""
 
 _STEPS_M: Final = tuple(
     step * 10.0**power for power in (-5, -4, -3, -2) for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 )
 _LEAST_M: Final = 5e-5
-"""Smallest full scale, m: noise must not look like a touch."""
+"""Minimum full scale, m, so that noise does not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""How long a deep press determines the scale."""
+"""Time for which a deep press determines the scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """The part of a displacement field that maps show. Arrays are (U, N), upper wire 0 first, in metres."""
+    """Part of a displacement field that maps show. Arrays are (U, N), upper wire 0 first, in metres."""
 
     depth_m: Float
     """Positive where the skin is pressed inwards."""
@@ -76,7 +76,7 @@ class Surface:
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """Return what maps show of a field.
+    """Return the part of a field that maps show.
 
     Args:
         field: Newest field of the patch.
@@ -102,14 +102,14 @@ def aspect_of(upper_m: Float) -> float:
 
 
 def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """Return width and height of the largest map in a box; a character is twice as high as wide."""
+    """Return width and height of the largest map that fits a box; characters are twice as high as wide."""
     across = min(width, round(2 * height * aspect))
     return max(2, across), max(1, min(height, round(across / (2 * aspect))))
 
 
 @functools.lru_cache(maxsize=64)
 def _weights(size: int, n: int) -> Float:
-    """Return (size, n) bilinear weights of n electrodes in each pixel; electrodes are centres of cells."""
+    """Return (size, n) bilinear weights of n electrodes in each pixel; electrodes are cell centres."""
     at = np.clip((np.arange(size) + 0.5) / size * n - 0.5, 0.0, n - 1)
     low = np.minimum(at.astype(int), max(n - 2, 0))
     made = np.zeros((size, n))
@@ -125,7 +125,7 @@ def resample(grid: Float, width: int, height: int) -> Float:
 
 
 def arrow(x: float, y: float) -> str:
-    """Return the arrow, one of eight, nearest to the direction (x, y)."""
+    """Return the arrow, one of eight, closest to the direction (x, y)."""
     return ARROWS[round(math.atan2(y, x) / (math.pi / 4)) % 8]
 
 
@@ -140,9 +140,9 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Depth drawn brightest: the smallest round number above the deepest press of the last seconds.
+    """Depth drawn brightest: the smallest round number above the deepest recent press.
 
-    All patches share it, so that their maps compare.
+    All patches share the scale, so that their maps are comparable.
     """
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Take the deepest press at ``t_ns``, m, into account."""
+        """Update the scale with the deepest press at ``t_ns``, m."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:
@@ -177,7 +177,7 @@ class MapStyle:
 def paint_map(
     surface: Surface, style: MapStyle, width: int, height: int, *, arrows: bool = False
 ) -> list[Line]:
-    """Draw depth as ``height`` lines of ``width`` characters; ``arrows`` adds arrows where there is shear."""
+    """Draw depth as ``height`` lines of ``width`` characters; ``arrows`` also draws arrows for shear."""
     full_m, colours = style.full_m, style.colours
     levels = np.rint(
         np.clip(resample(surface.depth_m, width, 2 * height) / full_m, 0.0, 1.0) * (LEVELS - 1)
@@ -214,7 +214,7 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
     """Draw shear as arrows; larger shear is brighter.
 
-    Each electrode has an arrow if there is room; with more room there are arrows in between.
+    Each electrode has an arrow if there is room; more room allows arrows in between.
     """
     colours = style.colours
     wires, electrodes = surface.depth_m.shape
@@ -241,7 +241,7 @@ def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> l
 
 
 def legend(style: MapStyle, width: int, text: Style) -> Line:
-    """Draw the colours from untouched to the brightest, with the depth of the brightest."""
+    """Draw the colours from untouched to brightest, with the depth of the brightest colour."""
     levels = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int).tolist()
     return [*_depth_line(levels, levels, {}, style.colours), Segment(f" {1e6 * style.full_m:.0f} µm", text)]
 
@@ -255,7 +255,7 @@ def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, st
 
 
 def _grouped(cells: Sequence[tuple[str, Style]]) -> Line:
-    """Merge neighbours of equal style: drawing time grows with the number of segments."""
+    """Merge neighbours with the same style, because drawing time grows with the number of segments."""
     return [
         Segment("".join(sign for sign, _ in run), style)
         for style, run in itertools.groupby(cells, key=lambda cell: cell[1])

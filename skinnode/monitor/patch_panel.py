@@ -1,4 +1,4 @@
-"""Draws a patch: as a tile among others, or alone with all its figures."""
+"""Draws a patch, either as a tile among others or alone with all its figures."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _LABEL: Final = 10
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:
-    """Draw all patches in as many columns as make the maps largest; at most ``height`` lines."""
+    """Draw all patches in the number of columns that makes the maps largest, in at most ``height`` lines."""
     theme = paint.theme
     count = len(patches)
     aspect = max((patch.surface.aspect for patch in patches if patch.surface is not None), default=1.0)
 
     def high_of(columns: int) -> int:
-        """Return the lines of a map if there are this many columns."""
+        """Return the height of a map in lines for this number of columns."""
         box = width // columns - 1, height // -(-count // columns) - _AROUND
         across, down, frame = _fit(*box, aspect) if min(box) > 0 else (0, 0, 0)
         return down + frame if across else 0
@@ -64,8 +64,8 @@ def _tile(number: int, patch: PatchView, paint: Paint, width: int, height: int) 
 def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: bool) -> list[Line]:
     """Draw the height map centred in its box.
 
-    The map has an outline because untouched skin is as dark as the screen. The last map of a patch without
-    data has no colours and shows the condition across it, so that it cannot be taken for live data.
+    The map has an outline because untouched skin is as dark as the screen. If a patch stops sending data, its
+    last map loses its colours and shows the condition across it, so that it cannot be mistaken for live data.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -95,7 +95,7 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
 
 
 def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
-    """Return width and height of the largest map in a box, and the characters that its outline takes.
+    """Return width and height of the largest map in a box, and the characters taken by its outline.
 
     A small box has no outline.
     """
@@ -126,7 +126,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw the condition with the first fault; without a fault, the rate."""
+    """Draw the condition with the first fault or, without a fault, the rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)
@@ -139,7 +139,7 @@ def _health(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def shear_text(shear_m: tuple[float, float]) -> str:
-    """Return a shear, m, as an arrow and a size; empty below a micrometre."""
+    """Return a shear, m, as an arrow and a magnitude; empty below 1 µm."""
     size_um = 1e6 * float((shear_m[0] ** 2 + shear_m[1] ** 2) ** 0.5)
     return "" if size_um < 1.0 else f"{field_map.arrow(*shear_m)} {size_um:.0f} µm"
 
@@ -183,7 +183,7 @@ def _caption(text: str, theme: Theme) -> Line:
 
 
 def facts(patch: PatchView, theme: Theme, width: int) -> list[Line]:
-    """Return all figures of a patch, a name and a value on each line."""
+    """Return all figures of a patch, one name and value per line."""
     health, stream = patch.health, patch.stream
     counts = stream.assembler
     lines = [
@@ -242,7 +242,7 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _span(seconds: float) -> str:
-    """Return a duration in a readable unit."""
+    """Return a duration in a suitable unit."""
     if seconds < 1.0:
         return f"{1e3 * seconds:.0f} ms"
     if seconds < 120.0:

@@ -1,4 +1,4 @@
-"""The faults of a session, reported at its end, and the view as JSON for programs."""
+"""Reports the faults of a session at its end, and the view as JSON for programs."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""How long a patch may take to become operational before the monitor counts it as a fault."""
+"""Time after which a patch that is not operational counts as a fault."""
 
 LOOK_S: Final = 0.1
 """Interval at which the source is checked for faults."""
 
 LINE_S: Final = 1.0
-"""Interval of the JSON lines."""
+"""Interval between JSON lines."""
 
 
 class FaultBook:
-    """Faults of a session, each once, in the order of their appearance."""
+    """Faults of a session, each listed once, in order of appearance."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[str, str], str] = {}
@@ -33,16 +33,16 @@ class FaultBook:
 
     @property
     def lines(self) -> list[str]:
-        """One line for each fault."""
+        """One line per fault."""
         return list(self._found.values())
 
     def update(self, view: View, real_ns: int, *, ending: bool = False) -> None:
         """Note every fault in a view.
 
         Args:
-            view: The hand now.
-            real_ns: Monotonic time of the monitor, ns; not that of a recording.
-            ending: Whether the session ends: patches that are not operational yet then count as faults.
+            view: Current view of the hand.
+            real_ns: Monotonic time of the monitor, ns; not the time of a recording.
+            ending: Whether the session is ending, so that patches not yet operational count as faults.
         """
         if self._begun_ns is None:
             self._begun_ns = real_ns
@@ -66,7 +66,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return the faults besides the condition: a key that identifies the fault, and its text."""
+    """Return the faults other than the condition, each as an identifying key and a text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:

@@ -17,11 +17,11 @@ from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
-"""Minimum size of the screen, characters; a smaller one shows only what it needs."""
+"""Minimum size of the screen, characters; a smaller screen shows only the required size."""
 
 
 def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Draw ``height`` lines of ``width`` characters; the newest line of ``log`` is its last."""
+    """Draw ``height`` lines of ``width`` characters; the last line of ``log`` is the newest."""
     theme, ui = paint.theme, paint.ui
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         text = f"{width} × {height} is too small: {LEAST_WIDTH} × {LEAST_HEIGHT} at least"
@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Describe the losses of the patches of a bus, the worst in words; empty if there are none."""
+    """Describe the losses of the patches on a bus, naming the worst; empty if there are none."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
@@ -120,7 +120,7 @@ def _keys(ui: UiState, theme: Theme, width: int) -> Line:
     keys = [("1-9", "patch"), ("z", "back" if ui.zoomed else "zoom")]
     if ui.live:
         keys += [("t", "tare"), ("r", "stop recording" if ui.recording else "record")]
-    keys += [("space", "go on" if ui.paused else "pause"), ("a", "arrows"), ("?", "help"), ("q", "quit")]
+    keys += [("space", "continue" if ui.paused else "pause"), ("a", "arrows"), ("?", "help"), ("q", "quit")]
     line = [Segment(" ", theme.bar)]
     for key, what in keys:
         line += [Segment(key, theme.key), Segment(f" {what}  ", theme.bar)]
@@ -131,7 +131,7 @@ def _keys(ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _lower(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Draw touches above events; on a wide screen side by side, with the figures of the selected patch."""
+    """Draw touches above events or, on a wide screen, beside them, with figures of the selected patch."""
     theme, ui = paint.theme, paint.ui
     chosen = view.patch(ui.selected)
     patches = (chosen,) if ui.zoomed else view.patches

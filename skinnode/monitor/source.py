@@ -1,6 +1,6 @@
-"""The monitor's data sources: a running host, or a recording that is replayed.
+"""Data sources of the monitor: a running host, or a replayed recording.
 
-Only the newest data is taken, and nothing here makes the host wait.
+Sources take only the newest data and never make the host wait.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _EVENTS: Final = 500
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A hand at one instant, by patch or by bus."""
+    """State of a hand at one instant, by patch or by bus."""
 
     t_ns: int
-    """Monotonic time, ns, of the host; of the recording host for a recording."""
+    """Monotonic time of the host, ns; for a recording, of the recording host."""
     health: Mapping[str, PatchHealth]
     bus_health: Mapping[str, BusHealth]
     buses: Mapping[str, BusStats]
@@ -54,7 +54,7 @@ class Recording:
 
 
 class Source(Protocol):
-    """What the screen needs. All methods return at once, except those that start and stop a recording."""
+    """Data source of the screen. All methods return at once, except record and stop_recording."""
 
     hand: HandConfig
     title: str
@@ -62,7 +62,7 @@ class Source(Protocol):
     """Whether patches can be tared and recorded."""
 
     def snapshot(self) -> Snapshot:
-        """Return the hand now. Raises the SkinError that ended the source."""
+        """Return the current state of the hand. Raises the SkinError that ended the source."""
 
     def events(self) -> list[HealthEvent]:
         """Return the events since the last call."""
@@ -73,7 +73,7 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Parts of a recording, as far as it was replayed, that are missing or cannot be read."""
+        """Missing or unreadable parts of a recording, as far as it has been replayed."""
 
     def tare(self, patch: str) -> None:
         """Tare a patch, as :meth:`Host.tare` does."""
@@ -86,7 +86,7 @@ class Source(Protocol):
         """Start a recording and return its path. Raises ConfigError if it cannot be written."""
 
     def stop_recording(self) -> Recording:
-        """End the recording and return its final figures."""
+        """End the recording and return its final statistics."""
 
     def close(self) -> None:
         """Release what the source holds."""
@@ -101,7 +101,7 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # subscribers learn why the host failed
+        self._fields = host.fields(capacity=_CAPACITY)  # subscribers receive the reason for a host failure
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
@@ -258,7 +258,7 @@ class ReplaySource:
                 pass
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # the user must see it
+        except Exception as error:  # the user must see every failure
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:

@@ -1,4 +1,4 @@
-"""Terminal output that never blocks: the terminal may stall, as over a slow line, or disappear."""
+"""Terminal output that never blocks, even if the terminal stalls, as on a slow line, or disappears."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAX_QUEUED: Final = 30
 """Maximum writes queued for the terminal: a few pictures."""
 
 _END_S: Final = 1.0
-"""Maximum wait at the end for a terminal to take what is queued."""
+"""Maximum wait at the end for the terminal to accept queued output."""
 
 
 class _Writer(threading.Thread):
@@ -45,14 +45,14 @@ class _Writer(threading.Thread):
                     self._gone.set()
 
     def end(self) -> None:
-        """Stop after what is queued. A thread that waits for a stalled terminal ends with the process."""
+        """Stop after writing the queue. A thread blocked on a stalled terminal ends with the process."""
         with suppress(queue.Full):
             self.queue.put_nowait(None)
         self.join(_END_S)
 
 
 class PatientDriver(LinuxDriver):
-    """Textual driver that reports whether the terminal is behind, or gone, instead of waiting for it."""
+    """Textual driver that reports a slow or missing terminal instead of waiting for it."""
 
     def __init__(self, app: App[Any], **options: Any) -> None:
         super().__init__(app, **options)
@@ -87,11 +87,11 @@ class PatientDriver(LinuxDriver):
 
     @property
     def deaf(self) -> bool:
-        """Whether a write would block on a stalled terminal, or find none."""
+        """Whether a write would block on a stalled terminal, or the terminal is gone."""
         return self.gone or (self._writer is not None and self._writer.is_alive())
 
     def run_input_thread(self) -> None:
-        """Read keys until the end; an input error means that the terminal is gone."""
+        """Read keys until the application ends; an input error means that the terminal is gone."""
         try:
             super().run_input_thread()
         except OSError:

@@ -1,4 +1,4 @@
-"""Styles of the screen, what the user has chosen, and the layout of styled text in lines."""
+"""Screen styles, user interface state, and layout of styled text in lines."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Theme:
     bad: Style
     chosen: Style
     alarm: Style
-    """Style of a recording, a pause, a lost patch."""
+    """Style that marks a recording, a pause or a lost patch."""
     gauge: Style
 
     def of(self, level: Level) -> Style:
-        """Return the style of a level."""
+        """Return the style for a severity."""
         return {"good": self.good, "note": self.note, "bad": self.bad}[level]
 
 
@@ -81,7 +81,7 @@ def theme_for(colours: Colours) -> Theme:
 
 @dataclass(frozen=True, slots=True)
 class UiState:
-    """What the user has chosen, and the message in the key bar."""
+    """User's selections, and the message in the key bar."""
 
     title: str
     selected: str
@@ -99,7 +99,7 @@ class UiState:
 
 @dataclass(frozen=True, slots=True)
 class Paint:
-    """What every part of the screen is drawn with."""
+    """Drawing parameters common to every part of the screen."""
 
     theme: Theme
     ui: UiState
@@ -134,7 +134,7 @@ def width_of(line: Line) -> int:
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Put ``right`` at the right end of a line; ``left`` is cut if there is no room for both."""
+    """Align ``right`` with the right end of a line; ``left`` is cut if there is no room for both."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 

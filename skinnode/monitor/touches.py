@@ -1,4 +1,4 @@
-"""Finds what presses on a patch, from its field."""
+"""Finds the contacts on a patch from its field."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of touched skin, as a share of the deepest, if contacts are found by depth alone. Under
+"""Minimum depth of touched skin, as a fraction of the deepest, if contacts are found by depth alone. Under
 Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
 """Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds it once in 10 million
@@ -21,9 +21,9 @@ LEAST_TOUCH_M: Final = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touch:
-    """One contact on a patch; None for unknown figures.
+    """One contact on a patch; unknown figures are None.
 
-    The posterior estimates forces. An exact field without a stiffness has only place, area and depth.
+    The posterior estimates forces. An exact field without a stiffness gives only place, area and depth.
     """
 
     x_m: float
@@ -38,10 +38,10 @@ class Touch:
 
 
 def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
-    """Return the contacts on a patch, the strongest first.
+    """Return the contacts on a patch, strongest first.
 
-    They are the posterior's contacts or, for an exact field, connected regions of pressed skin, with forces
-    if a stiffness was given.
+    Returns the posterior's contacts or, for an exact field, connected regions of pressed skin, with forces if
+    a stiffness was given.
 
     Args:
         field: Newest field of the patch.

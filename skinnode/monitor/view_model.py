@@ -1,4 +1,4 @@
-"""What the screen shows, as frozen data computed from snapshots. Pure functions, no terminal."""
+"""Computes the content of the screen from snapshots, as frozen data. Pure functions, no terminal."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
-"""Severity: good, worth a look, a fault."""
+"""Severity: good, worth checking, fault."""
 HISTORY_NS: Final = 2_000_000_000
 """Period over which rates and latencies are computed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchView:
-    """One patch."""
+    """View of one patch."""
 
     name: str
     node_id: int
@@ -39,13 +39,13 @@ class PatchView:
     condition: str
     level: Level
     words: tuple[str, ...]
-    """Faults besides the condition, the worst first."""
+    """Faults other than the condition, worst first."""
     health: PatchHealth
     stream: StreamStats
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
-    """Median time from a scan's last frame to its field, over the fields shown recently."""
+    """Median time from a scan's last frame to its field, over recently shown fields, s."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool
@@ -61,7 +61,7 @@ class PatchView:
 
 @dataclass(frozen=True, slots=True)
 class BusView:
-    """One bus."""
+    """View of one bus."""
 
     name: str
     where: str
@@ -69,7 +69,7 @@ class BusView:
     level: Level
     words: tuple[str, ...]
     load: float
-    """Share of the last second that frames occupied."""
+    """Fraction of the last second occupied by frames."""
     frames_hz: float
     lost: int
     """Frames dropped by the kernel or the host."""
@@ -77,7 +77,7 @@ class BusView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The whole hand at one instant."""
+    """View of the whole hand at one instant."""
 
     t_ns: int
     patches: tuple[PatchView, ...]
@@ -101,7 +101,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """One event, with its time of day."""
+    """One event with its time of day."""
 
     time: str
     subject: str
@@ -110,17 +110,17 @@ class LogLine:
 
 
 class History:
-    """The snapshots of the last seconds, condensed into views."""
+    """Snapshots of the last seconds, condensed into views."""
 
     def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
         self._hand, self._live = hand, live
         self._kept: deque[Snapshot] = deque()
 
     def add(self, snapshot: Snapshot) -> View:
-        """Take the newest snapshot and return its view."""
+        """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # a recording whose time jumps
+            kept.clear()  # the time of a recording may jump back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -134,7 +134,7 @@ def view_of(hand: HandConfig, history: Sequence[Snapshot], *, live: bool = True)
 
     Args:
         hand: The hand.
-        history: Snapshots, the oldest first; rates are computed since the oldest.
+        history: Snapshots, oldest first; rates are averages since the oldest.
         live: Whether the source is a running host; a recording has no latencies.
     """
     now, before = history[-1], history[0]
@@ -207,7 +207,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return (U, N, 3) positions at rest, m; a stand-in if only the patch knows its layout."""
+    """Return (U, N, 3) positions at rest, m; a placeholder if only the patch knows its layout."""
     return layout.build().upper_m
 
 
@@ -223,7 +223,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # a patch that is gone loses everything
+        lossy = []  # a missing patch loses everything
     level: Level = "good"
     if lossy or words:
         level = "note"
@@ -258,7 +258,7 @@ def _bus_view(
     if health.away is not None:
         words.append(f"away: {health.away}")
     if health.no_sync:
-        words.append("no SYNC of its master")
+        words.append("no SYNC from its master")
     if health.controller not in (None, "error active"):
         words.append(f"the controller is {health.controller}")
     lost = health.kernel_dropped + health.dropped
@@ -303,7 +303,7 @@ def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
 
 
 def time_of_day(t_ns: int) -> str:
-    """Return the local time of day, to the second, of a wall clock in ns."""
+    """Return the local time of day, to the second, of a wall-clock time in ns."""
     import datetime
 
     return datetime.datetime.fromtimestamp(t_ns * 1e-9).strftime("%H:%M:%S")

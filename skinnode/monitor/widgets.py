@@ -1,4 +1,4 @@
-"""Widgets of the screen: a canvas that redraws only changed lines, and a dialog."""
+"""Screen widgets: a canvas that redraws only changed lines, and a dialog."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from textual.widgets import Static
 from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
-"""Returns the lines of a picture for a width and a height."""
+"""Function that returns the lines of a picture for a width and a height."""
 
 
 class Canvas(Widget):
     """Shows the lines of a painter; only lines that changed go to the terminal.
 
-    Textual has no widget that compares lines: its own would redraw the whole picture each time.
+    No Textual widget compares lines; its own widgets would redraw the whole picture each time.
     """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
@@ -34,7 +34,7 @@ class Canvas(Widget):
         self._strips: list[Strip] = []
 
     def show(self, painter: Painter) -> None:
-        """Show this painter's picture from now on, at any size."""
+        """Show this painter's pictures from now on, at any size."""
         self._painter = painter
         self._paint()
 
@@ -98,6 +98,6 @@ class Dialog(ModalScreen[bool]):
     def on_key(self, event: Key) -> None:
         """Close the box with the answer."""
         event.stop()
-        if not self._answered:  # keys typed ahead arrive while it closes
+        if not self._answered:  # keys typed ahead arrive while the box closes
             self._answered = True
             self.dismiss(self._question and event.key in ("y", "enter"))

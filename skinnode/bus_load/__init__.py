@@ -1,5 +1,5 @@
-"""The bandwidth that a hand needs on its buses.
+"""Bandwidth that a hand needs on its buses.
 
-``stuffing`` counts bits, ``timing`` turns frames into seconds, ``response`` bounds the worst-case latency,
-and ``plan`` adds everything up for a hand.
+``stuffing`` counts bits, ``timing`` computes the duration of frames, ``response`` bounds the worst-case
+latency, and ``plan`` combines these for a hand.
 """

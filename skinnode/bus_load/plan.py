@@ -1,10 +1,10 @@
-"""The plan of a hand's buses: all frames, their load, and their worst-case delay.
+"""Traffic plan of a hand's buses: all frames, their load, and their worst-case delay.
 
-Each bus carries the SYNC; for each patch all chunks of a scan and its summary every SYNC period, its
-heartbeat, and one EMCY every heartbeat period; the host's heartbeat, if it sends one; the frames of others
-that the hand file names; and consecutive SDO transfers that take :data:`SDO_SHARE` of the bus. The
-configuration of a returning node by SDO is not counted: it uses free bandwidth, because SDO has a lower
-priority than all PDOs.
+Each bus carries the SYNC, the host's heartbeat if enabled, the frames of other devices listed in the hand
+file, and consecutive SDO transfers that use :data:`SDO_SHARE` of the bus. For each patch it carries all
+chunks of a scan and the summary every SYNC period, a heartbeat, and one EMCY every heartbeat period. The
+configuration of a returning node by SDO is not counted, because SDO has a lower priority than all PDOs and
+therefore uses free bandwidth.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ from skinnode.errors import BusLoadError, ConfigError, Shown
 from skinnode.protocol.profile import PatchProfile
 
 SCAN_SHARE: Final = 0.8
-"""Share of the SYNC period in which a node sends its scan; the rest is slack for SDO, EMCY and late frames.
-"""
+"""Fraction of the SYNC period in which a node sends its scan; the rest is for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
-"""Share of a bus reserved for SDO: at 1 Mbit/s a request and its answer every 27 ms."""
+"""Fraction of a bus reserved for SDO; at 1 Mbit/s, one request and its response every 27 ms."""
 
 NODE_LATENCY_S: Final = 2e-3
 """Maximum time from a SYNC to the first chunk, s, as specified for a patch on an idle machine."""
@@ -37,24 +36,23 @@ PACE_JITTER_S: Final = 0.2e-3
 """Maximum deviation of a chunk from its pace, s, as specified for a patch on an idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of frames with random data over which a typical length is averaged; the standard error is 0.1 bits.
-"""
+"""Number of random-data frames averaged for a typical length; the standard error is 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFrame:
-    """A kind of frame on a bus."""
+    """Kind of frame on a bus."""
 
     name: str
     can_id: int
     length: int
-    """Data bytes."""
+    """Data length, bytes."""
     period_s: float
     """Period, s."""
     count: int
-    """Frames in each period."""
+    """Number of frames per period."""
     spacing_s: float
-    """Shortest time between two of these frames, s."""
+    """Minimum time between two of these frames, s."""
     jitter_s: float
     """Maximum deviation from the spacing, s."""
     worst_s: float
@@ -62,7 +60,7 @@ class PlannedFrame:
     typical_s: float
     """Mean time on the bus with random data, s."""
     scans: bool = False
-    """Whether the period is that of SYNC."""
+    """Whether the period is the SYNC period."""
     response_s: float | None = None
     """Worst-case time from queueing to the end of the frame, s; None if it is unbounded."""
 
@@ -73,31 +71,31 @@ class PlannedFrame:
 
     @property
     def load(self) -> float:
-        """Share of the bus with frames of maximum length."""
+        """Fraction of the bus used with maximum-length frames."""
         return self.frames_per_s * self.worst_s
 
     @property
     def typical_load(self) -> float:
-        """Share of the bus with random data."""
+        """Fraction of the bus used with random data."""
         return self.frames_per_s * self.typical_s
 
 
 @dataclass(frozen=True, slots=True)
 class ScanTime:
-    """Duration of a scan of a patch."""
+    """Duration of a patch's scan."""
 
     patch: str
     node_id: int
     chunks: int
     paced_s: float
-    """Time from the first chunk to the last at the pace of the inhibit time, s."""
+    """Time from the first chunk to the last when paced by the inhibit time, s."""
     worst_s: float | None
     """Worst-case time from queueing the SYNC to the end of the summary, s; None if it is unbounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusPlan:
-    """The plan of one bus."""
+    """Traffic plan of one bus."""
 
     bus: BusConfig
     period_s: float
@@ -107,35 +105,35 @@ class BusPlan:
 
     @property
     def frames_per_s(self) -> float:
-        """Frames per second of the whole bus."""
+        """Frames per second on the whole bus."""
         return sum(frame.frames_per_s for frame in self.frames)
 
     @property
     def load(self) -> float:
-        """Share of the bus with frames of maximum length; 1 is a full bus."""
+        """Fraction of the bus used with maximum-length frames; 1 is a full bus."""
         return sum(frame.load for frame in self.frames)
 
     @property
     def typical_load(self) -> float:
-        """Share of the bus with random data."""
+        """Fraction of the bus used with random data."""
         return sum(frame.typical_load for frame in self.frames)
 
     @property
     def others(self) -> tuple[PlannedFrame, ...]:
-        """The frames of others that the hand file names."""
+        """Frames of other devices, as listed in the hand file."""
         named = {other.can_id for other in self.bus.others}
         return tuple(frame for frame in self.frames if frame.can_id in named)
 
     @property
     def shortest_period_ms(self) -> int | None:
-        """Shortest SYNC period that fits, ms; None if no period fits."""
+        """Shortest SYNC period at which the plan fits the bus, ms; None if no period does."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
         scan_s = sum(frame.count * frame.worst_s for frame in self.frames if frame.scans)
         return int(-(-scan_s * 1e3 // free)) if free > 0 else None
 
 
 def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Return the plan of each bus that has patches, and check their loads.
+    """Return the plan of each bus that has patches, and check the bus loads.
 
     Args:
         hand: the hand.
@@ -186,14 +184,14 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Return the plan of each bus that has patches, whatever its load.
+    """Return the plan of each bus that has patches, regardless of its load.
 
     Args:
         hand: the hand.
 
     Raises:
-        ConfigError: if the wire format cannot carry a patch, or a frame of others has an identifier of the
-            hand.
+        ConfigError: if the wire format cannot carry a patch, or another device's frame uses an identifier of
+            the hand.
     """
     profiles = {patch.name: _profile(hand, i, patch) for i, patch in enumerate(hand.patches)}
     return tuple(
@@ -202,7 +200,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3) at which some frames take SCAN_SHARE of a period, 100 µs.
+    """Return the inhibit time (0x1800:3) at which the frames take SCAN_SHARE of a period, 100 µs.
 
     Args:
         period_ms: SYNC period, ms.
@@ -226,7 +224,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # commands and SDO of every node, although the plan counts SDO once for each bus
+    for patch in patches:  # commands and SDO of every node, although the plan counts SDO only once per bus
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -308,7 +306,7 @@ def _typical_fd_bits(can_id: int, length: int) -> tuple[float, float]:
 
 
 def _responses_s(frames: tuple[PlannedFrame, ...], bus: BusConfig) -> dict[int, float | None]:
-    """Return the worst-case response time of each frame, s, by its identifier."""
+    """Return the worst-case response time of each frame, s, by identifier."""
     messages = [
         Message(
             frame.can_id,
@@ -335,7 +333,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Add up the worst case: SYNC, node latency, pace of the chunks, the last chunk and the summary."""
+    """Return the worst case, the sum of SYNC, node latency, chunk pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

@@ -1,16 +1,16 @@
-"""Worst-case response times on a CAN bus: from queueing a frame to its last bit.
+"""Worst-case response times on a CAN bus, from queueing a frame to its last bit.
 
-Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: Refuted, revisited and
-revised", Real-Time Systems 35, 2007, section 3: the lowest identifier wins, a frame on the bus is not
-interrupted, and every instance in the longest busy period of a priority is examined, because the first is not
-always the slowest.
+The analysis follows Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
+Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The lowest identifier wins, a frame on
+the bus is not interrupted, and every instance in the longest busy period of a priority is examined, because
+the first instance is not always the slowest.
 
-Extension: frames may come in bursts, ``count`` frames ``spacing_ns`` apart in each period, as the chunks of a
-scan do. A window that begins with a burst holds the maximum number of them, so the analysis holds with that
-number in place of the paper's ⌈(t + J) / T⌉.
+Extension: frames may come in bursts of ``count`` frames ``spacing_ns`` apart in each period, as the chunks of
+a scan do. A window that starts with a burst contains the maximum number of frames, so the analysis holds with
+that number instead of the paper's ⌈(t + J) / T⌉.
 
-Not covered: retransmission after an error, and controllers whose buffers send a frame of lower priority
-first.
+Retransmission after an error, and controllers whose buffers send a lower-priority frame first, are not
+covered.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Frames of one identifier on the bus. Times are whole nanoseconds.
+    """Frames with the same identifier on a bus. Times are whole nanoseconds.
 
     Raises:
         ValueError: if a burst is longer than its period, or a time is not positive.
     """
 
     can_id: int
-    """Identifier and priority: the lowest wins. No two messages of a bus share one."""
+    """Identifier, which is also the priority (the lowest wins) and unique on the bus."""
     time_ns: int
-    """Maximum time of a frame with inter-frame space, ns."""
+    """Maximum duration of a frame including the inter-frame space, ns."""
     period_ns: int
-    """Shortest time between two bursts, ns."""
+    """Minimum time between two bursts, ns."""
     count: int = 1
-    """Number of frames of a burst."""
+    """Number of frames per burst."""
     spacing_ns: int = 0
-    """Shortest time between two frames of a burst, ns."""
+    """Minimum time between two frames of a burst, ns."""
     jitter_ns: int = 0
-    """Maximum delay of queueing a frame, ns; frames of one message keep their order."""
+    """Maximum delay in queueing a frame, ns; frames of the same message keep their order."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -55,12 +55,12 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """Return when an instance is due, ns after the first, number 0."""
+        """Return the time at which an instance is due, ns after instance 0."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 
     def most_in(self, window_ns: int) -> int:
-        """Return the maximum number of instances queued in a window, its end excluded."""
+        """Return the maximum number of instances queued in a window that excludes its end."""
         bursts, rest_ns = divmod(window_ns + self.jitter_ns, self.period_ns)
         begun = (
             self.count
@@ -71,15 +71,16 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the longest time from when a message is due to its last bit, ns.
+    """Return the maximum time from when a message is due to its last bit, ns.
 
     Args:
         message: the message.
-        others: the other messages of the bus.
-        bit_ns: time of a bit, ns, during which frames can still join an arbitration.
+        others: the other messages on the bus.
+        bit_ns: bit time, ns, during which frames can still join an arbitration.
 
     Returns:
-        None if the time is unbounded: the message and those of higher priority need the whole bus.
+        The time, or None if it is unbounded because the message and all higher-priority messages together
+        need the whole bus.
     """
     higher = [other for other in others if other.can_id < message.can_id]
     blocking_ns = max((other.time_ns for other in others if other.can_id > message.can_id), default=0)

@@ -1,6 +1,6 @@
-"""Compiled kernels of :mod:`skinnode.bus_load.timing`: count the bits of frames on the bus.
+"""Compiled kernels of :mod:`skinnode.bus_load.timing` that count the bits of frames on the bus.
 
-Pure functions of arrays: uint32 identifiers, uint8 lengths and payloads, int64 bits.
+The kernels are pure functions of arrays: uint32 identifiers, uint8 lengths and payloads, int64 bit counts.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from skinnode.compiled.jit import njit_brief
 HEAD_BITS: Final = 19  # SOF, 11 bits identifier, RTR, IDE, r0, 4 bits DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""CRC delimiter, ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space."""
+"""Bits of CRC delimiter, ACK slot and delimiter, 7-bit end of frame and 3-bit inter-frame space."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11 bits identifier, RRS, IDE, FDF, res, BRS; and the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
@@ -28,10 +28,10 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return the CRC of each byte; and for run << 8 | byte the run after the byte, and the stuff bits in it.
+    """Return the CRC of each byte, and for run << 8 | byte the next run and the number of stuff bits.
 
-    A run is 0 before the first bit, otherwise value << 2 | (length − 1) + 1, with lengths 1 … 4: a fifth
-    equal bit causes the stuff bit, which begins another run.
+    A run is 0 before the first bit, otherwise value << 2 | (length − 1) + 1 with a length of 1 … 4. A fifth
+    equal bit causes a stuff bit, which begins a new run.
     """
     crc_table = []
     for byte in range(256):
@@ -58,7 +58,7 @@ def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
 
 @functools.cache
 def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return the tables as arrays: the CRC, and the run after the byte << 8 | the stuff bits in it."""
+    """Return the tables as arrays, the second one with next run << 8 | number of stuff bits."""
     crc, next_run, stuffed = (np.array(table, np.uint16) for table in tables())
     return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
 
@@ -67,14 +67,14 @@ _loaded = False
 
 
 def are_loaded() -> bool:
-    """Return whether :func:`load_kernels` was called."""
+    """Return whether :func:`load_kernels` has been called."""
     return _loaded
 
 
 def load_kernels() -> None:
     """Compile the kernels, or read them from the cache.
 
-    That takes half a second, in which a receiving thread would answer no request, so it is done in advance.
+    This takes half a second, in which a receiving thread could not answer requests, so it is done in advance.
     """
     global _loaded
     _loaded = True
@@ -94,7 +94,7 @@ def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stri
         bits: (n,) output, bits of each frame.
 
     Returns:
-        Sum of the bits.
+        Total number of bits.
     """
     return int(_classic(ids, lengths, payload, stride, *_arrays(), bits))
 
@@ -104,7 +104,7 @@ def fd_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, nominal: 
 
     Args:
         ids: (n,) identifiers.
-        lengths: (n,) data lengths that CAN FD has, bytes.
+        lengths: (n,) valid CAN FD data lengths, bytes.
         payload: the data of all frames, concatenated.
         nominal: (n,) output, bits at the nominal bit rate.
         fast: (n,) output, bits at the data bit rate.
@@ -125,8 +125,8 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ (head & 0xFF)])
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
-        # Head and CRC have 19 + 15 bits, two more than four bytes, so six filler bits make five bytes. Bytes
-        # of the stuffed region straddle payload bytes, so they are cut from pairs of neighbours.
+        # Head and CRC have 19 + 15 bits, two more than four bytes, so six filler bits complete five bytes.
+        # Bytes of the stuffed region straddle payload bytes, so each is cut from two adjacent payload bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0
@@ -161,8 +161,8 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
             code = 6 + length // 4  # 12, 16, 20, 24
         else:
             code = 11 + length // 16  # 32, 48, 64
-        # 22 bits up to the length code are two fewer than three bytes, and the data follow bytewise. FDF, res
-        # and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
+        # The 22 bits up to the length code are two fewer than three bytes, and the data bytes follow. FDF,
+        # res and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0
         stuff: Any = 0
@@ -179,7 +179,7 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
             entry = np.int64(run_of[run << 8 | np.int64(payload[k])])
             stuff, run = stuff + (entry & 0xFF), entry >> 8
             last = np.int64(payload[k]) & 1
-        # A stuff bit due after the last bit is not sent: the first fixed one stands there.
+        # A stuff bit due after the last bit is not sent, because the first fixed stuff bit replaces it.
         if run - 1 >> 2 != last:
             stuff -= 1
         crc_bits, fixed = (17, 6) if length <= 16 else (21, 7)

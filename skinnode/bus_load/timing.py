@@ -1,19 +1,19 @@
-"""Exact duration of CAN frames on the bus (ISO 11898-1:2015), and the load that they cause.
+"""Exact duration of CAN frames on the bus (ISO 11898-1:2015), and the resulting load.
 
-Classic frames. From start of frame to the end of the CRC sequence a stuff bit of the other value follows
-every five equal bits, stuff bits included in the count. The tail of 13 bits is not stuffed: CRC delimiter,
+Classic frames. From start of frame to the end of the CRC sequence, a stuff bit of the opposite value follows
+every five equal bits, and stuff bits count towards the five. The 13-bit tail is not stuffed: CRC delimiter,
 ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space. CRC: polynomial 0x4599, 15 bits,
-initially 0.
+initial value 0.
 
-CRC and stuffing are computed bytewise with tables. The head of a frame is padded on its left to whole bytes:
-with zeros for the CRC, which stays 0, and with alternating bits that end in a 1 for the stuffing, after which
-the dominant start of frame begins a new run.
+CRC and stuffing are computed bytewise with tables. The head of a frame is padded on the left to whole bytes.
+The CRC uses zeros, which leave it at 0. Stuffing uses alternating bits that end in a 1, so the dominant start
+of frame begins a new run.
 
-CAN FD frames, with an 11-bit identifier and bit-rate switch. This stuffing ends with the data. The CRC field
-holds 4 bits that count the stuff bits, 17 bits of CRC (21 for more than 16 data bytes), and fixed stuff bits:
-one before them and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit
-rate; the 17 bits before them and the 12 bits after them (ACK slot and delimiter, 7 bits end of frame, 3 bits
-inter-frame space) at the nominal bit rate.
+CAN FD frames, with an 11-bit identifier and bit-rate switch. Stuffing as above ends with the data. The CRC
+field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one
+before the field and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit
+rate. The 17 bits before them and the 12 bits after them (ACK slot and delimiter, 7 bits end of frame, 3 bits
+inter-frame space) are sent at the nominal bit rate.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ _Int = NDArray[np.int64]
 
 
 def nominal_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the bits of a frame without stuff bits.
+    """Return the number of bits in a frame without stuff bits.
 
     Args:
-        dlc: data bytes.
+        dlc: number of data bytes.
         extended: whether the identifier has 29 bits.
     """
     return (_EXTENDED_HEAD_BITS if extended else HEAD_BITS) + 8 * dlc + CRC_BITS + TAIL_BITS
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the bits of the longest frame: a stuff bit after the first 5 bits and after every 4 more.
+    """Return the bits in the longest frame, with stuff bits after the first 5 and every 4 further bits.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -67,13 +67,13 @@ def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
 def exact_bits(
     can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int | None = None
 ) -> int:
-    """Return the bits of a classic frame on the bus, with inter-frame space.
+    """Return the number of bits of a classic frame on the bus, including the inter-frame space.
 
     Args:
         can_id: identifier.
         data: data bytes.
         extended: whether the identifier has 29 bits.
-        remote: whether it is a remote frame, which carries no data.
+        remote: whether the frame is a remote frame, which carries no data.
         dlc: length code of a remote frame.
 
     Raises:
@@ -113,14 +113,14 @@ def exact_bits(
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
-    """Return the bits of CAN FD frames of one length.
+    """Return the number of bits of CAN FD frames that have the same length.
 
     Args:
         can_id: (n,) identifiers.
         data: (n, length) bytes.
 
     Returns:
-        (n,) bits at the nominal bit rate, with inter-frame space, and (n,) bits at the data bit rate.
+        (n,) bits at the nominal bit rate, including inter-frame space, and (n,) bits at the data bit rate.
 
     Raises:
         ValueError: if a shape is wrong, an identifier has more than 11 bits, or no frame has that length.
@@ -141,10 +141,10 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
 
 @functools.cache
 def fd_worst_case_bits(length: int) -> tuple[int, int]:
-    """Return the maximum bits of a CAN FD frame, found over all data run by run.
+    """Return the maximum number of bits of a CAN FD frame, found over all possible data run by run.
 
     Args:
-        length: data bytes.
+        length: number of data bytes.
 
     Returns:
         Bits at the nominal and at the data bit rate, as in :func:`fd_bits`.
@@ -154,8 +154,8 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
-    # 14 bits from SOF to IDE: a stuff bit may follow the first 5 and every 4 more. FDF, res and BRS
-    # alternate, ESI is 0 and the length code is known; the data are the worst possible.
+    # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 and every 4 further bits. FDF, res and
+    # BRS alternate, ESI is 0 and the length code is known. The data are the worst possible.
     stuff = {(1 << 2) + 1: 0}  # a run of one recessive bit, BRS
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -208,13 +208,13 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counts frames and their exact bits. Adding a frame is cheap; the bits are computed in batches.
+    """Counter of frames and their exact bits. Adding a frame is cheap, because bits are computed in batches.
 
-    Plain code with one owner.
+    The counter is not thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.
-        data_bitrate_bps: data bit rate of CAN FD, bit/s; by default the nominal one.
+        data_bitrate_bps: data bit rate of CAN FD, bit/s; by default the nominal bit rate.
 
     Raises:
         ConfigError: if a bit rate is not positive.
@@ -243,9 +243,9 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Count a frame, as in :func:`exact_bits` or, if ``fd``, :func:`fd_bits`.
+        """Count a frame with the bits of :func:`exact_bits` or, if ``fd``, of :func:`fd_bits`.
 
-        ``data`` is kept until the next batch, not copied.
+        ``data`` is not copied, and is kept until the next batch.
         """
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
@@ -257,8 +257,8 @@ class BusLoad:
         """Count data frames with 11-bit identifiers.
 
         Args:
-            frames: identifier, data and anything else of each frame.
-            fd: whether they are CAN FD frames.
+            frames: for each frame a tuple of identifier, data and any further items, which are ignored.
+            fd: whether the frames are CAN FD frames.
         """
         ids, data = self._fd if fd else self._classic
         ids += [frame[0] for frame in frames]
@@ -268,27 +268,27 @@ class BusLoad:
 
     @property
     def frames(self) -> int:
-        """Number of frames so far."""
+        """Number of frames counted so far."""
         return self._frames + len(self._classic[0]) + len(self._fd[0])
 
     @property
     def bits(self) -> int:
-        """Number of bits so far; a bit at the data bit rate counts as its share of a nominal bit."""
+        """Number of bits counted so far; a bit at the data bit rate counts as a fraction of a nominal bit."""
         self._work_off()
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the share of a time that the frames so far take; above 1 they do not fit.
+        """Return the fraction of a time interval taken by the counted frames; above 1 they do not fit.
 
         Args:
-            time_s: the time, s.
+            time_s: length of the interval, s.
         """
         return self.bits / (self.bitrate_bps * time_s) if time_s > 0 else 0.0
 
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if not stuffing.are_loaded():  # a command that listens for a second or two is faster without
+        if not stuffing.are_loaded():  # a command that listens only 1 or 2 s is faster without
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))
@@ -310,7 +310,7 @@ def _packed(
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return (n,) identifiers, (n,) lengths and the concatenated data, in writable memory.
 
-    Kernels are compiled for each kind of memory.
+    A kernel is compiled separately for writable and read-only memory, hence the copies.
     """
     lengths, joined = bytearray(map(len, data)), bytearray().join(data)
     return np.array(array("I", ids)), np.frombuffer(lengths, np.uint8), np.array(joined, np.uint8)

@@ -1,6 +1,7 @@
-"""CiA 301, 305 and 306 as data and pure functions, shared by node, host and tools: one place for each number.
+"""Constants and pure functions of CiA 301, 305 and 306, shared by node, host and tools.
 
-``indices``, ``nmt``, ``abort``, ``emergency``, ``sdo`` and ``lss`` hold the constants; ``dictionary`` and
-``communication`` describe an object dictionary, which ``eds`` writes as an EDS or DCF file. The conformance
-suite shares none of it on purpose: it checks the node against its own reading of the standard.
+``indices``, ``nmt``, ``abort``, ``emergency``, ``sdo`` and ``lss`` define each number once. ``dictionary``
+and ``communication`` describe an object dictionary, which ``eds`` writes as an EDS or DCF file. The
+conformance suite deliberately uses none of this code, so that it checks the node against an independent
+reading of the standard.
 """

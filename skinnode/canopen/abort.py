@@ -1,4 +1,4 @@
-"""Abort codes of the SDO protocol (CiA 301 v4.2, table 22), and the exception that carries one."""
+"""SDO abort codes (CiA 301 v4.2, table 22), and the exception that carries an abort code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class AbortCode(IntEnum):
-    """Reason why a transfer is aborted. Values of CiA 301."""
+    """Reason for aborting a transfer, with the value defined by CiA 301."""
 
     TOGGLE_BIT = 0x05030000
     TIMED_OUT = 0x05040000
@@ -42,7 +42,7 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """A refused access to the object dictionary. Never leaves the node: the SDO server sends the abort code.
+    """Error for a refused object access; it stays in the node, whose SDO server sends the abort code.
 
     Args:
         code: reason of the refusal.

@@ -1,4 +1,4 @@
-"""The objects 0x1000 to 0x1FFF of a node as CiA 301 v4.2, 7.5.2, defines them, with a patch's defaults."""
+"""Communication objects 0x1000 to 0x1FFF of a node (CiA 301 v4.2, 7.5.2), with the defaults of a patch."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _GROUPS = ("all", "communication", "application")
 
 @dataclass(frozen=True, slots=True)
 class PdoDefault:
-    """A PDO after a reset."""
+    """Default configuration of a PDO after a reset."""
 
     purpose: str
-    """Purpose, for the name of its records."""
+    """Purpose, shown in the names of the PDO's records."""
     cob_id: int
     """COB-ID with the bits of 0x1800:1; the node-ID is added if ``plus_node_id``."""
     kind: int = 254
@@ -33,11 +33,11 @@ class PdoDefault:
 
 
 def spare_pdo(cob_id: int | None) -> PdoDefault:
-    """Return a PDO that is not used until a client maps objects into it and switches it on.
+    """Return a PDO that is unused until a client maps objects into it and switches it on.
 
     Args:
-        cob_id: COB-ID without the node-ID, from the pre-defined connection set; None if it has none for this
-            PDO.
+        cob_id: COB-ID without the node-ID, from the pre-defined connection set; None if the set does not
+            contain this PDO.
     """
     return PdoDefault("spare", od.PDO_INVALID | (cob_id or 0), plus_node_id=cob_id is not None)
 
@@ -48,7 +48,7 @@ def communication_objects(
     slots: int,
     revision: int = od.REVISION_NUMBER,
 ) -> tuple[Object, ...]:
-    """Return all communication objects by ascending index.
+    """Return all communication objects in ascending order of index.
 
     Args:
         rpdos: the RPDOs.
@@ -160,6 +160,6 @@ def _mapping(index: int, name: str, pdo: PdoDefault, slots: int) -> Object:
     entries = tuple(
         Entry(index, sub, f"Mapped object {sub}", _U32, "rw", value) for sub, value in enumerate(values, 1)
     )
-    # Without a limit, because too many objects have their own abort code.
+    # No upper limit here, because mapping too many objects has its own abort code.
     first = Entry(index, 0, "Number of mapped objects", _U8, "rw", len(pdo.mapped))
     return record(index, f"{name} mapping parameter: {pdo.purpose}", entries, first)

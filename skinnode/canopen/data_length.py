@@ -7,17 +7,17 @@ from typing import Final
 from skinnode.text.words import counted
 
 FD_LENGTHS: Final[tuple[int, ...]] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""Lengths of the data of a CAN FD frame, bytes, by length code."""
+"""Data lengths of a CAN FD frame, bytes, by length code."""
 
 
 def fd_length(n_bytes: int) -> int:
-    """Return the shortest length of a CAN FD frame that holds some bytes.
+    """Return the shortest CAN FD data length that holds a number of bytes.
 
     Args:
         n_bytes: number of bytes.
 
     Raises:
-        ValueError: if no frame holds them: more than 64.
+        ValueError: if the number exceeds 64, the maximum of a frame.
     """
     for length in FD_LENGTHS:
         if n_bytes <= length:

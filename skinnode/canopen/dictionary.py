@@ -1,6 +1,6 @@
 """Declaration of an object dictionary as plain data, without values.
 
-Numbers and words are those of CiA 301 (object codes, data types) and CiA 306 (access types).
+Numbers and terms follow CiA 301 (object codes, data types) and CiA 306 (access types).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class ObjectType(enum.IntEnum):
 
 
 class DataType(enum.IntEnum):
-    """Indices of the static data types used here."""
+    """Indices of the static data types used in this project."""
 
     UNSIGNED8 = 0x05
     UNSIGNED16 = 0x06
@@ -34,7 +34,7 @@ class DataType(enum.IntEnum):
 
     @property
     def bits(self) -> int:
-        """Length of a value in bits; 0 if it varies."""
+        """Length of a value, bits; 0 if the length varies."""
         return _BITS[self]
 
 
@@ -51,7 +51,7 @@ _BITS = {
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One value: an index and a sub-index."""
+    """Declaration of one value at an index and sub-index."""
 
     index: int
     subindex: int
@@ -59,13 +59,13 @@ class Entry:
     """Parameter name in the EDS."""
     data_type: DataType
     access: str
-    """ro, rw, wo, const, or rww, which is rw and mappable into an RPDO."""
+    """ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
     default: Value | None = None
-    """Default value; None, and zero at start, if it is the device's own, such as a serial number."""
+    """Default value; None for a device-specific value such as a serial number, which is zero at start."""
     plus_node_id: bool = False
-    """Whether the node-ID is added to the default at start, as for a COB-ID."""
+    """Whether the node-ID is added to the default at start, as in a COB-ID."""
     mappable: bool = False
-    """Whether a PDO can map it."""
+    """Whether the entry can be mapped into a PDO."""
     low: int | None = None
     """Minimum value, if limited."""
     high: int | None = None
@@ -73,14 +73,14 @@ class Entry:
 
     @property
     def mapping(self) -> int:
-        """Value of a PDO mapping parameter for the entry: index, sub-index, length in bits."""
+        """PDO mapping value of the entry, made up of index, sub-index and length in bits."""
         return self.index << 16 | self.subindex << 8 | self.data_type.bits
 
     def value_at_start(self, node_id: int) -> Value | None:
         """Return the default value on a node.
 
         Args:
-            node_id: its node-ID.
+            node_id: node-ID of the node.
         """
         if self.plus_node_id and isinstance(self.default, int):
             return self.default + node_id
@@ -89,7 +89,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """One index with all its entries, by ascending sub-index; VAR and DOMAIN have the single sub-index 0."""
+    """Object with its entries in ascending order of sub-index; VAR and DOMAIN have only sub-index 0."""
 
     index: int
     name: str
@@ -114,7 +114,7 @@ def var(  # noqa: PLR0913 - one argument for each column of the standard's table
     mappable: bool = False,
     high: int | None = None,
 ) -> Object:
-    """Declare a single value, or a domain. The arguments are the fields of :class:`Entry`."""
+    """Declare a single value or a domain. The arguments are the fields of :class:`Entry`."""
     entry = Entry(index, 0, name, data_type, access, default, plus_node_id, mappable, None, high)
     kind = ObjectType.DOMAIN if data_type is DataType.DOMAIN else ObjectType.VAR
     return Object(index, name, kind, (entry,))
@@ -134,10 +134,10 @@ def record(index: int, name: str, entries: Sequence[Entry], first: Entry | None 
     """Declare a record.
 
     Args:
-        index: its index.
-        name: its name.
-        entries: its sub-objects from 1 on, by ascending sub-index.
-        first: its sub-index 0, if that is not a constant.
+        index: index of the record.
+        name: name of the record.
+        entries: sub-objects from sub-index 1, in ascending order.
+        first: sub-index 0, if it is not a constant.
     """
     first = first or highest(index, entries[-1].subindex)
     return Object(index, name, ObjectType.RECORD, (first, *entries))
@@ -157,7 +157,7 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
 ) -> Object:
     """Declare an array with one entry for each of ``labels``.
 
-    ``first`` as in :func:`record`; the other arguments are the fields of :class:`Entry`.
+    ``first`` is as in :func:`record`; the other arguments are the fields of :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

@@ -1,8 +1,8 @@
-"""Writes an object dictionary as an EDS or DCF file (CiA 306).
+"""Writer of an object dictionary as an EDS or DCF file (CiA 306).
 
-An EDS is an electronic data sheet, a DCF the configuration of one device. REAL32 defaults are written as the
-hexadecimal IEEE 754 pattern, as conforming tools expect. The canopen library expects decimals and omits such
-a default; 0 is the same in both.
+An EDS is an electronic data sheet; a DCF is the configuration of one device. REAL32 defaults are written as
+hexadecimal IEEE 754 bit patterns, as conforming tools expect. The canopen library expects decimals and drops
+such a default; 0 is the same in both notations.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 from skinnode.canopen import indices as od
 from skinnode.canopen.dictionary import DataType, Entry, Object, ObjectType
 
-_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed: a generated file must not change by itself
+_DATE, _TIME = "01-01-2025", "12:00AM"  # fixed, so that regenerating a file does not change it
 _BIT_RATES_KBPS: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 _MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 _DUMMY_TYPES: Final = range(1, 8)
@@ -23,7 +23,7 @@ _DUMMY_TYPES: Final = range(1, 8)
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """The device as the head of an EDS describes it."""
+    """Device description in the header sections of an EDS."""
 
     file_name: str
     description: str
@@ -39,22 +39,22 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """The data that a DCF adds to an EDS."""
+    """Data that a DCF adds to an EDS."""
 
     node_id: int
     bitrate_kbps: int
     node_name: str
     eds_name: str
-    """Name of the EDS file that it is based on."""
+    """Name of the EDS file on which the DCF is based."""
 
 
 def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
-    """Return the text of an EDS or DCF file. Depends on its arguments only; lines end in LF.
+    """Return the text of an EDS or DCF file, determined by the arguments alone; lines end in LF.
 
     Args:
         info: the device.
-        objects: its object dictionary.
-        device: the node for a DCF, in which each writable object has its value at start; None for an EDS.
+        objects: object dictionary of the device.
+        device: the node for a DCF, which gives each writable object its start value; None for an EDS.
     """
     listed = tuple(objects)
     lines = [*_head(info, device)]
@@ -117,7 +117,7 @@ def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     )
     if device is not None:
         yield from _section(
-            "DeviceComissioning",  # spelt like this in CiA 306
+            "DeviceComissioning",  # this spelling is from CiA 306
             [
                 ("NodeID", str(device.node_id)),
                 ("NodeName", device.node_name),
@@ -170,7 +170,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether a DCF configures the entry: commands and histories are excluded."""
+    """Return whether a DCF configures the entry, which excludes commands and histories."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

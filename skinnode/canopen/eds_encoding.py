@@ -1,7 +1,7 @@
-"""Reads the text of an EDS or DCF file in any encoding.
+"""Reader of the text of an EDS or DCF file in any encoding.
 
-CiA 306 requires ASCII; tools also write other encodings. A file is read without loss: each non-ASCII byte
-becomes a lone surrogate (PEP 383), so that the bytes of a value can be recovered, and :func:`for_people`
+CiA 306 requires ASCII, but tools also write other encodings. A file is read without loss: each non-ASCII byte
+becomes a lone surrogate (PEP 383), from which the bytes of a value can be recovered. :func:`for_people`
 decodes text for display.
 """
 
@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum size of a file: twenty times that of a patch, and more than any known device needs."""
+"""Maximum file size, bytes; twenty times the EDS of a patch, and more than any known device needs."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {
@@ -24,20 +24,20 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Codec, by Python's name, of the bytes that :class:`EdsText` holds for each encoding."""
+"""Python codec name of the bytes that :class:`EdsText` holds, for each encoding."""
 
 
 class EdsText(NamedTuple):
-    """Text of a file and the encoding that was assumed."""
+    """Text of a file and its assumed encoding."""
 
     text: str
-    """ASCII, with lone surrogates for other bytes; lines end in ``\\n``."""
+    """ASCII text with lone surrogates for other bytes; lines end in ``\\n``."""
     encoding: str
     """Human-readable name of the encoding."""
 
     @property
     def codec(self) -> str:
-        """Codec of the bytes behind the surrogates; bytes of UTF-16 have been converted to UTF-8."""
+        """Codec of the bytes behind the surrogates; UTF-16 has been converted to UTF-8."""
         return _CODECS[self.encoding]
 
     @property
@@ -47,15 +47,15 @@ class EdsText(NamedTuple):
 
     @property
     def note(self) -> str:
-        """One line for the user; empty for an ASCII file."""
+        """One-line note for the user; empty for an ASCII file."""
         return "" if self.encoding == ASCII else f"read as {self.encoding}: an EDS should be ASCII"
 
 
 def read_eds_text(data: bytes) -> EdsText:
     """Return the text of a file and its encoding.
 
-    The encoding is that of its byte order mark, or the first of ASCII, UTF-8, Windows-1252 and Latin-1 that
-    fits. Only the mark is lost.
+    The byte order mark determines the encoding. Without a mark, the encoding is the first of ASCII, UTF-8,
+    Windows-1252 and Latin-1 that fits. Nothing but the mark is lost.
 
     Args:
         data: the bytes of the file.
@@ -89,7 +89,7 @@ def octets(text: str) -> bytes:
 
 
 def for_people(text: str, codec: str) -> str:
-    """Decode the text of a file for display: bytes that the codec cannot decode become U+FFFD."""
+    """Decode the text of a file for display; bytes that the codec cannot decode become U+FFFD."""
     return octets(text).decode(codec, "replace")
 
 

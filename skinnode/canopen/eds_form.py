@@ -1,4 +1,4 @@
-"""Checks the form of an EDS (CiA 306) that its readers silently skip, and names the line of a mistake."""
+"""Checks for EDS format errors (CiA 306) that parsers silently skip, reported with their line numbers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from skinnode.errors import ProfileError, Shown
 _HEADER: Final = re.compile(r"\[(.+)\]")
 _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z]\w*", re.IGNORECASE)
-"""Titles such as 1003Value and 1003ObjectLinks."""
+"""Pattern of section titles such as 1003Value and 1003ObjectLinks."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Titles that are meant for an object."""
+"""Pattern of section titles that are meant for an object."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")
@@ -21,14 +21,14 @@ _LONGEST_SHOWN: Final = 60
 
 
 def check_form(text: str, source: str) -> None:
-    """Check the titles of the sections of objects, and the lists of objects.
+    """Check the titles of object sections, and the object lists.
 
     Args:
         text: text of the file.
-        source: its name, for the error.
+        source: name of the file, shown in the error.
 
     Raises:
-        ProfileError: at the first mistake, with its line.
+        ProfileError: at the first mistake, with its line number.
     """
     for line, section, key, value in _lines(text):
         if not key:
@@ -46,7 +46,7 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Return the error of a parser that could not read ``text``, with the line or section if it is known."""
+    """Return a ProfileError for a parser error on ``text``, with the line or section if it is known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:
@@ -80,7 +80,7 @@ def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = N
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, str, str]]:
-    """Yield the number, section, key and value of each line; key and value are empty for a section header.
+    """Yield number, section, key and value of each line; key and value are empty for a section header.
 
     Skips comments and continuation lines.
     """

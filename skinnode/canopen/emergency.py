@@ -1,7 +1,7 @@
-"""Emergency messages, the error register and the error history in words.
+"""Texts for emergency messages, the error register and the error history.
 
-CiA 301 v4.2, 7.2.7, tables 26 and 48. The meaning of a code beyond that, and of the bytes after it, belongs
-to the manufacturer; it is known for skinnode patches alone.
+The codes follow CiA 301 v4.2, 7.2.7, tables 26 and 48. Any further meaning of a code, and the bytes after it,
+are manufacturer-specific and known only for skinnode patches.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from skinnode.text.words import counted
 
 
 class EmcyCode(IntEnum):
-    """Error codes that a skinnode patch sends."""
+    """Error codes sent by a skinnode patch."""
 
     RESET = 0x0000
     HARDWARE = 0x5000
@@ -26,26 +26,25 @@ class EmcyCode(IntEnum):
     CAN_ID_COLLISION = 0x8150
     SYNC_WINDOW = 0x8200
     """A synchronous TPDO was not ready within the synchronous window (0x1007). Detail: u16 TPDO number. CiA
-    301 has no code for it, so this is the generic code of protocol errors."""
+    301 defines no code for this error, so the generic protocol error code is used."""
     PDO_NOT_PROCESSED = 0x8210
     PDO_LENGTH_EXCEEDED = 0x8220
     SYNC_LENGTH = 0x8240
     RPDO_TIMEOUT = 0x8250
     SOURCE = 0xFF00
-    """The converter gave no reading. Detail: u8 fault (1 it failed, 2 an array of another shape), u16 count.
+    """The converter returned no valid reading. Detail: u8 fault (1 failed, 2 wrong array shape), u16 count.
     """
 
     @property
     def register_bit(self) -> int:
-        """Bit of the error register: 4 is communication, 7 the manufacturer's own."""
+        """Error register mask of the code, with bit 4 (communication) or 7 (manufacturer-specific) set."""
         return 0x10 if self >> 12 == 8 else 0x80
 
 
 TOO_SLOW: Final = 1
-"""Third byte of the detail of 0x8110 if a slow computer or bus sent chunks later than the inhibit time
-requires.
+"""Third detail byte of 0x8110 if a slow computer or bus delayed chunks beyond the inhibit time.
 
-It follows the u16 count of skipped scans. 0: a scan takes longer than the scan period.
+It follows the u16 count of skipped scans. The value 0 means that a scan takes longer than the scan period.
 """
 
 _CODES: Final = {
@@ -70,7 +69,7 @@ _OWN_CODES: Final[dict[int, str]] = {
     EmcyCode.PDO_NOT_PROCESSED: "PDO not processed: too short",
     EmcyCode.SOURCE: "no reading from the converter",
 }
-"""Meaning of the codes when a skinnode patch sends them."""
+"""Meaning of each code when sent by a skinnode patch."""
 _CLASSES: Final = {
     0x10: "generic error",
     0x20: "current",
@@ -119,13 +118,12 @@ _REGISTER: Final = (
 
 
 def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
-    """Return an emergency error code in words.
+    """Return the text for an emergency error code.
 
     Args:
         code: the error code.
         detail: the manufacturer-specific bytes; the first two are also in the error history.
-        ours: whether vendor and product are those of a skinnode patch; if not, the words are those of CiA
-            301.
+        ours: whether vendor and product identify a skinnode patch; if not, the text follows CiA 301.
     """
     own = _OWN_CODES.get(code) if ours else None
     text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
@@ -134,11 +132,11 @@ def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
 
 
 def history_text(entry: int, *, ours: bool) -> str:
-    """Return an entry of 0x1003 in words.
+    """Return the text for an entry of 0x1003.
 
     Args:
-        entry: the code and, above it, two manufacturer-specific bytes.
-        ours: whether vendor and product are those of a skinnode patch; the two bytes are then decoded.
+        entry: error code in the lower 16 bits, two manufacturer-specific bytes in the upper 16 bits.
+        ours: whether vendor and product identify a skinnode patch; the two bytes are then decoded.
     """
     code, more = entry & 0xFFFF, entry >> 16
     text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
@@ -146,9 +144,9 @@ def history_text(entry: int, *, ours: bool) -> str:
 
 
 def says_too_slow(code: int, detail: bytes) -> bool:
-    """Return whether an emergency reports scans that were skipped because of a slow computer or bus.
+    """Return whether an emergency reports scans skipped because of a slow computer or bus.
 
-    That is not a fault of the skin.
+    Such skipped scans are not a fault of the skin.
 
     Args:
         code: the error code.
@@ -158,7 +156,7 @@ def says_too_slow(code: int, detail: bytes) -> bool:
 
 
 def register_text(register: int) -> str:
-    """Return the names of the bits that are set in an error register (0x1001)."""
+    """Return the names of the bits set in an error register (0x1001)."""
     return ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1) or "no error"
 
 
@@ -211,4 +209,4 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Text for the manufacturer-specific bytes of a skinnode patch, at least two of them."""
+"""Functions that return the text for at least two manufacturer-specific bytes of a skinnode patch."""

@@ -1,4 +1,4 @@
-"""Identity, COB-IDs, indices and sub-indices: the one place for each of these numbers.
+"""Identity, COB-IDs, indices and sub-indices, each defined only here.
 
 :mod:`skinnode.canopen.communication` (CiA 301) and :mod:`skinnode.protocol.objects` (the patch) declare the
 objects at these indices.
@@ -10,11 +10,11 @@ from typing import Final
 
 # --- identity (0x1018)
 VENDOR_ID: Final = 0
-"""Vendor-ID. CiA has assigned none to this project, and never assigns 0."""
+"""Vendor-ID. CiA has not assigned a vendor-ID to this project, and never assigns 0."""
 PRODUCT_CODE: Final = 0x534B494E
-"""Product code: 'SKIN'."""
+"""Product code, 'SKIN' in ASCII."""
 REVISION_NUMBER: Final = 0x0001_0001
-"""Revision number: major revision (CANopen behaviour) in the upper half, minor revision in the lower."""
+"""Revision number: major revision (CANopen behaviour) in the upper half, minor revision in the lower half."""
 UNCHECKED_REVISION_NUMBER: Final = 0x0001_0000
 """Revision number of patches whose scan summaries carry no check."""
 DEVICE_NAME: Final = "skinnode patch"
@@ -37,7 +37,7 @@ LSS_REQUEST_COB_ID: Final = 0x7E5
 
 
 def emcy_cob_id(node_id: int) -> int:
-    """Return the COB-ID of the emergency messages of a node."""
+    """Return the COB-ID of a node's emergency messages."""
     return 0x080 + node_id
 
 
@@ -67,12 +67,12 @@ def summary_cob_id(node_id: int) -> int:
 
 
 def sdo_response_cob_id(node_id: int) -> int:
-    """Return the COB-ID from the SDO server of a node to its client."""
+    """Return the COB-ID from a node's SDO server to its client."""
     return 0x580 + node_id
 
 
 def sdo_request_cob_id(node_id: int) -> int:
-    """Return the COB-ID from a client to the SDO server of a node."""
+    """Return the COB-ID from a client to a node's SDO server."""
     return 0x600 + node_id
 
 
@@ -82,14 +82,14 @@ def heartbeat_cob_id(node_id: int) -> int:
 
 
 def predefined_cob_ids(node_id: int) -> frozenset[int]:
-    """Return the COB-IDs that the pre-defined connection set gives to a node."""
+    """Return the COB-IDs that the pre-defined connection set assigns to a node."""
     pdos = {cob_id(number, node_id) for cob_id in (tpdo_cob_id, rpdo_cob_id) for number in range(4)}
     services = {emcy_cob_id(node_id), sdo_response_cob_id(node_id), sdo_request_cob_id(node_id)}
     return frozenset(pdos | services | {heartbeat_cob_id(node_id)})
 
 
 BIT_RATES_BPS: Final = (125_000, 250_000, 500_000, 1_000_000)
-"""Bit rates of a patch, bit/s."""
+"""Bit rates that a patch supports, bit/s."""
 
 # --- communication objects (CiA 301)
 DEVICE_TYPE: Final = 0x1000
@@ -124,20 +124,19 @@ TPDO1_PARAMETER: Final = 0x1800
 TPDO2_PARAMETER: Final = 0x1801
 TPDO1_MAPPING: Final = 0x1A00
 TPDO2_MAPPING: Final = 0x1A01
-"""Indices of the first PDOs; those of the n-th PDO, counted from 0, are n higher."""
+"""Indices of the first PDOs; for the n-th PDO, counted from 0, add n."""
 MAX_PDOS: Final = 512
-"""Maximum number of RPDOs, and of TPDOs: 0x1400 to 0x15FF and so on."""
+"""Maximum number of RPDOs, and of TPDOs, since each range such as 0x1400 to 0x15FF has this many indices."""
 PDO_MAPPING_OFFSET: Final = 0x200
-"""From the index of a PDO's communication parameter to that of its mapping."""
+"""Offset from the index of a PDO's communication parameter to the index of its mapping."""
 PDO_INVALID: Final = 1 << 31
 """Bit of a COB-ID that switches its PDO off."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication parameter."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Data types that an RPDO can map at sub-index 0 for bytes that this node ignores, with their lengths in
-bits.
+"""Lengths in bits of the data types that an RPDO can map at sub-index 0 for bytes that this node ignores.
 
-BOOLEAN is missing because PDOs consist of bytes.
+BOOLEAN is missing because PDOs consist of whole bytes.
 """
 ERROR_FIELD_LENGTH: Final = 8
 HEARTBEAT_CONSUMERS: Final = 8
@@ -147,21 +146,20 @@ DESCRIPTOR: Final = 0x2000
 ROWS, COLUMNS, UPPER_ELECTRODES, LOWER_ELECTRODES, CODE_BITS = 1, 2, 3, 4, 5
 CODE_LO, CODE_HI, RESISTIVITY, LAYOUT_ID, LAYOUT_HASH, SERIAL = 6, 7, 8, 9, 10, 11
 PDO_BYTES: Final = 12
-"""Sub-index of the length of a PDO: 8 bytes, or 64 over CAN FD."""
+"""Sub-index of the maximum PDO length, which is 8 bytes, or 64 over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""Sub-indices before the codes; over CAN FD the index is that of the upper wire, and the first column
-follows."""
+"""Sub-indices before the codes; over CAN FD the index is the upper wire's, and the first column follows."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
-"""Sub-indices that TPDO2 carries since revision 1.1 in place of the device time in µs."""
+"""Sub-indices that TPDO2 carries since revision 1.1 instead of the device time in µs."""
 SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
 COMMANDS: Final = frozenset({(ACQUISITION, SELF_TEST), (ACQUISITION, TARE), (ACQUISITION, SINGLE_SCAN)})
-"""Objects that a client writes as commands: not parameters, so neither stored nor verified."""
+"""Objects that a client writes as commands; not being parameters, they are neither saved nor verified."""
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 SELF_TEST_RESULT: Final = 0x2023
@@ -169,17 +167,17 @@ TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
 TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
-"""Masks of 32 wires from wire 32 i on: sub-index 2i+1 open, 2i+2 shorted."""
+"""Masks of the 32 wires that start at wire 32 i: sub-index 2i+1 open, 2i+2 shorted."""
 REJECTED_FRAMES: Final = 0x2040
 """Counters; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Plus r: the last codes of upper wire r, one sub-index for each column."""
+"""Index, plus r, of the last codes of upper wire r, with one sub-index per column."""
 BASELINE: Final = 0x2200
-"""Plus r: R0 of upper wire r, ohm, one sub-index for each column; 0 where there is none yet."""
+"""Index, plus r, of R0 of upper wire r, ohm, with one sub-index per column; 0 where R0 is unknown."""
 COORDINATES: Final = 0x2300
 """DOMAIN; see :func:`skinnode.protocol.coordinates.pack_coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301
-"""DOMAIN: R0 of all crossings, U·K REAL32, ohm, upper wire by upper wire; written as a whole."""
+"""DOMAIN: R0 of all crossings, U·K REAL32, ohm, one upper wire after another; written as a whole."""
 
 TARE_SIGNATURE: Final = int.from_bytes(b"tare", "little")
 SELF_TEST_SIGNATURE: Final = int.from_bytes(b"test", "little")

@@ -1,4 +1,4 @@
-"""Layer setting services (CiA 305 v3.0): constants that master and slave share."""
+"""Layer setting services (CiA 305 v3.0): constants shared by master and slave."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Node-ID of a node without a node-ID."""
+"""Node-ID value meaning that a node has no node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -18,20 +18,20 @@ BIT_RATES_BPS: Final = {
     7: 20_000,
     8: 10_000,
 }
-"""Bit rates, bit/s, of table 0 of the bit timing service; 5 is reserved, 9 means automatic detection."""
+"""Bit rates in table 0 of the bit timing service, bit/s; 5 is reserved, 9 means automatic detection."""
 
 LSS_DONE: Final = 0
 """Error code of a successful configuration service."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
-"""Error code of a configuration service whose next byte is an error code of the manufacturer."""
+"""Error code of a configuration service whose next byte is a manufacturer-specific error code."""
 
 RESET_SCAN: Final = 0x80
 """Fastscan bit-check value that makes every node without a node-ID answer and restart at the vendor-ID."""
 
 
 class LssCommand(IntEnum):
-    """Command specifiers. An answer without its own specifier repeats that of its request."""
+    """Command specifiers. A response without its own specifier repeats the request's specifier."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11
@@ -60,7 +60,7 @@ class LssState(IntEnum):
 
 
 class LssAddress(NamedTuple):
-    """The identity object (0x1018) in its order: unique to a device worldwide."""
+    """LSS address, the fields of the identity object (0x1018) in order; unique worldwide to a device."""
 
     vendor_id: int
     product_code: int

@@ -1,4 +1,4 @@
-"""Network management: states and commands of CiA 301 v4.2, 7.3.2, and what a node may do in each state.
+"""Network management (CiA 301 v4.2, 7.3.2): states, commands, and the services available in each state.
 
 ================  ===================  ===========================================================
 state             entered by           served
@@ -9,9 +9,9 @@ OPERATIONAL       command 1            the same, and PDO
 STOPPED           command 2            NMT, error control
 ================  ===================  ===========================================================
 
-A node obeys every command in every state but INITIALISING, in which it receives none. *Reset node* (129)
-gives all objects their defaults, *reset communication* (130) the objects from 0x1000 to 0x1FFF; the node
-boots after both.
+A node obeys every command in every state except INITIALISING, in which it receives no commands. *Reset node*
+(129) resets all objects to their defaults, and *reset communication* (130) the objects from 0x1000 to 0x1FFF.
+The node boots after both.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from typing import Final
 from skinnode.text.words import counted
 
 ALL_NODES: Final = 0
-"""Node-ID of an NMT command to every node of a bus."""
+"""Node-ID in an NMT command that addresses every node on a bus."""
 
 STATE_MASK: Final = 0x7F
 """Bits of a heartbeat or guarding response that hold the state."""
 
 GUARD_TOGGLE: Final = 0x80
-"""Bit of a guarding response that changes with each response."""
+"""Bit of a guarding response that toggles with each response."""
 
 
 class NmtState(IntEnum):
-    """States; a heartbeat carries the value. A node without power is INITIALISING too: it is silent."""
+    """NMT states, with the values sent in heartbeats. A node without power also counts as INITIALISING."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -72,7 +72,7 @@ AFTER_COMMAND: Final = {
 
 
 def state_name(state: int) -> str:
-    """Return the name of a state for display, ``state N`` for a number that CiA 301 does not define.
+    """Return the name of a state for display, or ``state N`` for a number that CiA 301 does not define.
 
     Args:
         state: the state byte of a heartbeat, without the toggle bit.
@@ -81,7 +81,7 @@ def state_name(state: int) -> str:
 
 
 def encode(command: NmtCommand, node_id: int) -> bytes:
-    """Return the data of an NMT frame, which travels on COB-ID 0.
+    """Return the data of an NMT frame, which is sent on COB-ID 0.
 
     Args:
         command: the command specifier.
@@ -91,7 +91,7 @@ def encode(command: NmtCommand, node_id: int) -> bytes:
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:
-    """Return the command in a frame on COB-ID 0, None if it is for another node.
+    """Return the command in a frame on COB-ID 0; None if it is for another node.
 
     Args:
         data: the payload.

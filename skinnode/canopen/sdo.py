@@ -1,4 +1,4 @@
-"""Service data objects on the wire (CiA 301 v4.2, 7.2.4.3): what client and server both must know."""
+"""Service data objects on the wire (CiA 301 v4.2, 7.2.4.3): definitions shared by client and server."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ SEGMENT_BYTES: Final = 7
 """Data bytes of a segment."""
 
 MAX_BLOCK_SEGMENTS: Final = 127
-"""Segments of the longest block."""
+"""Maximum number of segments in a block."""
 
 ABORT: Final = 0x80
-"""First byte of an abort, from either side."""
+"""First byte of an abort from either side."""
 
 UPLOAD: Final = 0x40
 """First byte of a request to read an object."""

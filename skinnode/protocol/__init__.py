@@ -1,5 +1,5 @@
-"""What a patch sends: its object dictionary and the content of its PDOs. Pure code, no bus, no clock.
+"""Object dictionary and PDO contents of a patch, as pure code without a bus or clock.
 
-Node:  resistances → ``codec`` → PDO payloads, mapped as ``profile`` says.
+Node:  resistances → ``codec`` → PDO payloads, mapped as ``profile`` defines.
 Host:  PDO payloads → ``codec`` → ``assembler`` → one complete scan.
 """

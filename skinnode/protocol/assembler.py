@@ -1,36 +1,36 @@
-"""Chunks and summaries of one patch, as received from the bus, to scans. Plain code with one owner, no clock.
+"""Assembler of one patch's received chunks and summaries into scans; not thread-safe, and without a clock.
 
 **A scan never mixes two scans.** A scan holds only frames with its own counter that arrived within the
-*timeout* of its first frame, and it is closed for good when a frame of a newer scan arrives. So frames of two
-scans can share a scan only if they carry the same counter and arrive within the timeout of each other. That
-cannot happen while counter range × period is longer than the timeout plus the age of the oldest frame,
-counted from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter range is
-shorter), so with the usual range of 240 scans a frame may be 237 periods old.
+*timeout* of its first frame, and it is closed for good when a frame of a newer scan arrives. Frames of two
+scans can therefore share a scan only if they carry the same counter and arrive within the timeout of each
+other. That cannot happen while counter range × period is longer than the timeout plus the age of the oldest
+frame, measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter
+range is shorter), so with the usual range of 240 scans a frame may be 237 periods old.
 
-**Two scans under one counter**, from a node that did not count on or from two nodes with one node-ID, show as
-a frame that comes twice with different content. The other frames cannot be assigned then, so the whole scan
-is discarded. The same holds for a scan with missing frames whose chunks lie more than two periods apart: it
-began with a chunk that had the counter of a later scan, and that scan's own chunk comes after the timeout.
-Only the check distinguishes two halves without overlapping frames from one scan.
+**Two scans with the same counter**, from a node that did not increment it or from two nodes with the same
+node-ID, show up as a frame received twice with different content. The other frames then cannot be assigned to
+either scan, so the whole scan is discarded. The same applies to a scan with missing frames whose chunks are
+more than two periods apart: it began with a chunk that had the counter of a later scan, and that scan's own
+chunk arrives after the timeout. Two halves without overlapping frames can be told from one scan only by the
+check.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
-codes that the receiver must hold (:mod:`skinnode.protocol.scan_check`). If it fails, the wrong chunk cannot
-be
-identified: the whole scan is discarded, with the codes held for chunks that were not sent. A stream is
-*checked* from the first check that passes, or if its owner knows that the node sends checks
-(:meth:`ScanAssembler.reset`). In a checked stream no scan is complete without its check: a scan whose summary
+codes that the receiver must hold (:mod:`skinnode.protocol.scan_check`). If the check fails, the wrong chunk
+cannot be identified, so the whole scan is discarded, together with the codes held for chunks that were not
+sent. A stream is *checked* from the first check that passes, or if its owner knows that the node sends checks
+(:meth:`ScanAssembler.reset`). In a checked stream no scan is complete without its check. A scan whose summary
 was lost, or that lacks codes of chunks that were not sent again, is published as *unchecked*, and a summary
 without a check is rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks
 have been received.
 
-**Order of counters.** A counter up to half the counter range ahead is newer; any other is late, and its frame
-is dropped. After a timeout without an accepted frame any counter starts a new stream: a node or the SYNC
-producer was restarted.
+**Order of counters.** A counter up to half the counter range ahead is newer; any other counter is late, and
+its frame is dropped. After a timeout without an accepted frame any counter starts a new stream, because a
+node or the SYNC producer was restarted.
 
-**Chunks that were not sent.** If the summary says that only changed chunks were sent, the others keep their
-last codes (:mod:`skinnode.protocol.partial_scan`). They do not if a scan in between was lost, torn or
-overrun, or if a silence was long enough to hide one: such a scan may have changed them, so they are invalid
-until they are sent again.
+**Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the others keep
+their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan in between was lost, torn or overrun, or a
+silence was long enough to hide such a scan, these codes may have changed and are invalid until their chunks
+are sent again.
 """
 
 from __future__ import annotations
@@ -52,29 +52,29 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Fills the chunk numbers that a patch does not have, so that the hot path needs no bounds check."""
+"""Filler for chunk numbers that a patch does not have, so that the hot path needs no bounds check."""
 _NONE_OPEN: Final = -1  # no scan counter is negative
 _NEVER: Final = -1
-# Testing a flag in a flag takes as long as a whole chunk; testing an int in an int, a tenth of that.
+# Testing an enum flag takes as long as processing a whole chunk; testing an int takes a tenth of that.
 _CHANGED_ONLY, _OVERRUN = int(SummaryFlag.CHANGED_ONLY), int(SummaryFlag.OVERRUN)
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 class ScanAssembler:
-    """Assembles the frames of one patch to scans. Every method returns at most one scan, in ascending order.
+    """Assembler of one patch's scans. Every method returns at most one scan, in ascending order.
 
-    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`: it returns a scan whose
-    missing frames have timed out, or one that ended in the same call as the previous scan.
+    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. It returns a scan whose
+    missing frames have timed out, or a scan that ended in the same call as the previous scan.
 
     Args:
         profile: sizes of the patch.
-        counter_overflow: as in 0x1019: scan counters run from 1 to this number, with the SYNC; 0 if they run
-            freely from 0 to 255.
+        counter_overflow: value of 0x1019; scan counters run from 1 to this number with the SYNC, or freely
+            from 0 to 255 if it is 0.
         period_ns: time between two scans, ns; sets the timeout.
-        grace_ns: how long to wait for late frames once the summary, or all chunks, have arrived, ns.
-        node_id: named in the errors given to ``on_reject``.
+        grace_ns: how long to wait for late frames after the summary or all chunks have arrived, ns.
+        node_id: node-ID shown in the errors passed to ``on_reject``.
         on_reject: called with a CodecError for each frame of the wrong length or form.
-        under_way: the node may be sending already; see :meth:`reset`.
+        under_way: whether the node may already be sending; see :meth:`reset`.
 
     Raises:
         ConfigError: if the counter overflow is not 0 or 2 to 240, or a time is not positive.
@@ -108,7 +108,7 @@ class ScanAssembler:
         self._node_id = node_id
         self._on_reject = on_reject
         self.on_discarded: Callable[[], None] | None = None
-        """Called when a scan is discarded that may have been the first of a new baseline."""
+        """Callback for a discarded scan that may have been the first scan of a new baseline."""
 
         # the open scan, or the last scan while none is open
         self._counter = _NONE_OPEN
@@ -139,14 +139,14 @@ class ScanAssembler:
     # --- frames in
 
     def on_chunk(self, data: bytes, t_ns: int) -> Scan | None:
-        """Take a chunk.
+        """Process a chunk.
 
         Args:
             data: payload of TPDO1; kept, not copied.
             t_ns: when it was received, ns.
 
         Returns:
-            The scan that the chunk ended, if any.
+            The scan ended by the chunk; None if it ended no scan.
         """
         if len(data) != self._chunk_bytes:
             self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
@@ -165,14 +165,14 @@ class ScanAssembler:
         return None
 
     def on_summary(self, data: bytes, t_ns: int) -> Scan | None:
-        """Take a summary.
+        """Process a summary.
 
         Args:
             data: payload of TPDO2.
             t_ns: when it was received, ns.
 
         Returns:
-            The scan that the summary ended, if any.
+            The scan ended by the summary; None if it ended no scan.
         """
         if len(data) != PDO_BYTES:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
@@ -206,13 +206,13 @@ class ScanAssembler:
         """Return the open scan if its missing frames have timed out.
 
         Args:
-            t_ns: present time, ns.
+            t_ns: current time, ns.
         """
         deadline = self.next_deadline_ns()
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`poll` returns a scan unless a frame comes before, ns; None with no open scan."""
+        """Return when :meth:`poll` will return a scan if no frame arrives, ns; None with no open scan."""
         if self._counter == _NONE_OPEN:
             return None
         if self._received >= self._sent != _NEVER:
@@ -222,13 +222,13 @@ class ScanAssembler:
         return self._expires_ns
 
     def reset(self, *, under_way: bool = False, checked: bool = False) -> None:
-        """Forget the open scan, the last codes and the counter, as after a boot-up. The statistics stay.
+        """Discard the open scan, the last codes and the counter, as after a boot-up; keep the statistics.
 
         Args:
-            under_way: the node may be sending already, so chunks missing at the start of the first scan count
-                as not received instead of lost.
-            checked: the node sends a check with every summary; otherwise the first check that passes shows
-                it.
+            under_way: whether the node may already be sending; chunks missing at the start of the first scan
+                then count as not received instead of lost.
+            checked: whether the node is known to send a check with every summary; if not, the first check
+                that passes shows this.
         """
         if self._counter != _NONE_OPEN:
             self._discarded += 1
@@ -307,9 +307,9 @@ class ScanAssembler:
             self._on_reject(CodecError(cob_id, data, allowed))
 
     def _is_news(self, counter: int, t_ns: int, *, known: bool) -> bool:
-        """Return whether a frame outside the open scan begins a new scan; if not, count it.
+        """Return whether a frame outside the open scan begins a new scan; if not, count the frame.
 
-        ``known``: the last scan has this very frame already.
+        ``known``: whether the last scan already contains an identical frame.
         """
         if not self._lowest <= counter < self._lowest + self._range:
             self._bad_counter += 1
@@ -423,9 +423,9 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard a scan and let no later scan inherit codes.
+        """Discard a scan, and keep later scans from inheriting its codes.
 
-        ``doubt``: the scan may have been the first of a new baseline.
+        ``doubt``: whether the scan may have been the first scan of a new baseline.
         """
         self._held.forget()
         if doubt and self.on_discarded is not None:

@@ -1,4 +1,4 @@
-"""Chunks: the parts in which TPDO1 carries the codes of a scan."""
+"""Chunks, the parts in which TPDO1 carries the codes of a scan."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _COB_ID: Final = od.chunk_cob_id(0)
 
 
 class Chunk(NamedTuple):
-    """A chunk of a scan as it is sent."""
+    """Chunk of a scan as sent."""
 
     chunk: int
     """Chunk index: its first code is the ``chunk · codes_per_chunk``-th of the scan."""
@@ -36,7 +36,7 @@ def pack_chunk(chunk: int, scan: int, codes: Sequence[int], bits: int = 16) -> b
     Args:
         chunk: chunk index, 0 to 255.
         scan: scan counter, 0 to 255.
-        codes: up to 3 codes of 16 bits or 2 of 24; the rest of the payload is 0.
+        codes: up to 3 codes of 16 bits or 2 codes of 24 bits; the rest of the payload is 0.
         bits: width of a code, 16 or 24.
 
     Raises:
@@ -60,7 +60,7 @@ def unpack_chunk(data: bytes, bits: int = 16, *, cob_id: int = _COB_ID) -> Chunk
     Args:
         data: the payload.
         bits: width of a code, 16 or 24.
-        cob_id: named in the error.
+        cob_id: COB-ID shown in the error.
 
     Raises:
         CodecError: if the payload is not 8 bytes long.
@@ -80,7 +80,7 @@ def pack_scan(codes: ArrayLike, scan: int, profile: PatchProfile) -> list[bytes]
         profile: sizes of the patch.
 
     Raises:
-        ValueError: if the codes have another shape, or one is wider than the profile's.
+        ValueError: if the codes have the wrong shape, or a code is wider than the profile allows.
     """
     array = np.asarray(codes, dtype=np.uint32)
     if array.shape != (profile.rows, profile.columns):
@@ -121,7 +121,7 @@ def unpack_scan(frames: bytes, profile: PatchProfile) -> Codes:
 
 
 def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes, int]:
-    """Unpack like :func:`unpack_scan`.
+    """Unpack the codes as :func:`unpack_scan` does, and compute their CRC.
 
     Args:
         frames: payloads of all chunks in ascending order, concatenated.
@@ -143,8 +143,8 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
 def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
     """Return the position of each code in the payloads of a scan.
 
-    (U, K) words of 16 bits, or (U, K, 4) bytes of 24-bit codes, of which the last is a zero after the
-    payloads.
+    The shape is (U, K) for codes as 16-bit words, or (U, K, 4) for 24-bit codes as bytes, the fourth of which
+    is a zero after the payloads.
     """
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
     lines, shape = profile.lines, (profile.rows, profile.columns)
@@ -158,7 +158,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return (U, K) the number of the chunk that carries each code, counted from 0 in the order sent."""
+    """Return the (U, K) numbers of the chunks that carry each code, counted from 0 in the order sent."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -170,8 +170,8 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
     """Return a function from the payload of a chunk to its number, counted as in :func:`chunk_of_code`.
 
-    Numbers from ``n_chunks`` on belong to chunks that the patch does not have. The function does not check
-    the length of the payload.
+    Numbers of ``n_chunks`` and above belong to chunks that the patch does not have. The function does not
+    check the length of the payload.
     """
     if profile.bus == "classic":
         return operator.itemgetter(0)

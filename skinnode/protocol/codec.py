@@ -1,8 +1,8 @@
-"""The wire format of a patch under one name.
+"""Wire format of a patch, collected in one module.
 
-``codes`` turns resistances into codes, ``chunk`` and ``summary`` pack them into PDOs, ``scan_check`` and
-``device_time`` compute two fields of the summary, ``command`` is what the host sends, and ``self_test`` is
-the record 0x2023. All are pure functions: no bus, no clock.
+``codes`` converts resistances to codes, ``chunk`` and ``summary`` pack these into PDOs, ``scan_check`` and
+``device_time`` compute two fields of the summary, ``command`` packs the host's commands, and ``self_test``
+the record 0x2023. All functions are pure, without a bus or clock.
 """
 
 from skinnode.protocol.chunk import (

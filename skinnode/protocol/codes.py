@@ -1,7 +1,7 @@
-"""Resistances to codes and back: what a measurement becomes on the wire.
+"""Conversion of resistances to the codes sent on the wire, and back.
 
-code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements; the three above them
-are reserved, in ascending order: over-range, short, open.
+code = round((R/R0 − lo) / (hi − lo) · (2ⁿ − 4)). The codes 0 … 2ⁿ − 4 are measurements. The three codes above
+them are reserved; in ascending order they are over-range, short and open.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from skinnode.protocol.objects import DEFAULT_CODE_HI, DEFAULT_CODE_LO
 Codes = NDArray[np.uint32]
 
 MISSING: Final = 0xFFFF_FFFF
-"""Marks a code that was not received. It is wider than any code, so it is never sent and never decoded."""
+"""Marker for a code that was not received; it is wider than any code, so it is never sent or decoded."""
 
 CODE_BITS: Final = (16, 24)
-"""Widths of a code."""
+"""Allowed code widths, bits."""
 
 
 @dataclass(frozen=True)
 class CodeScale:
-    """The mapping of R/R0 to codes. Rounds ``lo`` and ``hi`` to REAL32, as the object dictionary keeps them.
+    """Mapping of R/R0 to codes. ``lo`` and ``hi`` are rounded to REAL32, as in the object dictionary.
 
     Raises:
         ConfigError: if the width is not 16 or 24 bits, or the range is not 0 ≤ lo < hi < ∞.
     """
 
     bits: int = 16
-    """Width of a code."""
+    """Width of a code, bits."""
     lo: float = DEFAULT_CODE_LO
     """R/R0 at code 0."""
     hi: float = DEFAULT_CODE_HI
-    """R/R0 at the highest measurement."""
+    """R/R0 at the highest measurement code."""
 
     def __post_init__(self) -> None:
         if self.bits not in CODE_BITS:
@@ -53,22 +53,22 @@ class CodeScale:
 
     @functools.cached_property
     def steps(self) -> int:
-        """Highest code of a measurement, at ``hi``."""
+        """Highest measurement code, at ``hi``."""
         return (1 << self.bits) - 4
 
     @property
     def over_range(self) -> int:
-        """Reserved code: R/R0 is outside lo … hi, or there is no baseline yet."""
+        """Reserved code for R/R0 outside lo … hi, or for a crossing without a baseline."""
         return self.steps + 1
 
     @property
     def short(self) -> int:
-        """Reserved code: no resistance between the wires."""
+        """Reserved code for zero resistance between the wires."""
         return self.steps + 2
 
     @property
     def open(self) -> int:
-        """Reserved code: no connection between the wires."""
+        """Reserved code for no connection between the wires."""
         return self.steps + 3
 
     @functools.cached_property
@@ -78,12 +78,12 @@ class CodeScale:
 
     @property
     def relative_std(self) -> float:
-        """RMS rounding error relative to R0: step / √12, that of a uniform error of one step."""
+        """RMS rounding error relative to R0: step / √12, as for an error uniform over one step."""
         return self.step / math.sqrt(12.0)
 
 
 def as_baseline(baseline_ohm: ArrayLike) -> Float:
-    """Round R0 to REAL32, the precision in which node and host know it.
+    """Round R0 to REAL32, the precision that node and host use.
 
     Args:
         baseline_ohm: any shape, ohm.
@@ -97,17 +97,17 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
 def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
     """Encode resistances.
 
-    +inf and NaN become open, zero and below short. R/R0 outside lo … hi becomes over-range, and so does a
-    measurement without a baseline (R0 not positive and finite). A value within half a step of the range is in
-    the range.
+    +inf and NaN become open; zero and negative values become short. R/R0 outside lo … hi becomes over-range,
+    as does a measurement without a baseline (R0 not positive and finite). A value within half a step of the
+    range counts as inside it.
 
     Args:
         resistance_ohm: any shape, ohm.
-        baseline_ohm: R0 in ohm, of the same shape or broadcast to it.
+        baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
         scale: the mapping of R/R0 to codes.
 
     Returns:
-        Codes of the shape of ``resistance_ohm``.
+        Codes with the same shape as ``resistance_ohm``.
     """
     resistance = np.asarray(resistance_ohm, dtype=np.float64)
     baseline = as_baseline(baseline_ohm)
@@ -116,7 +116,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
         measured = (code >= 0) & (code <= scale.steps) & (baseline > 0) & (baseline < np.inf)
         codes = np.where(measured, code, scale.over_range)
         codes = np.where(resistance <= 0, scale.short, codes)
-        codes = np.where(resistance < np.inf, codes, scale.open)  # NaN is not below inf either
+        codes = np.where(resistance < np.inf, codes, scale.open)  # NaN also fails this comparison
     return codes.astype(np.uint32)
 
 
@@ -125,21 +125,21 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
 
     Args:
         codes: any shape.
-        baseline_ohm: R0 in ohm, of the same shape or broadcast to it.
+        baseline_ohm: R0 in ohm, with the same shape or broadcastable to it.
         scale: the mapping of R/R0 to codes.
 
     Returns:
-        Resistances in ohm, and a mask of the measurements among them, both of the shape of ``codes``. A
-        reserved code, :data:`MISSING` or a baseline that is not positive and finite gives NaN and False.
+        Resistances in ohm and a mask of the measurements, both with the same shape as ``codes``. A reserved
+        code, :data:`MISSING` or a baseline that is not positive and finite gives NaN and False.
     """
     return Decoder(baseline_ohm, scale).decode(codes)
 
 
 class Decoder:
-    """:func:`decode` for many scans with the same baseline.
+    """Decoder that works like :func:`decode`, for many scans with the same baseline.
 
     Args:
-        baseline_ohm: R0 in ohm, of the shape of the codes or broadcast to it.
+        baseline_ohm: R0 in ohm, with the shape of the codes or broadcastable to it.
         scale: the mapping of R/R0 to codes.
     """
 
@@ -149,7 +149,7 @@ class Decoder:
         self._known: NDArray[np.bool_] | None = None if known.all() else known
 
     def decode(self, codes: ArrayLike) -> tuple[Float, NDArray[np.bool_]]:
-        """Decode as :func:`decode` does.
+        """Decode codes as :func:`decode` does.
 
         Args:
             codes: any shape.

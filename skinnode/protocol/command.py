@@ -1,4 +1,4 @@
-"""Commands of the host: RPDO1."""
+"""Host commands, sent in RPDO1."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ _COB_ID: Final = od.command_cob_id(0)
 
 
 class SendMode(enum.IntEnum):
-    """Which chunks of a scan are sent, 0x2020:1."""
+    """Selection of the chunks that a scan sends, 0x2020:1."""
 
     FULL = 0
     CHANGED = 1
 
 
 class Command(NamedTuple):
-    """A command as it is sent."""
+    """Command as sent."""
 
     tare: int
-    """:data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number does nothing."""
+    """:data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number has no effect."""
     single_scan: int
     """1 to take one scan now."""
     send_mode: int
-    """A number of :class:`SendMode`."""
+    """Value of :class:`SendMode`."""
 
 
 _COMMAND: Final = struct.Struct("<IBB")
@@ -39,19 +39,19 @@ def pack_command(
     """Pack the payload of RPDO1.
 
     Args:
-        tare: make the present resistances the baseline.
-        single_scan: take one scan now.
-        send_mode: always carried, and kept by the node until the next command.
+        tare: whether to make the current resistances the baseline.
+        single_scan: whether to take one scan now.
+        send_mode: send mode, which every command carries and the node keeps until the next command.
     """
     return _COMMAND.pack(od.TARE_SIGNATURE if tare else 0, single_scan, send_mode)
 
 
 def unpack_command(data: bytes, *, cob_id: int = _COB_ID) -> Command:
-    """Unpack the payload of RPDO1. Bytes beyond the six that are mapped are ignored (CiA 301).
+    """Unpack the payload of RPDO1. Bytes beyond the six mapped bytes are ignored (CiA 301).
 
     Args:
         data: the payload.
-        cob_id: named in the error.
+        cob_id: COB-ID shown in the error.
 
     Raises:
         CodecError: if the payload is shorter than six bytes.

@@ -1,7 +1,8 @@
-"""Object 0x2300: where the electrodes are, as bytes.
+"""Object 0x2300, which holds the electrode coordinates as bytes.
 
-Signed 32-bit nanometres, little-endian, x y z of every upper electrode wire by wire, then of every lower one.
-Nanometres because the layout hash is taken over nanometres: what arrives has the hash of what was sent.
+Coordinates are signed 32-bit nanometres, little-endian: x y z of every upper electrode, wire by wire, then of
+every lower electrode. The layout hash is also computed over nanometres, so the received layout has the same
+hash as the layout sent.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 _NANOMETRE_M = 1e-9
-_BYTES = 12  # of an electrode
+_BYTES = 12  # per electrode
 
 
 def pack_coordinates(layout: PatchLayout) -> bytes:
-    """The bytes of 0x2300. Raises ConfigError for an electrode more than 2.1 m from the origin."""
+    """Return the bytes of 0x2300. Raises ConfigError if a coordinate exceeds 2.1 m."""
     nanometres = np.rint(np.concatenate([a.ravel() for a in (layout.upper_m, layout.lower_m)]) / _NANOMETRE_M)
     farthest = float(np.abs(nanometres).max())
     if farthest >= 2**31:
@@ -29,9 +30,9 @@ def pack_coordinates(layout: PatchLayout) -> bytes:
 def unpack_coordinates(
     data: bytes, profile: PatchProfile, resistivity_ohm_per_m: float, name: str = "custom"
 ) -> PatchLayout:
-    """The layout in the bytes of 0x2300 of a patch with these sizes.
+    """Return the layout in the bytes of 0x2300, for a patch with the sizes in ``profile``.
 
-    Raises ConfigError for another number of bytes, ValueError for coordinates that are no layout.
+    Raises ConfigError if the number of bytes is wrong, ValueError if the coordinates do not form a layout.
     """
     upper, lower = profile.rows * profile.upper_electrodes, profile.columns * profile.lower_electrodes
     if len(data) != (upper + lower) * _BYTES:

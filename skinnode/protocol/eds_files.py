@@ -12,18 +12,18 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def eds_name(profile: PatchProfile) -> str:
-    """Return the file name of the reference EDS of this wire format."""
+    """Return the file name of the reference EDS for this wire format."""
     variant = "-fd" if profile.bus == "fd" else ""
     return f"skinnode-{profile.rows}x{profile.columns}-u{profile.code_bits}{variant}.eds"
 
 
 def eds_text(profile: PatchProfile) -> str:
-    """Return the electronic data sheet (CiA 306) of a patch. The same profile gives the same bytes."""
+    """Return the electronic data sheet (CiA 306) of a patch. The same profile always gives the same bytes."""
     return render_eds(_device_info(profile, eds_name(profile)), profile.objects())
 
 
 def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
-    """Return the device configuration file (CiA 306) of a patch. The same arguments give the same bytes.
+    """Return the device configuration file (CiA 306) of a patch; equal arguments give equal bytes.
 
     Args:
         profile: sizes of the patch.
@@ -31,7 +31,7 @@ def dcf_text(profile: PatchProfile, node_id: int, bitrate_bps: int) -> str:
         bitrate_bps: bit rate of the bus, bit/s.
 
     Raises:
-        ConfigError: if the node-ID is not 1 to 127, or a patch does not have the bit rate.
+        ConfigError: if the node-ID is not 1 to 127, or a patch does not support the bit rate.
     """
     if not 1 <= node_id <= od.MAX_NODE_ID:
         raise ConfigError("node_id", node_id, "1 to 127")
@@ -65,7 +65,7 @@ REFERENCE_PROFILES: Final = (
     PatchProfile(10, 30, 10, 10, 16, bus="fd"),
     PatchProfile(10, 30, 10, 10, 24, bus="fd"),
 )
-"""One profile for each wire format; their EDS files are kept in ``eds/``."""
+"""One profile per wire format; their EDS files are in ``eds/``."""
 
 
 def write_reference_files(folder: Path) -> None:

@@ -1,7 +1,7 @@
-"""The object dictionary of a patch.
+"""Object dictionary of a patch.
 
-Declares its manufacturer objects (0x2000 to 0x2301) and the default mapping of its PDOs. A value that a patch
-measures, counts or sends has no default: it is not a setting.
+Declares the manufacturer objects (0x2000 to 0x2301) and the default PDO mappings. A value that a patch
+measures, counts or sends is not a setting and has no default.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _U8, _U16, _U32, _REAL32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNS
 DEFAULT_CODE_LO: Final = 0.25
 """R/R0 at code 0."""
 DEFAULT_CODE_HI: Final = 1.25
-"""R/R0 at the highest code: a press brings electrodes closer and R down, a slide moves some of them apart."""
+"""R/R0 at the highest code; a press brings electrodes closer and lowers R, a slide moves some apart."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Scans from one full scan to the next: codes that a lost scan left unknown are known again within 0.8 s, for
-a tenth of the full traffic."""
+"""Number of scans per full scan; codes lost with a scan are known again within 0.8 s, for a tenth of the full
+traffic."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:
-    """Return the whole object dictionary of a patch, by ascending index.
+    """Return the whole object dictionary of a patch in ascending order of index.
 
     Args:
         profile: sizes of the patch.

@@ -1,4 +1,4 @@
-"""Scans that carry only some chunks: the codes held for the others, and the decoding of both together."""
+"""Partial scans: codes held for chunks that were not sent, and decoding of sent and held chunks together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class HeldChunks:
-    """The payloads known of every chunk of a patch after its last scan.
+    """Known payloads of all chunks of a patch after its last scan.
 
     Args:
         profile: sizes of the patch.
@@ -26,15 +26,15 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all payloads: a scan may have changed them unseen."""
+        """Discard all payloads, because a scan that was not received may have changed them."""
         self._payloads = [None] * self._profile.n_chunks
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
-        """Take the payloads of the scan that ends.
+        """Store the payloads of the scan that has ended.
 
         Args:
-            received: payload of each chunk, None where none arrived.
-            carry: keep the payloads of chunks that did not arrive, because the scan did not change them.
+            received: payload of each chunk; None where none arrived.
+            carry: whether to keep the payloads of chunks that did not arrive, because they are unchanged.
         """
         if carry and None in received:
             held = self._payloads
@@ -45,8 +45,8 @@ class HeldChunks:
         """Decode the payloads.
 
         Returns:
-            (U, K) codes, a mask of the measurements among them, and the CRC over the codes
-            (:func:`~skinnode.protocol.scan_check.check_of_codes`), None if not all codes are known.
+            (U, K) codes, a (U, K) mask of measurements, and the CRC over the codes
+            (:func:`~skinnode.protocol.scan_check.check_of_codes`), which is None unless all codes are known.
         """
         profile = self._profile
         known = [payload for payload in self._payloads if payload is not None]

@@ -1,4 +1,4 @@
-"""What all PDO payloads of a patch share: the length, and the error for another length. All little-endian."""
+"""Payload length shared by the PDOs of a patch, and its check. All payloads are little-endian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skinnode.errors import CodecError
 from skinnode.text.words import counted
 
 PDO_BYTES: Final = 8
-"""Bytes of a classic chunk and of every summary."""
+"""Length of a classic chunk and of every summary, bytes."""
 
 
 def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
@@ -16,12 +16,12 @@ def require_length(data: bytes, length: int, cob_id: int, what: str) -> None:
 
     Args:
         data: the payload.
-        length: the bytes that it must have.
-        cob_id: named in the error.
-        what: name of the message, for the error.
+        length: required length, bytes.
+        cob_id: COB-ID shown in the error.
+        what: name of the message, shown in the error.
 
     Raises:
-        CodecError: if the payload has another length.
+        CodecError: if the payload does not have that length.
     """
     if len(data) != length:
         raise CodecError(cob_id, data, f"{counted(length, 'byte')} ({what})")

@@ -1,14 +1,15 @@
-"""The sizes of a patch, from which its wire format follows.
+"""Patch sizes that determine the wire format.
 
-A patch of U×K codes sends them in *chunks*: TPDO1 carries u8 chunk index, u8 scan counter and 3 codes of
-16 bits (or 2 of 24), codes in row-major order, upper wire first. TPDO2, the *summary*, ends each scan and
-carries a check over all codes of the matrix (:mod:`skinnode.protocol.scan_check`).
+A patch with U×K codes sends them in *chunks*: TPDO1 carries a u8 chunk index, a u8 scan counter and 3 codes
+of 16 bits (or 2 of 24 bits). Codes are in row-major order, upper wire first. TPDO2, the *summary*, ends each
+scan and carries a check over all codes of the matrix (:mod:`skinnode.protocol.scan_check`).
 
-Over CAN FD a chunk is a part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30 codes
-of 16 bits (or 20 of 24). All chunks of a patch have one length: that of the mapping, padded to the next
-length that CAN FD has. A patch of more columns sends each wire in several chunks, as even as possible.
+Over CAN FD a chunk is part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30 codes
+of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping padded to
+the next valid CAN FD length. A patch with more columns sends each wire in several chunks of sizes as equal as
+possible.
 
-``python -m skinnode.protocol.profile eds/`` writes the reference EDS files again
+``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).
 """
 
@@ -30,21 +31,21 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period for which the defaults are chosen, ms: four 10×30 patches load 1 Mbit/s to about two thirds."""
+"""SYNC period on which the defaults are based, ms; four 10×30 patches load 1 Mbit/s to about two thirds."""
 
 BusType = Literal["classic", "fd"]
-"""Kind of frame that carries PDOs: CAN 2.0 of up to 8 bytes, or CAN FD of up to 64."""
+"""Kind of frame that carries PDOs: CAN 2.0 with up to 8 bytes, or CAN FD with up to 64 bytes."""
 
 _MOST_SUBINDICES: Final = 254  # CiA 301: sub-index 255 is reserved
 
 
 @dataclass(frozen=True, slots=True)
 class PatchProfile:
-    """The sizes of a patch that its wire format depends on.
+    """Patch sizes that determine the wire format.
 
     Raises:
         ConfigError: if a size does not fit an array of the object dictionary (254) or the chunk index (256
-            chunks), the code width is not 16 or 24 bits, or there are more PDOs than CANopen has.
+            chunks), the code width is not 16 or 24 bits, or there are more PDOs than CANopen allows.
     """
 
     rows: int
@@ -52,11 +53,11 @@ class PatchProfile:
     columns: int
     """Lower wires, K."""
     upper_electrodes: int
-    """Electrodes of an upper wire, N."""
+    """Electrodes per upper wire, N."""
     lower_electrodes: int
-    """Electrodes of a lower wire, M."""
+    """Electrodes per lower wire, M."""
     code_bits: int = 16
-    """Width of a code, 16 or 24."""
+    """Width of a code, bits: 16 or 24."""
     rpdos: int = 4
     """Number of RPDOs: RPDO1 takes commands, the others are spare."""
     tpdos: int = 4
@@ -64,8 +65,8 @@ class PatchProfile:
     bus: BusType = "classic"
     """Kind of frame that carries PDOs."""
     checked: bool = True
-    """Whether summaries carry a check over the scan. False: a patch of revision 1.0, whose summaries carry 32
-    bits of device time instead."""
+    """Whether summaries carry a check over the scan; False for a patch of revision 1.0, whose summaries carry
+    32 bits of device time instead."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -95,8 +96,8 @@ class PatchProfile:
         """Return the profile of a patch with the electrodes of ``layout``.
 
         Args:
-            layout: its electrodes.
-            code_bits: width of a code, 16 or 24.
+            layout: electrodes of the patch.
+            code_bits: width of a code, bits: 16 or 24.
             bus: kind of frame that carries PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]
@@ -105,22 +106,22 @@ class PatchProfile:
 
     @classmethod
     def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
-        """Return the profile that the hand file gives to a patch on ``bus``."""
+        """Return the profile that follows from the hand file for a patch on ``bus``."""
         return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
     def n_codes(self) -> int:
-        """Number of codes of a scan, U·K."""
+        """Number of codes in a scan, U·K."""
         return self.rows * self.columns
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum bytes of a PDO, and maximum objects mapped into it: the smallest object is a byte."""
+        """Maximum bytes of a PDO, and maximum objects mapped into it, as the smallest object is one byte."""
         return 8 if self.bus == "classic" else 64
 
     @property
     def chunk_head_bytes(self) -> int:
-        """Number of bytes before the codes of a chunk."""
+        """Number of bytes before the codes in a chunk."""
         return 2 if self.bus == "classic" else 4
 
     @property
@@ -129,27 +130,27 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of runs of codes that are cut into chunks: 1, or over CAN FD one for each upper wire."""
+        """Number of code runs that are split into chunks: 1, or over CAN FD one per upper wire."""
         return 1 if self.bus == "classic" else self.rows
 
     @property
     def chunks_per_line(self) -> int:
-        """Number of chunks of a run. The unused codes of the last chunk are sent as 0 and ignored."""
+        """Number of chunks per run. Unused codes in the last chunk are sent as 0 and ignored."""
         return -(-self.n_codes // self.lines // self._most_codes)
 
     @property
     def codes_per_chunk(self) -> int:
-        """Number of codes of a chunk: 3 of 16 bits or 2 of 24, over CAN FD up to 30 or 20."""
+        """Number of codes per chunk: 3 with 16 bits or 2 with 24 bits, over CAN FD up to 30 or 20."""
         return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 
     @property
     def n_chunks(self) -> int:
-        """Number of chunks of a full scan."""
+        """Number of chunks in a full scan."""
         return self.lines * self.chunks_per_line
 
     @property
     def chunk_bytes(self) -> int:
-        """Number of bytes of a chunk."""
+        """Length of a chunk, bytes."""
         if self.bus == "classic":
             return 8
         return fd_length(self.chunk_head_bytes + self.codes_per_chunk * self.code_bits // 8)
@@ -168,12 +169,12 @@ class PatchProfile:
     def default_inhibit_100us(self) -> int:
         """Default inhibit time of TPDO1 (0x1800:3), 100 µs.
 
-        A full scan takes nine tenths of the default period; the inhibit time is at most 1 ms.
+        A full scan takes nine tenths of the default period, and the inhibit time is at most 1 ms.
         """
         return max(1, min(10, 9 * DEFAULT_PERIOD_MS // self.n_chunks))
 
     def objects(self) -> tuple[Object, ...]:
-        """Return the whole object dictionary, by ascending index."""
+        """Return the whole object dictionary in ascending order of index."""
         return patch_objects(self)
 
 

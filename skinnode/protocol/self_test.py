@@ -1,4 +1,4 @@
-"""The result of a self-test: the record 0x2023."""
+"""Result of a self-test, the record 0x2023."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ class SelfTestStatus(enum.IntEnum):
 
 
 class SelfTestFault(enum.IntFlag):
-    """Faults that a self-test found, 0x2023:2."""
+    """Faults found by a self-test, 0x2023:2."""
 
     SOURCE = 0x01
-    """The converter gave no reading at least once."""
+    """The converter failed to return a valid reading at least once."""
     NOISE = 0x02
     OPEN_WIRE = 0x04
     SHORTED_WIRE = 0x08
     OUT_OF_RANGE = 0x10
-    """Crossings with a baseline gave no measurement: they are open, shorted or outside lo … hi."""
+    """Crossings with a baseline gave no measurement, because they are open, shorted or outside lo … hi."""
     NO_BASELINE = 0x20
 
 
 class SelfTest(NamedTuple):
-    """Findings of a self-test: 0x2023 from sub-index 2 on."""
+    """Findings of a self-test, in the order of 0x2023 from sub-index 2."""
 
     faults: SelfTestFault
     readings: int
     noise: float
-    """RMS over the crossings of the relative standard deviations."""
+    """RMS of the crossings' relative standard deviations."""
     open_wires: int
     shorted_wires: int
     out_of_range: int
@@ -43,13 +43,13 @@ class SelfTest(NamedTuple):
 
 _SELF_TEST: Final = struct.Struct("<BHBfHHII")
 SELF_TEST_NEVER_RUN: Final = bytes(_SELF_TEST.size)
-"""The record before the first self-test."""
+"""Record before the first self-test."""
 
 
 def pack_self_test(test: SelfTest) -> bytes:
-    """Pack the record 0x2023, its sub-objects concatenated.
+    """Pack the sub-objects of the record 0x2023.
 
     Args:
-        test: the findings; without a fault the test has passed.
+        test: the findings; the test has passed if there are no faults.
     """
     return _SELF_TEST.pack(SelfTestStatus.FAILED if test.faults else SelfTestStatus.PASSED, *test)

@@ -1,4 +1,4 @@
-"""The scan summary: TPDO2, which ends each scan."""
+"""Scan summary, sent in TPDO2 at the end of each scan."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ _SUMMARY: Final = struct.Struct("<BBHI")
 _HEAD: Final = struct.Struct("<BBHH")
 
 HEAD_BYTES: Final = _HEAD.size
-"""Bytes of a summary that its check covers."""
+"""Number of summary bytes that the check covers."""
 
 
 class SummaryFlag(enum.IntFlag):
     """Flags of a scan summary. Bits without a name are sent as 0 and ignored."""
 
     CHANGED_ONLY = 0x01
-    """Only chunks that changed were sent: the others are as in the previous scan."""
+    """Only changed chunks were sent; all other chunks are as in the previous scan."""
     OVERRUN = 0x02
-    """The next SYNC came first: chunks were left out, and their codes are unknown."""
+    """Some chunks were not sent before the next SYNC, and their codes are unknown."""
     WIRE_FAULT = 0x04
-    """A wire is open or shorted: see 0x2030 and 0x2031."""
+    """A wire is open or shorted; see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
-    """The codes of this scan are the first of a new baseline: read 0x2200 … again."""
+    """The codes of this scan are the first with a new baseline; read 0x2200 … again."""
     SOURCE_FAILED = 0x10
-    """The converter gave no reading: no chunk was sent, and the codes of this scan are unknown."""
+    """The converter returned no valid reading, so no chunk was sent and this scan's codes are unknown."""
     CHECKED = 0x20
     """Bytes 4 to 7 are u16 device time in steps of 64 µs and u16 scan check. Without this flag, as in patches
     of revision 1.0, they are u32 device time in µs."""
 
 
 class Summary(NamedTuple):
-    """A scan summary as it is sent."""
+    """Scan summary as sent."""
 
     scan: int
     """Scan counter, u8."""
     flags: int
     """Bits of :class:`SummaryFlag`."""
     chunks: int
-    """Chunks sent in this scan."""
+    """Number of chunks sent in this scan."""
     device_time_us: int
-    """Device time, µs, 0 to 2³² − 1; with a ``check``, a multiple of 64 from 0 to 2²² − 64: see
+    """Device time, µs, 0 to 2³² − 1; with a ``check``, a multiple of 64 from 0 to 2²² − 64. See
     :mod:`skinnode.protocol.device_time`."""
     check: int | None = None
-    """Check of the scan, see :mod:`skinnode.protocol.scan_check`; None in a summary without
+    """Scan check (:mod:`skinnode.protocol.scan_check`); None in a summary without
     :attr:`SummaryFlag.CHECKED`."""
 
 
-_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time of a flag
+_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time for an enum flag
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
-    """Pack the payload of TPDO2 of a patch of revision 1.0, whose summaries carry no check.
+    """Pack the payload of TPDO2 for a patch of revision 1.0, whose summaries carry no check.
 
     Args:
         scan: scan counter, 0 to 255.
@@ -100,7 +100,7 @@ def pack_checked_summary(
 
 
 def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
-    """Return the record 0x2011 that belongs to a summary, its sub-objects concatenated.
+    """Return the concatenated sub-objects of the record 0x2011 that belongs to a summary.
 
     Args:
         payload: the payload of TPDO2.
@@ -116,7 +116,7 @@ def unpack_summary(data: bytes, *, cob_id: int = _COB_ID) -> Summary:
 
     Args:
         data: the payload.
-        cob_id: named in the error.
+        cob_id: COB-ID shown in the error.
 
     Raises:
         CodecError: if the payload is not 8 bytes long.

@@ -1,5 +1,7 @@
 """Object dictionary and PDO contents of a patch, as pure code without a bus or clock.
 
-Node:  resistances → ``codec`` → PDO payloads, mapped as ``profile`` defines.
-Host:  PDO payloads → ``codec`` → ``assembler`` → one complete scan.
+Node:  resistances → ``codes`` → codes → ``chunk``, ``summary`` → PDO payloads, mapped as ``profile`` defines.
+Host:  PDO payloads → ``chunk``, ``summary`` → ``assembler`` → one complete scan → ``codes`` → resistances.
+
+``codec`` only collects the public names of these files for users.
 """

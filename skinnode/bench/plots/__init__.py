@@ -1,1 +1,4 @@
-"""Plots of benchmarks, one module per benchmark. They need matplotlib."""
+"""Plots of benchmarks. ``ratios`` serves ``kernel`` and ``solve``; the rest are named after their benchmark.
+
+They need matplotlib.
+"""

@@ -1,0 +1,85 @@
+"""Time a benchmark of two commits in turn on one machine: ``python -m tools.compare.speed OLD [NEW]``.
+
+NEW is the working tree by default. Each round runs the benchmark once in either tree; which tree goes first
+alternates, so that a change of the speed of the machine hits both. The report gives the shortest time of each
+row in either commit, and their ratio. Rows of NumPy and LAPACK show the noise of the machine.
+
+Exit status 0 if no row is slower than ``--limit`` times the old one, otherwise 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from tools.compare.__main__ import tree_of
+
+
+def rows_of(report: Any) -> dict[str, float]:
+    """Return every time in the JSON report of a benchmark, by the name of its row and key."""
+    found: dict[str, float] = {}
+    for index, row in enumerate(report["rows"]):
+        label = " ".join(str(value) for value in row.values() if isinstance(value, str)) or f"row {index}"
+        for key, value in row.items():
+            if isinstance(value, (int, float)) and key.split("_")[-1] in ("us", "ms", "µs"):
+                found[f"{label} {key}"] = float(value)
+    return found
+
+
+def run(tree: Path, benchmark: str, arguments: list[str], out: Path) -> dict[str, float]:
+    """Run ``skinnode bench BENCHMARK`` with the packages in ``tree`` and return its times."""
+    code = (
+        f"import sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
+        f"sys.argv = {['skinnode', 'bench', benchmark, '--json', str(out), *arguments]!r}; "
+        "from skinnode.cli.main import main; sys.exit(main())"
+    )
+    environment = os.environ | {"PYTHONPATH": str(tree)}
+    subprocess.run(
+        [sys.executable, "-c", code], cwd=tree, env=environment, check=True, stdout=subprocess.DEVNULL
+    )
+    return rows_of(json.loads(out.read_text()))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
+    parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
+    parser.add_argument("--benchmark", default="kernel", help="name of the benchmark; default kernel")
+    parser.add_argument("--rounds", type=int, default=5, help="runs of either commit; default 5")
+    parser.add_argument("--limit", type=float, default=1.05, help="largest allowed ratio; default 1.05")
+    options, arguments = parser.parse_known_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        trees = [tree_of(options.old, folder / "old"), tree_of(options.new, folder / "new")]
+        for tree in trees:  # fills the cache of compiled kernels
+            run(tree, options.benchmark, arguments, folder / "out.json")
+        best: list[dict[str, float]] = [{}, {}]
+        for turn in range(options.rounds):
+            for which in (0, 1) if turn % 2 == 0 else (1, 0):
+                for name, value in run(
+                    trees[which], options.benchmark, arguments, folder / "out.json"
+                ).items():
+                    best[which][name] = min(value, best[which].get(name, value))
+    fine = True
+    print(f"{'':60} {'old':>9} {'new':>9}   ratio")
+    for name, old in best[0].items():
+        new = best[1].get(name)
+        if new is None:
+            print(f"{name:60} {old:9.1f}   missing")
+            fine = False
+            continue
+        slow = new > options.limit * old
+        fine = fine and not slow
+        ratio = new / old if old else 1.0
+        print(f"{name:60} {old:9.1f} {new:9.1f}   {ratio:.3f}{'  slower' if slow else ''}")
+    return 0 if fine else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -311,7 +311,7 @@ def _ten_steps() -> list[dict[str, Any]]:
 
     calls = {f"alone, {LABELS[operator]}": alone(operator, plain) for operator in OPERATORS}
     calls["alone, ours"] = alone("dogleg", Uniform())
-    calls["of the ten of a patch, dogleg"] = lambda: solve_path(layout, patch, schedule=plain)
+    calls["in a patch of ten, dogleg"] = lambda: solve_path(layout, patch, schedule=plain)
     times = take_turns(calls, rounds=11)
     rows = []
     for what, call in calls.items():

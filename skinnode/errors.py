@@ -9,11 +9,11 @@
      ├ BusError                    a CAN interface fails to open, send or receive
      │  └ NodeError                a node misbehaves
      │     ├ NodeTimeout(TimeoutError)
-     │     └ SdoAbort              with code and text of CiA 301
+     │     └ SdoAbort              with the code and text from CiA 301
      └ CodecError(ValueError)      a payload does not match its COB-ID
 
-Lost chunks, stale patches and solves that do not converge are part of normal operation: they are reported by
-statuses and counters, never by exceptions. An argument of the wrong shape raises a plain ``ValueError``.
+Lost chunks, stale patches and solves that do not converge are part of normal operation: statuses and counters
+report them, never exceptions. An argument of the wrong shape raises a plain ``ValueError``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""Value that a message shows for a missing key."""
+"""Value shown in a message if the key is missing."""
 
 _MOST_SHOWN: Final = 240
 
@@ -46,7 +46,7 @@ class ConfigError(SkinError, ValueError):
     """Configuration value that cannot be used.
 
     Args:
-        key: Dotted path of the value, such as ``patches[1].node_id``, or name of the option.
+        key: Dotted path of the value, such as ``patches[1].node_id``, or the name of the option.
         got: Value found; None if there is no value.
         allowed: Phrase that describes the accepted values.
         where: File, line and column of the value, if known.
@@ -66,7 +66,7 @@ class ProfileError(ConfigError):
 
 
 class BusLoadError(ConfigError):
-    """Plan that exceeds the load limit of a bus; ``needed`` and ``available`` are fractions of the bus."""
+    """Plan that exceeds a bus load limit; ``needed`` and ``available`` are fractions of bus capacity."""
 
     def __init__(  # noqa: PLR0913 - one argument per part of the message
         self, key: str, got: object, allowed: str, *, needed: float, available: float, where: str = ""
@@ -76,11 +76,11 @@ class BusLoadError(ConfigError):
 
 
 class BusError(SkinError):
-    """CAN interface that fails to open, send or receive; raised ``from`` the error of python-can."""
+    """Failure of a CAN interface to open, send or receive; raised ``from`` the python-can error."""
 
 
 class NodeError(BusError):
-    """Node that does not behave as specified."""
+    """Behaviour of a node that violates the specification."""
 
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id
@@ -88,11 +88,11 @@ class NodeError(BusError):
 
 
 class NodeTimeout(NodeError, TimeoutError):
-    """Node that did not answer in time."""
+    """Timeout while waiting for a node's response."""
 
 
 class SdoAbort(NodeError):
-    """Aborted SDO transfer; ``code`` is the abort code of CiA 301 table 22."""
+    """Aborted SDO transfer; ``code`` is the abort code from CiA 301, table 22."""
 
     def __init__(self, node_id: int, code: int, text: str) -> None:
         self.code = code
@@ -100,7 +100,7 @@ class SdoAbort(NodeError):
 
 
 class CodecError(SkinError, ValueError):
-    """Payload that cannot be decoded; ``cob_id`` and ``data`` come from the frame."""
+    """Payload that cannot be decoded; ``cob_id`` and ``data`` are taken from the frame."""
 
     def __init__(self, cob_id: int, data: bytes, allowed: str) -> None:
         self.cob_id, self.data, self.allowed = cob_id, bytes(data), allowed

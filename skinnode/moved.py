@@ -1,4 +1,4 @@
-"""Old import paths of public names: they go on working for one version, with a warning."""
+"""Old import paths of public names, which keep working for one version and issue a warning."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 
 def moved(old: str, new: str) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` (PEP 562) of a module whose names are in another module now.
+    """Return a ``__getattr__`` (PEP 562) for a module whose names have moved to another module.
 
     Args:
-        old: Dotted path of the module that stays for one version.
-        new: Dotted path of the module that holds the names.
+        old: Dotted path of the old module, which is kept for one version.
+        new: Dotted path of the module that now contains the names.
     """
 
     def attribute(name: str) -> Any:
@@ -21,7 +21,7 @@ def moved(old: str, new: str) -> Callable[[str], Any]:
             raise AttributeError(f"module {old!r} has no attribute {name!r}")
         found = getattr(import_module(new), name)
         warnings.warn(
-            f"{old}.{name} is {new}.{name} now; the old path goes in version 0.2",
+            f"{old}.{name} has moved to {new}.{name}; the old path will be removed in version 0.2",
             DeprecationWarning,
             stacklevel=2,
         )

@@ -1,8 +1,8 @@
-"""Passes many arrays and numbers to a kernel in one argument, with access by name.
+"""Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
 
 Numba checks and unpacks every argument of every call. For the fifty arrays of a patch this takes 4 µs with
-warm caches and 40 µs with cold caches, as long as solving four wires. An :class:`ArrayTable` is one array of
-addresses and shapes. A subclass declares the fields once, for Python and for kernels:
+warm caches and 40 µs with cold caches, the time needed to solve four wires. An :class:`ArrayTable` is one
+array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -15,9 +15,10 @@ addresses and shapes. A subclass declares the fields once, for Python and for ke
 
     kernel(Scan(ohm=np.zeros((10, 30)), limit=1.0).table)
 
-Python packs and kernels read by name, so the order of the declaration does not matter. The constructor
-checks element type, number of axes, contiguity, and that axes with the same name have the same length. The
-first entry of a table is a digest of its declaration; a kernel that receives another table raises TypeError.
+Python writes fields and kernels read them by name, so the order of declaration does not matter. The
+constructor checks the element type, number of axes and contiguity of each array, and requires axes with the
+same name to have the same length. The first entry of a table is a digest of its declaration; a kernel that
+receives a table of another class raises TypeError.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ register_model: Any = typed_register_model
 arrayobj: Any = typed_arrayobj
 
 READONLY: Final = "readonly"
-"""Annotation of a field that kernels may only read."""
+"""Annotation for a field that kernels may read but not write."""
 _AXES_MAX: Final = 3
 _COLUMNS: Final = 1 + _AXES_MAX
 _T = TypeVar("_T", bound="ArrayTable")
@@ -91,13 +92,13 @@ class _Field:
                 )
 
     def _wanted(self) -> str:
-        """What a message says the array must be; made only for a message."""
+        """Return the requirements on the array as text for an error message."""
         return f"must be a contiguous, writable {self.dtype} array with axes ({', '.join(self.axes or ())})"
 
 
 @dataclass(frozen=True)
 class _Group:
-    """Fields of a NamedTuple, which kernels read as that tuple."""
+    """Fields of a NamedTuple; kernels read them as one such tuple."""
 
     name: str
     made_of: type
@@ -134,10 +135,10 @@ class ArrayTable:
     """Base class for tables of named arrays and numbers; subclasses declare the fields as annotations.
 
     Args:
-        values: Every declared field by name. Arrays are not copied; write to them in place.
+        values: Value of every declared field, by name. Arrays are not copied; write to them in place.
 
-    Raises TypeError if a field is missing or unknown, or if an array has another element type, number of
-    axes or length than declared, is not contiguous or cannot be written.
+    Raises TypeError if a field is missing or unknown, or if an array differs from its declaration in element
+    type, number of axes or length, is not contiguous, or is read-only.
     """
 
     table: NDArray[np.int64]
@@ -215,11 +216,11 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Return a function for kernels that converts a table of ``made_of`` to an object with its fields.
+    """Return a kernel function that converts the table of a ``made_of`` to an object with its fields.
 
     Only compiled code can call the function. Each use of a field name reads the table again, so read fields
-    before loops. In kernels, bool arrays are uint8. Raises TypeError in the kernel if the table has another
-    declaration.
+    before loops. In kernels, bool arrays are uint8. The kernel raises TypeError if the table has a
+    different declaration.
     """
     view, digest = _ViewType(made_of), made_of._digest
     message = f"table: got a table of another class, must be the table of a {made_of.__name__}"

@@ -1,14 +1,14 @@
-"""Compiles kernels: ``@njit`` with a cache that cannot go stale.
+"""Compilation of kernels: ``@njit`` with a cache that cannot go stale.
 
-A plain file cache notices edits to the file of a function, but not to functions that it calls in other files.
-Therefore the folder of the cache (:mod:`skinnode.compiled.kernel_cache`) is named after a digest of every
+A plain file cache notices edits to the file of a function, but not edits to functions called from other
+files. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest of every
 file that contains kernels: an edit to any of these files recompiles all kernels. The folder is created below
 ``$SKINNODE_CACHE_DIR``, the user's cache folder or the system's temporary folder, whichever is writable
 first. If no folder is writable, nothing is cached.
 
 ``error_model="numpy"`` makes a division by zero yield inf (reported by a status) instead of an exception, and
-``nogil`` lets a thread pool solve several patches at a time. ``fastmath`` stays off because results must not
-depend on how a compiler reorders sums.
+``nogil`` lets a thread pool solve several patches at the same time. ``fastmath`` stays off because results
+must not depend on how a compiler reorders sums.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numba as typed_numba
 
 from skinnode.compiled.kernel_cache import SUFFIX, KernelCache
 
-numba: Any = typed_numba  # its type hints lack configuration and options used here
+numba: Any = typed_numba  # numba's type hints lack the configuration and options used here
 _F = TypeVar("_F", bound=Callable[..., Any])
 _KERNEL_FILES = (
     "compiled/*.py",
@@ -51,7 +51,7 @@ def _writable(folder: Path) -> bool:
 
 @functools.cache
 def cache_dir() -> Path | None:
-    """Return the folder of the compiled kernels, or None if no folder is writable."""
+    """Return the folder for compiled kernels, or None if no folder is writable."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for pattern in _KERNEL_FILES:
@@ -80,7 +80,7 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def njit_part(function: _F) -> _F:
-    """Compile ``function`` for calls from other kernels only; its code is cached with that of its callers.
+    """Compile ``function`` for calls from other kernels only; its code is cached with its callers' code.
 
     Python cannot call it. Omitting the Python entry point saves a fifth of the compile time.
     """
@@ -91,7 +91,7 @@ def njit_part(function: _F) -> _F:
 def njit_body(function: _F) -> _F:
     """Inline ``function`` into the only kernel that calls it, before compilation.
 
-    Compiling and linking both separately takes 50 % longer.
+    Compiling and linking the two separately takes 50 % longer.
     """
     compiled: _F = numba.njit(inline="always", **_OPTIONS)(function)
     return compiled
@@ -103,10 +103,10 @@ def njit(function: _F) -> _F:
 
 
 def njit_brief(function: _F) -> _F:
-    """Compile ``function`` as :func:`njit` does, but keep the interpreter lock while it runs.
+    """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
     Use this for kernels that take about a microsecond: if the lock were released, another thread could hold
-    it for longer than the rest of the field takes.
+    it for longer than it takes to compute the rest of the field.
     """
     return _kept(function, nogil=False)
 

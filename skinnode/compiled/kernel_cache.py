@@ -6,10 +6,10 @@ one index, so two processes that compile different signatures at once can store 
 of the other.
 
 Here each compiled signature has its own file, with a magic number, the SHA-256 of the payload, and the
-payload. The name contains a digest of everything that the code depends on, so no index is needed. Files are
-written under a temporary name and renamed. If a file fails verification, it is removed, the kernel is
-recompiled, and one line is logged. One line is also logged if a kernel cannot be cached. Errors of the cache
-never reach the caller.
+payload. The file name contains a digest of everything that the code depends on, so no index is needed. Files
+are written under a temporary name and renamed. If a file fails verification, it is removed, the kernel is
+recompiled, and one line is logged. One line is also logged if a kernel cannot be cached. Cache errors never
+reach the caller.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from numba.core import compiler, serialize
 
 from skinnode.files.whole_file import replace_file
 
-_numba_compiler: Any = compiler  # neither has type hints
+_numba_compiler: Any = compiler  # neither module has type hints
 _numba_serialize: Any = serialize
 _MAGIC: Final = b"skinnode kernel 1\n"
 _HEAD_BYTES: Final = len(_MAGIC) + hashlib.sha256().digest_size
@@ -50,7 +50,7 @@ class KernelCache:
 
     Args:
         function: The Python function.
-        folder: Folder of the cache files.
+        folder: Folder for the cache files.
     """
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
@@ -62,11 +62,11 @@ class KernelCache:
 
     @property
     def cache_path(self) -> str:
-        """Cache folder, under the name that numba's statistics use."""
+        """Path of the cache folder; numba's statistics read this property."""
         return str(self._folder)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the compiled code of ``signature``, None if there is no usable file."""
+        """Return the compiled code of ``signature``, or None if there is no usable file."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
@@ -83,14 +83,14 @@ class KernelCache:
                 if kept_signature == signature
                 else None
             )
-        except Exception as error:  # intact, but from another installation
+        except Exception as error:  # the file is intact, but from another installation
             if _remove(path):
                 _report(self._folder, f"a file could not be loaded ({error!r:.200}); removed, recompiling")
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write ``compiled`` to the cache if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # as numba's own cache does
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache skips these too
             return
         path = self._path(signature, compiled.codegen)
         try:
@@ -123,7 +123,7 @@ def _file_digest(file: str) -> str:
 
 
 def _read(path: Path) -> bytes:
-    """Return the payload of a file. Raises OSError if the file is unreadable, ValueError if damaged."""
+    """Return the payload of a file. Raises OSError if the file is unreadable, ValueError if it is damaged."""
     if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would wait for its writer
         raise ValueError("not a file")
     data = path.read_bytes()
@@ -138,7 +138,7 @@ def _write(path: Path, payload: bytes) -> None:
 
 
 def _heal(folder: Path) -> None:
-    """Remove all damaged files of ``folder`` at once, so that one line reports them.
+    """Remove all damaged files in ``folder`` together, so that one log line reports them.
 
     If several processes find the damage, the first process removes and reports the files.
     """
@@ -189,7 +189,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log ``what`` once per process and folder, so that forty kernels on a full disk log one line."""
+    """Log ``what`` once per process and folder, so that forty kernels on a full disk cause only one line."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

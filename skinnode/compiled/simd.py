@@ -6,7 +6,7 @@ gets exactly these instructions, and each lane accumulates its own sum in the or
 therefore the same for any number of threads and any split of the columns. On processors with narrower
 vectors, each operation is split.
 
-Lanes support + − *; a double in such an expression is broadcast to a vector.
+Vectors support +, − and *; a double in such an expression is broadcast to a vector.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def _lanes() -> int:
         return 8 if "+avx512f" in (chosen or "") else 4
     try:
         return 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4
-    except RuntimeError:  # unknown on this platform
+    except RuntimeError:  # the features are unknown on this platform
         return 4
 
 
@@ -70,7 +70,7 @@ def _constant(vector: Any, value: Any) -> Any:
 
 
 def _splat(builder: Any, value: Any) -> Any:
-    """Return ``value`` as a vector; a double is copied to every lane, a vector is unchanged."""
+    """Return ``value`` as a vector; a double is copied to every lane, a vector is returned unchanged."""
     if value.type == _VECTOR:
         return value
     seed = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -106,7 +106,7 @@ def _first(builder: Any, count: Any) -> Any:
 
 def _binary(symbol: Any, in_place: Any, method: str) -> None:
     class Template(templates.ConcreteTemplate):  # type: ignore[misc]
-        cases = [  # noqa: RUF012  # numba wants a list
+        cases = [  # noqa: RUF012  # numba requires a list
             signature(_LANES_TYPE, _LANES_TYPE, _LANES_TYPE),
             signature(_LANES_TYPE, types.float64, _LANES_TYPE),
             signature(_LANES_TYPE, _LANES_TYPE, types.float64),
@@ -182,7 +182,7 @@ def splat(_typing: Any, value: Any) -> Any:
 
 @extending.intrinsic  # type: ignore[untyped-decorator]
 def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return a·b + c, rounded once if the processor supports it."""
+    """Return a·b + c, with a single rounding if the processor supports it."""
 
     def generate(_context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
         inputs = [_splat(builder, argument) for argument in arguments]

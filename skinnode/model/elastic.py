@@ -1,8 +1,8 @@
-"""Rubber as an elastic half-space: computes surface displacements from surface loads.
+"""Rubber as an elastic half-space: surface displacements caused by surface loads.
 
 The body fills z < 0, its surface is z = 0, and z points outwards, as everywhere in this project; a press is a
-load with a negative z component. With d = (x, y) from load to point, r = |d|, shear modulus G and Poisson's
-ratio ν, a unit point load displaces the surface by (Boussinesq 1885, Cerruti 1882; Johnson, Contact
+load with a negative z component. With the offset d = (x, y) from load to point, r = |d|, shear modulus G and
+Poisson's ratio ν, a point load f displaces the surface by (Boussinesq 1885, Cerruti 1882; Johnson, Contact
 Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
 
     ⎡ u_x ⎤      1   ⎡ (1−ν)/r + ν x²/r³    ν x y/r³              (½−ν) x/r² ⎤ ⎡ f_x ⎤
@@ -69,14 +69,14 @@ def point_compliance(rubber: Rubber, offset_m: ArrayLike, *, softening_m: float 
         rubber: The material.
         offset_m: (P, 2) offset of each point from the load, metres.
         softening_m: ε in r → √(r² + ε²), metres; spreads the load over a spot of about that radius, so that
-            the displacement at the load stays finite. 0 is an ideal point load.
+            the displacement at the load stays finite. 0 gives an ideal point load.
 
     Returns:
-        (P, 3, 3) compliance, m/N. The last axis is the component of the load, the second-to-last that of the
-        displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
+        (P, 3, 3) compliance, m/N. The last axis is the component of the load, the second-to-last axis that of
+        the displacement. Values at the load itself are inf or NaN if ``softening_m`` is 0.
 
     Raises:
-        ValueError: If the array has the wrong shape or NaN, or the softening is negative.
+        ValueError: If the array has the wrong shape or contains NaN, or the softening is negative.
     """
     offset = require_array("offset_m", offset_m, ("P", 2))
     if not (math.isfinite(softening_m) and softening_m >= 0):
@@ -105,7 +105,7 @@ def rectangle_compliance(rubber: Rubber, offset_m: ArrayLike, size_m: tuple[floa
         (P, 3, 3) compliance, m/Pa, with axes as in :func:`point_compliance`.
 
     Raises:
-        ValueError: If the array has the wrong shape or NaN, or a length is not positive.
+        ValueError: If the array has the wrong shape or contains NaN, or a length is not positive.
     """
     offset = require_array("offset_m", offset_m, ("P", 2))
     if not all(math.isfinite(length) and length > 0 for length in size_m):
@@ -124,8 +124,8 @@ def _antiderivatives(x: Float, y: Float) -> Float:
     r = np.hypot(x, y)
     ax, ay = np.abs(x), np.abs(y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # asinh(x/|y|) = ln(x + r) − ln|y|: the second term drops out between the corners, and asinh avoids
-        # the cancellation in x + r
+        # asinh(x/|y|) = ln(x + r) − ln|y|: the second term cancels between the corners, and asinh avoids the
+        # loss of digits in x + r
         xx = np.where(ay > 0, y * np.arcsinh(x / ay), 0.0)
         yy = np.where(ax > 0, x * np.arcsinh(y / ax), 0.0)
         log_r = np.where(r > 0, np.log(r), 0.0)
@@ -155,13 +155,13 @@ def _compliance(  # noqa: PLR0913 - the six functions in the matrix
 
 @dataclass(frozen=True)
 class HertzContact:
-    """Contact of a rigid sphere pressed into the rubber and dragged over it: Hertz's pressure, full sliding.
+    """Contact with a rigid sphere pressed into the rubber and sliding over it: Hertz's pressure, full sliding.
 
     The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
-    surface displacement has a closed form everywhere: p is symmetric, so all integrals of the matrix follow
-    from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. That shear
-    does not change the pressure is exact for incompressible rubber and an approximation for ν < 0.5 (Johnson
-    7.1).
+    surface displacement has a closed form everywhere: p is radially symmetric, so all integrals of the matrix
+    follow from two radial functions, Φ = ∫ p/|d| (Johnson eqs. 3.41a, 3.42a) and P, the load within r. The
+    model assumes that shear does not change the pressure, which is exact for incompressible rubber and an
+    approximation for ν < 0.5 (Johnson 7.1).
 
     Args:
         rubber: The material.
@@ -208,10 +208,10 @@ class HertzContact:
         return self.traction_ratio[0] * normal, self.traction_ratio[1] * normal, -normal
 
     def traction_pa(self, points_m: ArrayLike) -> Float:
-        """Return the load per area (P, 3), Pa, at surface points (P, 2), metres; 0 outside the contact.
+        """Return the load per unit area (P, 3), Pa, at surface points (P, 2), metres; 0 outside the contact.
 
         Raises:
-            ValueError: If the array has the wrong shape or NaN.
+            ValueError: If the array has the wrong shape or contains NaN.
         """
         offset = require_array("points_m", points_m, ("P", 2)) - self.center_m
         a = self.contact_radius_m
@@ -225,7 +225,7 @@ class HertzContact:
         """Return the displacement (P, 3) of surface points (P, 2), metres; exactly 0 without contact.
 
         Raises:
-            ValueError: If the array has the wrong shape or NaN.
+            ValueError: If the array has the wrong shape or contains NaN.
         """
         offset = require_array("points_m", points_m, ("P", 2)) - self.center_m
         if self.indentation_m == 0:
@@ -248,8 +248,8 @@ def _hertz_integrals(offset: Float, a: float, peak: float) -> tuple[Float, Float
     """Return Φ, Φ − S, (2S − Φ)/r² and P/r² at offsets (P, 2) from the centre of p = peak √(1 − r²/a²).
 
     χ = ∫ p |d| has the Laplacian Φ, so its gradient is d S with S = ∫₀ʳ Φ s ds / r², its second derivatives
-    are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a flat charge,
-    which is d P/r² by Gauss's law in the plane.
+    are S I + (Φ − 2S) d dᵀ/r², and ∫ p d dᵀ/|d|³ = Φ I − ∇∇χ. ∫ p d/|d|² is the field of a planar
+    charge, which is d P/r² by Gauss's law in the plane.
     """
     r2 = np.einsum("pi,pi->p", offset, offset)
     near = r2 <= a * a

@@ -1,4 +1,4 @@
-"""Forward model of a patch: computes wire-to-wire resistances from electrode positions (NumPy reference).
+"""Forward model of a patch: wire-to-wire resistances from electrode positions (NumPy reference).
 
 The rubber between two electrodes at distance d is a resistor ρ d. The N·M paths between an upper and a lower
 wire are in parallel, so  ρ / R_k = F_k(X) = Σ_j Σ_i 1 / |x_i − x̄_jk|  (Xu et al. 2018, eq. 2). F is the
@@ -23,10 +23,10 @@ def _offsets(layout: PatchLayout, upper_m: ArrayLike) -> Float:
 
 
 def potential_per_m(layout: PatchLayout, upper_m: ArrayLike) -> Float:
-    """Return F (U, K), 1/m, for electrodes at ``upper_m`` (U, N, 3), metres; inf if two coincide.
+    """Return F (U, K), 1/m, for electrodes at ``upper_m`` (U, N, 3), metres; inf if two electrodes coincide.
 
     Raises:
-        ValueError: If the array has the wrong shape or NaN.
+        ValueError: If the array has the wrong shape or contains NaN.
     """
     distance = np.linalg.norm(_offsets(layout, upper_m), axis=-1)
     with np.errstate(divide="ignore"):
@@ -44,7 +44,7 @@ def resistance_ohm(layout: PatchLayout, upper_m: ArrayLike) -> Float:
         (U, K) resistances, ohm.
 
     Raises:
-        ValueError: If the array has the wrong shape or NaN.
+        ValueError: If the array has the wrong shape or contains NaN.
     """
     return layout.resistivity_ohm_per_m / potential_per_m(layout, upper_m)
 
@@ -60,7 +60,7 @@ def jacobian(layout: PatchLayout, upper_m: ArrayLike) -> Float:
         (U, K, N, 3) Jacobian, 1/m².
 
     Raises:
-        ValueError: If the array has the wrong shape or NaN.
+        ValueError: If the array has the wrong shape or contains NaN.
     """
     offset = _offsets(layout, upper_m)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)

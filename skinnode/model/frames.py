@@ -26,8 +26,8 @@ class ScanStamp:
     counter: int
     """Scan number in the CAN frames, u8: the SYNC counter if the SYNC has one."""
     device_time_us: int
-    """Time of the node's own clock at the SYNC of the scan, µs, 0 to 2³² − 1 with wrap-around; 0 if the
-    summary was lost. The resolution is 64 µs; the host derives the upper 10 bits, at the first scan from its
+    """Time on the node's own clock at the SYNC of the scan, µs, 0 to 2³² − 1 with wrap-around; 0 if the
+    summary was lost. The resolution is 64 µs; the host derives the upper 10 bits, for the first scan from its
     own clock. The node's full 32-bit time with a resolution of 1 µs can be read from 0x2011:4; patches of
     revision 1.0 send it with each scan."""
     t_sync_ns: int
@@ -64,7 +64,7 @@ class SolveStats:
     jacobians: int
     """Number of evaluations of J, each of which also yields F."""
     steps: int
-    """Operator steps; for a posterior, factorisations."""
+    """Number of operator steps or, for a posterior, of factorisations."""
     time_s: float
     """Elapsed time, s."""
 
@@ -78,7 +78,7 @@ class Contact:
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
-    """Area of the contact, assuming a smooth body (Hertz), m²; that of one cell if too small to resolve."""
+    """Area of the contact, assuming a smooth body (Hertz), m²; one cell's area if too small to resolve."""
     area_std_m2: float
     normal_force_n: float
     """Normal force, N, positive when pressing."""
@@ -105,8 +105,8 @@ class FieldFrame:
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin, N: estimated by the posterior, or by the paper's law k Δs if a stiffness
-    was given."""
+    """(U, N, 3) loads on the skin, N: estimated by the posterior, or computed from the paper's law k Δs if a
+    stiffness was given."""
     stamp: ScanStamp | None = None
     """Scan from which the field was computed; None outside a host."""
     method: str = "exact"

@@ -1,9 +1,9 @@
-"""Compiled forward model of one wire, in structure-of-arrays order.
+"""Compiled forward model of one wire, with arrays in structure-of-arrays layout.
 
 Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K), so vectors of neighbouring
 lower wires k are contiguous in memory and their sums stay in registers. Distances are the main cost: a square
 root and a division per pair would saturate one slow unit of the processor, so 1/√ is computed from
-multiplications instead. Lengths may be in any unit; F is in its inverse.
+multiplications instead. Lengths may be in any unit; F has the inverse unit.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ def lower_rows(lower: Float) -> Float:
 
 
 def relative_residual(a: _T, f: _T) -> _T:
-    """Return a F − 1 of numbers or arrays: how far a resistance is from what F predicts, relative to it."""
+    """Return a F − 1 for numbers or arrays: the relative deviation of a resistance from the predicted one."""
     return a * f - 1.0
 
 
 relative_residual_part = njit_body(relative_residual)
-"""The same in kernels."""
+"""Version of ``relative_residual`` for kernels."""
 
 
 @njit_part

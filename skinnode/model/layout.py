@@ -1,4 +1,4 @@
-"""Geometry of a patch: positions of its electrodes at rest. All matrix sizes are derived from it.
+"""Geometry of a patch: positions of its electrodes at rest, from which all matrix sizes are derived.
 
 The x axis is along an upper wire, y across the upper wires and z out of the skin; the lower layer is at
 z = 0.
@@ -21,15 +21,15 @@ PRESETS: Final = ("aligned", "symmetric", "staggered")
 PRESET_IDS: Final = {"custom": 0, "aligned": 1, "symmetric": 2, "staggered": 3}  # object 0x2000, layout id
 
 MOST_ELECTRODES: Final = 1024
-"""Maximum number of upper electrodes of a patch, for example 32 × 32. A covariance of their 3072 coordinates
-takes 75 MB, and the posterior stores several."""
+"""Maximum number of upper electrodes of a patch, for example 32 × 32. A covariance matrix of their 3072
+coordinates takes 75 MB, and the posterior stores several."""
 
 MOST_PAIRS: Final = 1 << 22
 """Maximum number of pairs of an upper and a lower electrode. Their distances take 100 MB, and each evaluation
 of all wires computes all of them."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
-"""Resolution of coordinates in the hash, m; layouts that agree to a nanometre count as equal."""
+"""Resolution of coordinates in the hash, m; layouts that agree to within a nanometre count as equal."""
 
 
 def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, finite: bool = True) -> Float:
@@ -45,7 +45,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         ValueError: If the value cannot be converted. The message names the argument, its value and the
             requirement.
     """
-    if (  # fast path: a host passes this with every frame
+    if (  # fast path: a host passes such an array with every frame
         type(value) is np.ndarray
         and value.dtype == np.float64
         and value.shape == shape
@@ -83,7 +83,7 @@ def _require_size(upper_wires: int, upper_electrodes: int, lower_wires: int, low
     if upper * lower > MOST_PAIRS:
         raise ValueError(
             f"lower_wires × lower_electrodes: got {lower_wires} × {lower_electrodes}, must be at most "
-            f"{MOST_PAIRS // upper} beside {upper} upper electrodes"
+            f"{MOST_PAIRS // upper} with {upper} upper electrodes"
         )
 
 
@@ -95,11 +95,11 @@ class PatchLayout:
         upper_m: (U, N, 3) electrodes of the U upper wires, metres; they move with the surface.
         lower_m: (K, M, 3) electrodes of the K lower wires, metres; they do not move.
         resistivity_ohm_per_m: Resistance of the rubber per metre between two electrodes, the paper's g.
-        name: Name of the layout, of a preset or any other.
+        name: Name of the layout, either a preset or any other name.
 
     Raises:
         ValueError: If a shape is wrong, a coordinate is NaN, the resistivity is not positive, an upper
-            electrode lies on a lower one, or a limit (:data:`MOST_ELECTRODES`,
+            electrode coincides with a lower electrode, or a limit (:data:`MOST_ELECTRODES`,
             :data:`MOST_PAIRS`) is exceeded.
     """
 
@@ -119,7 +119,7 @@ class PatchLayout:
         gaps = upper.reshape(-1, 1, 3) - lower.reshape(1, -1, 3)
         closest = float(np.sqrt(np.min(np.einsum("abi,abi->ab", gaps, gaps))))
         if closest < _HASH_RESOLUTION_M:
-            raise ValueError(f"upper_m: an electrode lies {closest} m from a lower one, must be farther")
+            raise ValueError(f"upper_m: an electrode is {closest} m from a lower electrode, must be farther")
         upper.setflags(write=False)
         lower.setflags(write=False)
         object.__setattr__(self, "upper_m", upper)
@@ -152,8 +152,9 @@ class PatchLayout:
         ``aligned``    lower wires straight along y and evenly spaced in x, electrodes offset from the upper
                        wires by a quarter pitch: the literal reading of the paper's figure
         ``symmetric``  as ``aligned`` without the offset; the Jacobian is close to singular
-        ``staggered``  lower layer half a pitch wider than the patch, electrode pitch 1.2, wires shifted in y
-                       by 0.43 (k mod 3 − 1) pitches; up to a thousand times better conditioned as measured
+        ``staggered``  lower layer half a pitch wider than the patch, electrodes 1.2 pitches apart, wires
+                       shifted in y by 0.43 (k mod 3 − 1) pitches; measured to be up to a thousand times
+                       better conditioned
 
         Args:
             name: ``aligned``, ``symmetric`` or ``staggered``.
@@ -161,8 +162,8 @@ class PatchLayout:
             height_m: Height of the upper electrodes above the lower layer, metres.
             upper_wires: Number of upper wires, U.
             upper_electrodes: Number of electrodes per upper wire, N.
-            lower_wires: Number of lower wires, K; default 3 N, for square systems.
-            lower_electrodes: Number of electrodes per lower wire, M; default U.
+            lower_wires: Number of lower wires, K; the default 3 N makes the systems square.
+            lower_electrodes: Number of electrodes per lower wire, M; the default is U.
             resistivity_ohm_per_m: ρ of the resistor ρ d between two electrodes at distance d, ohm/m.
 
         Raises:

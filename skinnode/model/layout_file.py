@@ -24,7 +24,7 @@ _MOST_ITEM_BYTES: Final = 32
 """Maximum size of one value: a complex long double, which is rejected later because of its type."""
 _LONGEST_KEY: Final = 40
 _MOST_HEADER_BYTES: Final = 10_240
-"""Maximum size of the data before the values; NumPy reads headers of up to 10,000 characters."""
+"""Maximum size of the data that precedes the values; NumPy reads headers of up to 10,000 characters."""
 
 
 def read_npz(path: Path) -> PatchLayout:
@@ -55,8 +55,8 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
     """Check the headers of an NPZ file before unpacking: a few megabytes can unpack to gigabytes.
 
     Raises:
-        ConfigError: If a member is unknown, duplicate, too large or uses another compression. zipfile and
-            NumPy raise their own errors if the file is not an NPZ file.
+        ConfigError: If a member is unknown, duplicate, too large or uses another compression method. zipfile
+            and NumPy raise their own errors if the file is not an NPZ file.
     """
     with zipfile.ZipFile(data) as members:
         seen: set[str] = set()
@@ -69,7 +69,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # others are unpacked all at once
+            ):  # other methods unpack all data at once
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
@@ -98,7 +98,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
     """Return the layout given by a table with the keys of :func:`read_npz`.
 
     Raises:
-        ConfigError: If a key is missing or unknown, or a value is impossible; the error names ``path``.
+        ConfigError: If a key is missing or unknown, or a value is invalid; the error names ``path``.
     """
     for key in _ARRAYS:
         if key not in table:
@@ -116,7 +116,7 @@ def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
 
 
 def impossible(error: ValueError, table: str = "", where: str = "") -> ConfigError:
-    """Convert an error of :class:`PatchLayout` to a ConfigError for the key in ``table``."""
+    """Convert an error from :class:`PatchLayout` to a ConfigError for the key in ``table``."""
     key, _, what = str(error).partition(": ")
     got, _, allowed = what.partition(", must be ")
     key = f"{table}.{key}" if table else key

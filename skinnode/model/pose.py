@@ -20,14 +20,14 @@ UNIT_TOLERANCE: Final = 1e-3
 class Pose:
     """Position and orientation of a patch's frame in the frame of the hand.
 
-    The x axis of the patch is along its upper wires, the z axis points out of the skin.
+    The patch's x axis is along its upper wires, and its z axis points out of the skin.
 
     Args:
         position_m: Origin of the patch's frame, metres.
         quaternion_xyzw: Orientation of the patch's frame, real part last.
 
     Raises:
-        ValueError: If a number is not finite, or the quaternion is not of unit length.
+        ValueError: If a number is not finite, or the quaternion does not have unit length.
     """
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -12,7 +12,7 @@ class Status(enum.IntEnum):
     CONVERGED = 0
     """The result is a root that passed all checks."""
     MAX_STEPS = 1
-    """The maximum number of steps was reached before the tolerance."""
+    """The maximum number of steps was reached before the tolerance was met."""
     DEADLINE = 2
     """The time limit was reached."""
     RADIUS_TOO_SMALL = 3
@@ -20,11 +20,11 @@ class Status(enum.IntEnum):
     STEP_TOO_SMALL = 4
     """The steps shrank below the tolerance, and the point is not a root."""
     ILL_CONDITIONED = 5
-    """The Jacobian is singular, resistances are missing, or the root may be a wrong one."""
+    """The Jacobian is singular, resistances are missing, or the root may be wrong."""
     NON_FINITE = 6
     """A value overflowed, or resistances were unusable."""
     INVALID_START = 7
-    """F or J is not finite at the start, which is returned unchanged (`solve_system`)."""
+    """F or J is not finite at the starting point, which is returned unchanged (`solve_system`)."""
     INCONSISTENT = 8
     """No deformation explains the resistances: χ² is far above what their noise allows."""
 

@@ -2,6 +2,6 @@
 
 ``tracker`` solves a live stream with the method that suits the patch: ``exact`` inverts each wire
 separately, ``posterior`` estimates the whole patch. ``root_gate`` checks doubtful wires of the exact inverse
-with the posterior, by the rules and thresholds of ``roots``. ``paths`` follows a recorded press. All of these
-use ``operators``, ``linalg`` and ``wires``.
+with the posterior, using the rules and thresholds in ``roots``. ``paths`` follows a recorded press. All of
+these use ``operators``, ``linalg`` and ``wires``.
 """

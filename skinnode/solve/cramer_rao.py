@@ -1,7 +1,7 @@
-"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ of a wire: how well the resistances determine a patch at rest.
+"""Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ of a wire: how precisely its resistances determine its rest position.
 
 J is the Jacobian of the relative residual a F − 1 at rest and σ the relative noise of each resistance.
-Standard deviations are in clearances; the clearance is the least distance at rest between an upper and a
+Standard deviations are in clearances; the clearance is the smallest distance at rest between an upper and a
 lower electrode.
 """
 
@@ -28,7 +28,7 @@ def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool =
 
     Args:
         layout: The patch.
-        relative_noise: A number or (U, K), standard deviation of R relative to R.
+        relative_noise: Relative standard deviation of R, a number or (U, K).
         normal_only: Whether only z is unknown.
 
     Returns:
@@ -39,7 +39,7 @@ def wire_std(layout: PatchLayout, relative_noise: ArrayLike, normal_only: bool =
     return _std(layout, np.broadcast_to(relative_noise, layout.shape), normal_only)
 
 
-@functools.lru_cache(maxsize=64)  # 3 ms per layout, and every path needs it
+@functools.lru_cache(maxsize=64)  # takes 3 ms per layout, and every path needs it
 def _unit_std(layout: PatchLayout, normal_only: bool) -> Float:
     return _std(layout, np.ones(layout.shape), normal_only)
 

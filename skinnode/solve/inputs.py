@@ -16,7 +16,7 @@ NOISE_MAX: Final = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeMap:
-    """Meaning of a converter's codes: R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
+    """Mapping from a converter's codes to R = (lo + code · step) · R0 · gain, for codes up to ``steps``."""
 
     baseline_ohm: Float
     """(U, K) R0, ohm; a code is invalid if its R0 is not positive and finite."""
@@ -27,11 +27,11 @@ class CodeMap:
     steps: int
     """Largest valid code."""
     rounding_ohm: Float
-    """(U, K) standard deviation of rounding to a code, ohm."""
+    """(U, K) standard deviation of the error from rounding to a code, ohm."""
     relative_noise: float
     """Relative standard deviation of the signal before the converter."""
     gain: Float | None = None
-    """(U, K) or (U, 1) gain of the front end; None for 1."""
+    """(U, K) or (U, 1) gain of the front end; None for a gain of 1."""
 
 
 def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:

@@ -1,7 +1,7 @@
 """Options of the trackers, with their defaults and checks.
 
-A constructor accepts an options object, keyword arguments of the same names, or both; keyword arguments take
-precedence.
+A constructor accepts an options object, keyword arguments with the same names, or both; keyword arguments
+take precedence.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ class EstimateOptions:
     """Options common to all trackers.
 
     Args:
-        relative_noise: A number or (U, K), standard deviation of R relative to R.
+        relative_noise: Relative standard deviation of R, a number or (U, K).
         baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
         rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
             on it.
-        estimate_noise: Whether to estimate a factor on ``relative_noise`` from the data.
+        estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
         drift: Gain errors to estimate: ``patch`` for one common gain of all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.
         model_error: Standard error of the forward model, as a fraction of the change of each resistance
-            (from thickness, electrode size and conductivity under strain): once as a common error, and 0.7 of
-            it independently per resistance.
+            (from thickness, electrode size and conductivity under strain): the full value for an error common
+            to all resistances, and 0.7 of it for an independent error of each resistance.
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.
         hold: Whether to keep the last solution of wires that changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
-            then are DEADLINE.
+            then have the status DEADLINE.
 
     Raises:
         ValueError: If an option is out of range.
@@ -73,7 +73,7 @@ class EstimateOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosteriorOptions(EstimateOptions):
-    """Options of :class:`skinnode.Posterior`: :class:`EstimateOptions` and two more.
+    """Options of :class:`skinnode.Posterior`: those of :class:`EstimateOptions` and two more.
 
     Args:
         scale_m: RMS normal displacement that the prior expects, metres; by default set from the data.
@@ -94,7 +94,7 @@ class PosteriorOptions(EstimateOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackerOptions(EstimateOptions):
-    """Options of :class:`skinnode.Tracker`: :class:`EstimateOptions` and some more.
+    """Options of :class:`skinnode.Tracker`: those of :class:`EstimateOptions` and five more.
 
     The method ``auto`` chooses the posterior if ``drift``, ``model_error`` or ``estimate_noise`` is set,
     since only the posterior supports them.
@@ -102,10 +102,10 @@ class TrackerOptions(EstimateOptions):
     Args:
         method: ``exact``, ``posterior`` or ``auto``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``; exact inverse only.
-        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; exact inverse only, which returns no forces
-            without it. The posterior's forces come from ``rubber``.
-        active_only: Whether only electrodes that contacts move are unknown; exact inverse only.
-        codes: Meaning of the codes passed to :meth:`skinnode.Tracker.update_codes`.
+        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; without it, the exact inverse returns
+            no forces. The posterior computes forces from ``rubber`` instead.
+        active_only: Whether to solve only for electrodes that contacts move; exact inverse only.
+        codes: Mapping from the codes passed to :meth:`skinnode.Tracker.update_codes` to resistances.
 
     Raises:
         ValueError: If an option is out of range.
@@ -177,7 +177,7 @@ def merged(kind: type[_Options], options: _Options | None, arguments: Any) -> _O
     """Return ``options``, or the defaults of ``kind``, overridden by the keyword arguments.
 
     Raises:
-        TypeError: If an argument names no option, or ``options`` is not of type ``kind``.
+        TypeError: If an argument is not an option, or ``options`` is not of type ``kind``.
         ValueError: If an option is out of range.
     """
     known = [field.name for field in dataclasses.fields(kind)]

@@ -2,8 +2,8 @@
 
 A wire is doubtful if it has no root, if it jumped, or if its displacement is too rough for a press. If a
 layout has folds within the reach of a press, every solved wire is doubtful, because F = b then has roots
-nearby that the inverse alone cannot tell apart. The posterior uses the neighbouring wires and confirms a
-doubtful wire, replaces its root or leaves it without one. The thresholds are in
+nearby that the inverse alone cannot tell apart. The posterior, which uses the neighbouring wires, confirms
+the root of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds are in
 :mod:`skinnode.solve.roots`.
 """
 
@@ -29,23 +29,27 @@ from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck,
 
 PAUSE: Final = 16
 """Number of frames without a posterior solve after the posterior missed a deadline; a futile solve in every
-frame costs 2 ms that other patches on the same thread are waiting for."""
+frame would delay other patches on the same thread by 2 ms."""
 APART: Final = 3.0
-"""Factor on the distance between a root near a fold and the posterior that confirms it. The product is added
-to the standard deviation, because two roots may lie closer than the posterior can tell apart."""
+"""Factor applied to the distance between a root near a fold and the posterior estimate that confirms it. The
+product is added to the standard deviation, because two roots may be too close for the posterior to
+distinguish."""
 NEAR_FOLD: Final = 2.0
-"""Factor on the standard deviation of a root near a fold that the posterior replaced, for the same reason."""
+"""Factor applied, for the same reason, to the standard deviation of a root near a fold that the posterior
+replaced."""
 
 Mask = NDArray[np.bool_]
 
 
 class RootGate:
-    """Checks every field of an exact tracker with the posterior of its patch. Not shared between owners.
+    """Gate that checks every field of an exact tracker with the posterior of its patch.
+
+    Do not share an instance between owners.
 
     Args:
         exact: Tracker whose fields are checked.
         posterior: Posterior of the same patch.
-        options: Options of both.
+        options: Options of both estimators.
     """
 
     def __init__(self, exact: ExactTracker, posterior: Posterior, options: TrackerOptions) -> None:
@@ -81,10 +85,10 @@ class RootGate:
             pitch_m=layout.pitch_m,
             rough_limit=roots.ROUGH_IN_STREAM / problem.step_limit,
         )
-        self._doubtful()  # compile now
+        self._doubtful()  # compiles the kernel before a stream starts
 
     def reset(self) -> None:
-        """Forget the stream."""
+        """Discard the state of the stream."""
         self._confirmed = None
         self._apart[:], self._any_apart = 0.0, False
         self._last_m[:] = 0.0
@@ -95,7 +99,7 @@ class RootGate:
 
         Args:
             field: Field of the exact tracker.
-            start: Time of :func:`time.perf_counter` at which the update began.
+            start: Value of :func:`time.perf_counter` when the update began, s.
         """
         doubtful: Mask | None = None
         if self._doubtful():
@@ -148,7 +152,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Leave the doubtful wires without a root because there is no time for a posterior solve."""
+        """Leave the doubtful wires without a root, for lack of time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0
@@ -162,7 +166,7 @@ class RootGate:
         )
 
     def _select(self, field: FieldFrame, doubtful: Mask, estimate: FieldFrame) -> FieldFrame:
-        """Confirm, replace or reject the doubtful roots by the posterior's estimate."""
+        """Confirm, replace or reject the doubtful roots using the posterior's estimate."""
         known = np.array(estimate.status) == Status.CONVERGED
         converged = np.array(field.status) == Status.CONVERGED
         spread = np.hypot(field.displacement_std_m, estimate.displacement_std_m)
@@ -218,7 +222,7 @@ class RootGate:
 
 
 def _selected(status: tuple[Status, ...], changed: Mask, replaced: Mask) -> tuple[Status, ...]:
-    """Return statuses with CONVERGED for ``replaced`` (U,), ILL_CONDITIONED for other ``changed`` roots."""
+    """Return statuses with CONVERGED for ``replaced`` (U,), ILL_CONDITIONED for other ``changed`` wires."""
     found = list(status)
     for u in np.flatnonzero(changed).tolist():
         if replaced[u]:

@@ -1,7 +1,7 @@
 """Rules and thresholds that decide which root of F = b is the true position of the skin.
 
 Zero residuals prove nothing, because F = b has several roots. The rules consider four things: the layout at
-rest (does it have folds, do its resistances depend on the electrodes at all), one root (its branch, its
+rest (does it have folds, and do its resistances depend on the electrodes at all), one root (its branch, its
 distance from rest, its roughness), two roots of one wire (which is likelier), and the posterior of the whole
 patch, which uses the neighbouring wires. The functions are pure; callers keep the state.
 
@@ -12,7 +12,7 @@ FOLDED             250    conditioning above which presses meet folds       6000
 BLIND              1e7    conditioning above which a root is meaningless    symmetric; aligned, h ≥ 1.5
 NEARLY_BLIND       1e5    conditioning above which UNLIKELY_BLIND applies   aligned from h = 1
 NONLINEAR          0.003  std, clearances, above which noise hides folds    not measured
-JUMP               0.2    move between frames, clearances, to be checked    folds passed from 0.24
+JUMP               0.2    move between frames, clearances, to be checked    folds crossed from 0.24
 LARGE              0.03   displacement, clearances, that must be smooth     folds lie farther out
 ROUGH_IN_STREAM    1.2    roughness / size, checked with the posterior      presses 0.5 to 1.7, wrong 1 to 2
 ROUGH_AT_PATH_END  0.8    roughness / size that triggers a second attempt   presses 0.67, wrong 0.7 to 2
@@ -25,7 +25,7 @@ UNLIKELY_BLIND     16     energy margin for nearly blind wires              not 
 REFEREE_NOISE      1e-5   least noise of a posterior that checks roots      not measured
 AGREE              6      standard deviations up to which roots agree       not measured
 NEAR               0.25   first correction, clearances, when tracking       not measured
-FAR                0.1    move, clearances, before annealing is compared    folds passed from 0.3
+FAR                0.1    move, clearances, before annealing is compared    folds crossed from 0.3
 LIKELIER           4      energy margin of a second annealing               a wrong maximum lost by 23
 SUSPICIOUS         3      nuisance, prior std, that triggers a check        not measured
 BELIEVABLE         5      nuisance, prior std, that rejects a frame         not measured
@@ -51,17 +51,17 @@ Mask = NDArray[np.bool_]
 # -- the layout ---------------------------------------------------------------------------------------------
 
 FOLDED: Final = 250.0
-"""RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. It is 70 on staggered at h =
-0.5, where none of 6000 wires did, and at least 1200 on staggered from h = 1 and on aligned and symmetric,
-where one in 30 ends on a wrong root."""
+"""RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. It is 70 for staggered
+at h = 0.5, where none of 6000 wires did, and at least 1200 for staggered from h = 1 on and for aligned and
+symmetric, where one wire in 30 ends at a wrong root."""
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
-while R changes in its seventh digit. Wires on a symmetry line of the layout are blind, because each of their
-roots has a mirror image. The only other blind wires are those 1.5 pitches or more above aligned lower
+while R changes only in its seventh digit. Wires on a symmetry line of the layout are blind, because each of
+their roots has a mirror image. The only other blind wires are those 1.5 pitches or more above aligned lower
 wires."""
 NEARLY_BLIND: Final = 1e5
-"""RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; exceeded on
-aligned from h = 1."""
+"""RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; aligned
+exceeds it from h = 1."""
 NONLINEAR: Final = 0.003
 """Standard deviation of the exact inverse, in clearances, above which F is not linear within the noise; roots
 are then as doubtful as near a fold."""
@@ -69,65 +69,66 @@ are then as doubtful as near a fold."""
 # -- one root -----------------------------------------------------------------------------------------------
 
 JUMP: Final = 0.2
-"""Move of an electrode between two frames, in clearances, above which the next root may be wrong; moves from
-0.24 on were seen to pass folds."""
+"""Move of an electrode between two frames, in clearances, above which the next root may be wrong; moves of
+0.24 and more were observed to cross folds."""
 LARGE: Final = 0.03
 """Displacement, in clearances, above which the roughness is checked; folds lie at larger displacements."""
 ROUGH_IN_STREAM: Final = 1.2
 """Ratio of roughness to size of a displacement above which a live stream checks it with the posterior.
-Presses have 0.5 to 1, or up to 1.7 if they move a single electrode; wrong roots have 1 to 2."""
+The ratio is 0.5 to 1 for presses, up to 1.7 if they move a single electrode, and 1 to 2 for wrong roots."""
 ROUGH_AT_PATH_END: Final = 0.8
 """Ratio of roughness to size of a displacement above which the end of a path is solved again from the
-smoothest displacement. Presses have 0.67 on average, nine of ten less than 0.9, and up to 1.9 if they move a
-single electrode; wrong roots have 0.7 to 2."""
+smoothest displacement. The ratio is 0.67 on average for presses, below 0.9 for nine of ten, up to 1.9 if they
+move a single electrode, and 0.7 to 2 for wrong roots."""
 STILL_CONFIRMED: Final = 0.2
 """Relative change of a displacement since its confirmation up to which a rough wire is not checked again."""
 
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Distance of two solutions, relative to the displacement, up to which they are the same root."""
+"""Distance between two solutions, relative to the displacement, up to which they are the same root."""
 TWIN_REACH: Final = 2.0
-"""Largest distance of a twin worth solving for, relative to the largest displacement of the wire. Twins
-farther away were at least 1.3 times as rough on staggered, h = 0.3 to 1."""
+"""Largest distance to a twin root that is worth solving for, relative to the largest displacement of the
+wire. Twins farther away were at least 1.3 times as rough on staggered, h = 0.3 to 1."""
 TWIN_ROUGHNESS: Final = 1.05
 """Ratio of roughness above which the smoother of two roots at a fold is accepted. Over 82 random presses of
-50 % on staggered, h = 1, the twins of wrong roots were at most 1.044 times as rough. 4 of 100 right roots
-have a twin within the ratio and lose their CONVERGED. In 60 further presses of each depth and height (6710
-wires, h = 0.3 to 1) no wrong root ended CONVERGED; in 40 others (4510 wires) one did."""
+50 % on staggered, h = 1, the twins of wrong roots were at most 1.044 times as rough. Of 100 correct roots,
+4 have a twin within the ratio and lose the status CONVERGED. In 60 further presses of each depth and height
+(6710 wires, h = 0.3 to 1) no wrong root was reported as CONVERGED; in 40 others (4510 wires) one was."""
 UNLIKELY: Final = 4.0
-"""Energy by which other roots must be less likely. In 1530 pairs of roots of presses of 30 to 70 % on
-staggered, h = 1, and aligned, h = 0.5, the wrong root was likelier in 19 pairs, by at most 1.4; in a second
-set of the same size, by at most 2.6. A root at the end of a path is no safer: with paths of 5 samples, the
-wrong root was likelier by up to 2.5 as well."""
+"""Energy margin by which other roots must be less likely. In 1530 pairs of roots from presses of 30 to 70 %
+on staggered, h = 1, and aligned, h = 0.5, the wrong root was likelier in 19 pairs, by at most 1.4; in a
+second set of the same size, it was likelier by at most 2.6. A root at the end of a path is no safer: with
+paths of 5 samples, the wrong root was likelier by up to 2.5 as well."""
 UNLIKELY_BLIND: Final = 16.0
-"""Energy by which other roots must be less likely on nearly blind wires, which may have roots that were not
-found."""
+"""Energy margin by which other roots must be less likely on nearly blind wires, which may have undiscovered
+roots."""
 
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
 REFEREE_NOISE: Final = 1e-5
-"""Smallest relative noise of a posterior that checks roots; with less it is drawn to roots itself."""
+"""Smallest relative noise of a posterior that checks roots; with less noise, it is itself drawn to roots."""
 AGREE: Final = 6.0
-"""Standard deviations within which the posterior confirms a root."""
+"""Number of standard deviations within which the posterior confirms a root."""
 NEAR: Final = 0.25
-"""Largest first correction of an electrode, in clearances; after a larger one the estimate is annealed."""
+"""Largest first correction of an electrode, in clearances; after a larger one, annealing is used instead."""
 FAR: Final = 0.1
 """Move of an electrode, in clearances, after which the estimate is compared with one annealed from rest.
-Without the comparison, presses of 0.3 or more passed folds frame by frame and went unnoticed."""
+Without the comparison, presses of 0.3 or more crossed folds unnoticed, frame by frame."""
 LIKELIER: Final = 4.0
-"""Energy by which an estimate from a second annealing must be likelier. A smaller gain means the same
-maximum, moved closer to the loads found; the wrong maximum that occurred was worse by 23."""
+"""Energy margin by which an estimate from a second annealing must be likelier to replace the first. A smaller
+gain indicates the same maximum, shifted towards the loads found; the wrong maximum observed was worse by
+23."""
 SUSPICIOUS: Final = 3.0
 """Value of a nuisance, in prior standard deviations, above which the estimate is compared with an annealed
-one and never held. A drift or model error can stand in for a displacement, and a stream would not recover."""
+estimate and never held. A drift or model error can mimic a displacement, and a stream would not recover."""
 BELIEVABLE: Final = 5.0
 """Value of a nuisance, in prior standard deviations, above which the frame is INCONSISTENT."""
 IMPOSSIBLE_CHANCE: Final = 1e-9
 """Probability per frame that the χ² test reports a wire that obeys the model as INCONSISTENT."""
 Z_REFUSE: Final = 5.998
-"""Normal quantile of 1 − 1e-9, at whose χ² a tall system becomes INCONSISTENT: by chance once in four months
-at 100 frames/s. Wrong roots and wrong values cause larger χ²."""
+"""Normal quantile of 1 − 1e-9; its χ² is the limit above which a tall system is INCONSISTENT. At 100
+frames/s, this happens by chance once in four months. Wrong roots and wrong values cause larger χ²."""
 
 
 def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
@@ -149,9 +150,8 @@ def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reac
     """Return the wires (U,) whose solve reached a root on the branch of the rest position, within reach.
 
     On this branch the determinant of J has the same sign as at rest. A system with more equations than
-    unknowns has no determinant; its sign is 0. Within reach, no electrode moves farther than its clearance
-    from the lower layer (
-    :meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
+    unknowns has no determinant; the sign is then 0. A root is within reach if no electrode moves farther than
+    its clearance from the lower layer (:meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
 
     Args:
         status: (U,) statuses of the solves.
@@ -195,7 +195,7 @@ def agrees(gap: Float, reach: Float) -> Mask:
 
 
 def still_confirmed(displacement: Float, confirmed: Float) -> Mask:
-    """Return the wires (U,) whose displacement (U, N, 3) hardly changed since it was confirmed."""
+    """Return the wires (U,) whose displacement (U, N, 3) has hardly changed since it was confirmed."""
     change = np.abs(displacement - confirmed).max(axis=(1, 2))
     return ~np.asarray(change > STILL_CONFIRMED * np.abs(displacement).max(axis=(1, 2)))
 

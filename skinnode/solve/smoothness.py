@@ -1,9 +1,9 @@
 """Gaussian covariance of the displacement of one upper wire, a model of the smoothness of rubber.
 
-C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance of two electrodes at rest. This is a
-weaker assumption than the elasticity of a patch and needs no material constant. It provides starts for
-solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the smaller roughness
-√(uᵀ C⁻¹ u) is likelier.
+C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance between two electrodes at rest. This
+is a weaker assumption than elasticity of the patch and needs no material constant. It provides starting
+points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the smaller
+roughness √(uᵀ C⁻¹ u) is likelier.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
-"""Correlation length ℓ, pitches. At 1.0 the guided start finds 3204 of the 3209 wires that are on the branch
-of the rest position, in 82 random presses each of 70 % on staggered, h = 0.5, and of 10, 30 and 50 % on
-h = 1; 0.7 and 1.5 lose more."""
+"""Correlation length ℓ, pitches. At 1.0, the guided start finds 3204 of the 3209 wires that are on the branch
+of the rest position in 82 random presses each of 70 % on staggered, h = 0.5, and of 10, 30 and 50 % on
+staggered, h = 1; values of 0.7 and 1.5 find fewer."""
 ROUGH_SHARE: Final = 1e-3
 """Relative increase of the diagonal of C, so that C⁻¹ exists in floating point."""
 
@@ -54,7 +54,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) and its whitening for displacements of ``size``, pitches, which hardly matters."""
+    """Return C (U, n, n) and its whitening for displacements of ``size``, pitches; the size is uncritical."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

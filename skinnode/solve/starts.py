@@ -1,8 +1,8 @@
-"""Starts for solving a sample or frame that cannot be reached from an earlier solution.
+"""Starting points for a sample or frame that cannot be solved from an earlier solution.
 
 guided_start   finds the smooth displacement that explains the resistances, the maximum a posteriori estimate,
-               while the noise is lowered in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4)
-near_twin      if J is nearly singular, a second root lies nearby on the other side of the fold. To second
+               lowering the assumed noise in steps (data-space Gauss-Newton, Tarantola 2005, section 3.4)
+near_twin      estimates the second root, which lies nearby across the fold if J is nearly singular. To second
                order, along the direction v of the smallest singular value σ, σ α + ½ α² wᵀF″[v, v] = 0 puts
                the twin at α = −2σ / wᵀF″[v, v] (Golubitsky & Schaeffer 1985, chapter I.3)
 """
@@ -23,7 +23,7 @@ from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEVELS: Final[Float] = np.power(10.0, -0.5 * np.arange(2.0, 16.0))
 """Noise levels of r in the guided start, 0.1 to 3e-8, with one step per level. Steps of a whole decade lose
-one more wire in a hundred at h = 1 and 50 %."""
+one more wire in a hundred in presses of 50 % at h = 1."""
 POWER_STEPS: Final = 8
 """Number of inverse iterations; the second-smallest singular value is about 3 times the smallest."""
 DIFFERENCE: Final = 1e-4
@@ -38,10 +38,10 @@ def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) 
         wire: Index of the upper wire.
         a: (K,) R · gain of the wire.
         covariance: (n, n) prior covariance of the displacement, pitches². Any covariance works; that of
-            elastic rubber would also use the neighbouring wires.
+            elastic rubber would also involve the neighbouring wires.
 
     Returns:
-        (n,) position, pitches, and the number of evaluations of F with J. The position is the rest position
+        (n,) position, pitches, and the number of evaluations of F and J. The position is the rest position
         if the iteration runs into an electrode.
     """
     n, equations = problem.rest.shape[1], a.size
@@ -112,7 +112,7 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
 
 
 def near_twin(problem: PatchProblem, x: Float, a: Float, inverse: Float) -> Float:
-    """Estimate the root on the other side of the nearest fold from two Jacobians.
+    """Estimate, from two Jacobians, the root on the other side of the nearest fold.
 
     Args:
         problem: The patch.

@@ -23,17 +23,18 @@ from skinnode.solve.root_gate import RootGate
 
 EXACT_STD: Final = 0.0025
 """Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses it: 2.5 % of a
-press of a tenth of the layer. With 16-bit codes it is 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
+press by a tenth of the layer. With 16-bit codes it is 0.0005 on staggered, h = 0.5, and 0.05 on aligned."""
 
 
 class Tracker:
-    """Tracks one patch through a stream of frames.
+    """Tracker of one patch through a stream of frames.
 
-    Not shared between owners. Compiled code releases the GIL. The constructor compiles the kernels.
+    Do not share an instance between owners. Compiled code releases the GIL. The constructor compiles the
+    kernels.
 
     Args:
         layout: The patch.
-        options: Options of the tracker; default :class:`skinnode.solve.options.TrackerOptions()`.
+        options: Options of the tracker; the default is :class:`skinnode.solve.options.TrackerOptions()`.
         **arguments: Options by name, which override ``options``.
 
     Attributes:
@@ -75,7 +76,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream: the next frame is solved from the rest position."""
         self._posterior.reset()
         if self._exact is not None:
             self._exact.reset()
@@ -84,7 +85,7 @@ class Tracker:
     def update(
         self, frame_ohm: ArrayLike, valid: ArrayLike | None = None, relative_noise: ArrayLike | None = None
     ) -> FieldFrame:
-        """Solve the displacement field of one frame.
+        """Compute the displacement field of one frame.
 
         No resistance value raises an exception. A wire that could not be solved keeps its last trusted
         position, with an infinite standard deviation and a status other than CONVERGED.
@@ -92,7 +93,7 @@ class Tracker:
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: A number or (U, K), noise of this frame only. Resistances whose noise is not
+            relative_noise: Noise of this frame only, a number or (U, K). Resistances whose noise is not
                 positive and finite are ignored.
 
         Returns:
@@ -107,22 +108,23 @@ class Tracker:
         return self._gate.check(self._exact.update(frame_ohm, valid, relative_noise), start)
 
     def update_codes(self, codes: NDArray[np.uint32]) -> tuple[FieldFrame, int]:
-        """Solve the field of a scan given as codes, much faster than decoding and :meth:`update`.
+        """Compute the field of a scan of codes, much faster than decoding followed by :meth:`update`.
 
         Args:
-            codes: (U, K) uint32, with the meaning passed to the constructor as ``codes``.
+            codes: (U, K) uint32, converted by the mapping passed to the constructor as ``codes``.
 
         Returns:
-            The field, as from the decoded resistances and their noise, and the number of invalid codes.
+            The field that the decoded resistances and their noise would give, and the number of invalid
+            codes.
 
         Raises:
             ValueError: If the shape or type is wrong, the tracker was created without ``codes``,
                 or its :attr:`method` is ``posterior``.
         """
         if self._exact is None:
-            raise ValueError("method: got 'posterior', must be exact to take codes")
+            raise ValueError("method: got 'posterior', must be exact to accept codes")
         if self.options.codes is None:
-            raise ValueError("codes: got none, must be given on construction to take codes")
+            raise ValueError("codes: got None, must be a CodeMap passed to the constructor")
         start = perf_counter()
         field = self._gate.check(self._exact.update_codes(codes), start)
         return field, self._exact.invalid_codes

@@ -379,8 +379,7 @@ def test_integers_have_64_bits(number: str, place: str, tmp_path: Path) -> None:
         ),
         (
             (32, 32, 96, 254),
-            "lower_wires × lower_electrodes: got 96 × 254, "
-            "allowed: at most 4096 beside 1024 upper electrodes",
+            "lower_wires × lower_electrodes: got 96 × 254, allowed: at most 4096 with 1024 upper electrodes",
         ),
     ],
 )

@@ -95,7 +95,7 @@ def test_scale_of_a_wire_with_one_electrode_is_its_clearance():
         ((np.ones((1, 1, 3)), np.zeros((1, 2, 2))), r"lower_m: got shape \(1, 2, 2\), must be \(K, M, 3\)"),
         ((np.ones((0, 1, 3)), np.zeros((1, 1, 3))), "every length must be at least 1"),
         ((np.full((1, 1, 3), np.nan), np.zeros((1, 1, 3))), r"upper_m: got nan at \[0, 0, 0\]"),
-        ((np.zeros((1, 1, 3)), np.zeros((1, 1, 3))), "upper_m: an electrode lies 0.0 m from a lower one"),
+        ((np.zeros((1, 1, 3)), np.zeros((1, 1, 3))), "upper_m: an electrode is 0.0 m from a lower electrode"),
         (
             (np.ones((1, 1, 3)), np.zeros((1, 1, 3)), -1.0),
             "resistivity_ohm_per_m: got -1.0, must be positive",

@@ -369,7 +369,7 @@ def code_map(layout: sk.PatchLayout) -> CodeMap:
 
 def test_codes_that_mean_nothing_are_refused(layout: sk.PatchLayout) -> None:
     codes = np.zeros(layout.shape, np.uint32)
-    with pytest.raises(ValueError, match="method: got 'posterior', must be exact to take codes"):
+    with pytest.raises(ValueError, match="method: got 'posterior', must be exact to accept codes"):
         sk.Tracker(layout, method="posterior", codes=code_map(layout)).update_codes(codes)
     with pytest.raises(ValueError, match="codes: got none, must be given on construction"):
         sk.Tracker(layout, method="exact").update_codes(codes)

@@ -3,17 +3,16 @@
 With ``normal_only``, x and y of every electrode stay at rest. With ``active_only``, electrodes that no
 contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the electrode
 that explains most of the residual joins the unknowns together with its neighbours; once more than half have
-joined, all do. All electrodes return to rest when the rest position explains the frame. The standard
-deviation of an omitted coordinate is the move at which χ² would notice its electrode if no other moved, to
-first order at
-rest: √(quantile − degrees of freedom) σ / ‖its column of J outside the range of the unknowns and of the
-electrode's other columns‖.
+joined, all of them join. All electrodes return to rest when the rest position explains the frame. The
+standard deviation of an omitted coordinate is the smallest move that χ² would detect if no other electrode
+moved, to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J outside the
+range of the unknowns and of the electrode's other columns‖.
 
 Both options are assumptions about the skin, and the standard deviations of the unknowns are valid only if the
 assumption is. χ² tests the assumption of active_only well. It tests that of normal_only less well, because a
-smooth shear resembles a slope of z. On staggered, h = 0.5, noise 1e-5, a strong Hertzian press with a shear
-of 0.3 of its depth is rejected; a weaker press is accepted with errors of z up to 16 of its small standard
-deviations, or 0.2 % of h. Allowing for this would cost more than solving for the shear.
+smooth shear resembles a gradient of z. On staggered, h = 0.5, noise 1e-5, a strong Hertzian press with a
+shear of 0.3 of its depth is rejected; a weaker press is accepted with errors in z of up to 16 of its small
+standard deviations, or 0.2 % of h. Allowing for this would cost more than solving for the shear.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from skinnode.solve.wires.hold import Z_HOLD, chi2_quantile
 from skinnode.solve.wires.stages import DEADLINE, STALE
 
 Z_WIDEN: Final = 3.719
-"""Normal quantile of the χ² probability, 1 − 1e-4, at which electrodes join; at 100 frames/s, a long press
-gains one electrode by chance every 100 s."""
+"""Normal quantile of the χ² probability, 1 − 1e-4, at which electrodes join the unknowns; at 100 frames/s, a
+long press gains one electrode by chance every 100 s."""
 TINY: Final = 1e-200
 """Smallest squared slope used as a divisor: far below real slopes, yet large enough to avoid overflow."""
 
 
 class LeftOut:
-    """Electrodes of a stream that have no unknowns, and the moves of them that would go unnoticed."""
+    """Electrodes omitted from the unknowns of a stream, and the size of moves that would go unnoticed."""
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -63,7 +62,7 @@ class LeftOut:
         )
 
     def reset(self) -> None:
-        """Forget the stream; with ``active_only``, start with all electrodes at rest."""
+        """Discard the state of the stream; with ``active_only``, start with all electrodes at rest."""
         self._unnoticed_weight[:] = 0.0
         if self._active_only:
             for u in range(self._layout.shape[0]):
@@ -94,7 +93,7 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Add electrodes to the unknowns of processed wires that are unexplained; return these wires (U,).
+        """Add electrodes to the unknowns of processed wires whose residual is unexplained; return them (U,).
 
         Sets ``turns`` (U,) to False for wires reached after the deadline.
         """
@@ -133,7 +132,7 @@ class LeftOut:
             if most:
                 seen = _outside(slopes[group, :most].reshape(-1, lower), unknown).reshape(-1, most, lower)
                 power, direction = np.linalg.eigh(seen @ seen.transpose(0, 2, 1))
-                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # below this, power is only rounding
+                power = np.maximum(power, op.EPS * power[:, -1:] + TINY)  # smaller values are rounding errors
                 unnoticed[group, :most] = least * np.sqrt((direction**2 / power[:, None]).sum(axis=2))
 
     def _explained(self) -> NDArray[np.bool_]:
@@ -146,7 +145,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add electrodes of wire u until they explain the frame; undo this if all of them do not."""
+        """Add electrodes of wire u until they explain the frame; undo this if even all of them do not."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:

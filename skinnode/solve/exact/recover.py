@@ -1,4 +1,4 @@
-"""Recovery of wires for which no solve of a frame found an acceptable root.
+"""Recovery of wires for which no solve in a frame found an acceptable root.
 
 bridge     interpolates R from the last trusted frame to the new frame and solves each substep
 restart    bridges from the rest position
@@ -21,16 +21,16 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps of successive bridges. On staggered, h = 0.5, from rest, 3 substeps solve every wire of
-a 50 % press between two frames, and 5 solve all but one of 24 at 70 %. Adaptive steps restricted to the
-trusted branch do worse, because the straight line crosses singular points that the press avoids."""
+"""Number of substeps of successive bridges. On staggered, h = 0.5, from rest, 3 substeps solve every wire if
+a 50 % press occurs between two frames, and 5 solve all but one of 24 at 70 %. Adaptive steps restricted to
+the trusted branch do worse, because the straight line crosses singular points that the press avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
 """Tolerance of bridge substeps: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20
 """Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
 """Maximum total steps of all bridges of a frame, about 15 ms; a broken frame must not stall the stream."""
-# Levenberg-Marquardt is the most robust operator for gaps, whatever the operator of the stream.
+# Levenberg-Marquardt is the most robust operator for gaps, regardless of the stream's operator.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
 
@@ -86,7 +86,8 @@ def _bridge(  # noqa: PLR0913 - both ends of the bridge
     """Solve wire u along a straight line from its resistances ``a_from`` (K,) to those of the frame.
 
     Only the last point counts: the line is not a deformation of rubber, so intermediate points may lie on any
-    branch. The outcome is in the solver's report of the wire. Returns False if the deadline interrupts it.
+    branch. The outcome is in the solver's report of the wire. Returns False if the deadline interrupts the
+    bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]
     between = stream.arrays.a.copy()

@@ -26,12 +26,12 @@ from skinnode.solve.wires.patch_solver import PatchSolver
 from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
-"""Tolerance of r and, in pitches, of x: four orders of magnitude below a 24-bit converter, and one Newton
-step from 1e-5."""
+"""Tolerance of r and, in pitches, of x: four orders of magnitude below the noise of a 24-bit converter, and
+one Newton step from 1e-5."""
 FRAME_STEPS: Final = 12
 """Maximum steps per solve; quadratic convergence from within the trust region takes 3 to 6."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
-"""Tasks of every solve that may be the last one of a frame."""
+"""Tasks of every solve that may be the last in a frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class Frame:
     order: Index
     """(U,) wires in processing order."""
     until: float
-    """Deadline as a time of ``perf_counter``, s; inf for none."""
+    """Deadline on the ``perf_counter`` clock, s; inf if there is none."""
 
     @property
     def expired(self) -> bool:
@@ -52,7 +52,9 @@ class Frame:
 
 
 class StreamState:
-    """Solver and arrays of one stream, modified in place by parts of the tracker. Not shared between owners.
+    """Solver and arrays of one stream, modified in place by the parts of the tracker.
+
+    Do not share an instance between owners.
 
     Args:
         problem: The patch in solver units.
@@ -100,8 +102,8 @@ class StreamState:
         Args:
             todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
             frame: Frame with σ and the order of the wires.
-            a: (U, K) resistances; default those of the frame.
-            options: Solver options; default those of the stream.
+            a: (U, K) resistances; the default is those of the frame.
+            options: Solver options; the default is those of the stream.
             units: As in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(
@@ -139,5 +141,5 @@ class StreamState:
         return np.asarray(relative_residual(a, (1.0 / np.sqrt((gaps**2).sum(axis=2))).sum(axis=(0, 1))))
 
     def a_at(self, x: Float) -> Float:
-        """Return the a (K,) of a wire that has its root at ``x`` (3N,), pitches."""
+        """Return the ``a`` (K,) for which a wire has its root at ``x`` (3N,), pitches."""
         return np.asarray(1.0 / (1.0 + self.relative_residual(x, np.ones(self.problem.layout.shape[1]))))

@@ -1,10 +1,10 @@
-"""Exact tracker: solves each frame of a live stream from the previous frame, as the paper follows a path.
+"""Exact tracker: solves each frame of a live stream starting from the last, as the paper follows a path.
 
 hold       keep the position of a wire whose resistances changed no more than their noise (see ``hold``)
 predict    move by (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, which the covariance needed anyway
 follow     take simplified Newton steps with the same J⁻¹ while it is still accurate enough
 correct    otherwise iterate the operator, to a tolerance far below any noise
-widen      add an omitted electrode that seems to move to the unknowns (see ``leave_out``)
+widen      add an omitted electrode to the unknowns if it seems to move (see ``leave_out``)
 recover    bridge a wire that fails, or give it up (see ``recover``)
 
 The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
@@ -35,32 +35,33 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Maximum time of one evaluation of F and J with its step, s. Each call solves as many wires as certainly fit
-into the remaining time, because ten calls instead of one cost as much as solving ten wires."""
+"""Maximum time of one evaluation of F and J with its step, s. Each call solves as many wires as are certain
+to fit into the remaining time, because ten calls instead of one cost as much as solving ten wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 """Maximum cost of a wire per frame, in evaluations."""
 
 
 class ExactTracker:
-    """Tracks one patch by the exact inverse of each wire.
+    """Tracker of one patch by the exact inverse of each wire.
 
-    Not shared between owners; compiled code releases the GIL.
+    Do not share an instance between owners. Compiled code releases the GIL.
 
     Args:
         layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
-        relative_noise: Standard deviation of R relative to R, a number or (U, K).
+        relative_noise: Relative standard deviation of R, a number or (U, K).
         baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
-        stiffness_n_per_m: k of the paper's law F = k Δs, N/m; if given, fields contain forces.
+        stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, fields contain forces.
         hold: Whether to keep the position of a wire whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one solve of a wire. Wires not
-            processed by then are DEADLINE with an infinite standard deviation; they come first in the next
-            frame.
+            processed by then have the status DEADLINE and an infinite standard deviation; they come first in
+            the next frame.
         normal_only: Whether only z is unknown.
-        active_only: Whether only electrodes that contacts move are unknown.
-        codes: Meaning of the codes passed to :meth:`update_codes`.
+        active_only: Whether to solve only for electrodes that contacts move.
+        codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
 
-    The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or range.
+    The constructor compiles the kernels. Raises ValueError if an argument has the wrong shape or is out of
+    range.
     """
 
     def __init__(  # noqa: PLR0913 - keyword arguments of the public interface
@@ -111,7 +112,7 @@ class ExactTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream: the next frame is solved from the rest position."""
         self._stream.reset()
         self._left_out.reset()
         self.arrays.order[:], self._waiting = self._in_order, False
@@ -130,8 +131,8 @@ class ExactTracker:
         No resistance value raises an exception. A wire with fewer usable resistances than unknowns is
         ILL_CONDITIONED, or NON_FINITE if resistances not marked as missing were unusable. Such a wire, and
         any wire that no solve brings to a root, keeps its last trusted position with an infinite standard
-        deviation; its residual is computed there, or is inf if the deadline left no time. Raises ValueError
-        if a shape is wrong.
+        deviation; its residual is computed at that position, or is inf if the deadline left no time. Raises
+        ValueError if a shape is wrong.
         """
         start = perf_counter()
         arrays = self.arrays
@@ -147,14 +148,14 @@ class ExactTracker:
         """Return the field of a scan of codes (U, K), as :meth:`update` does for resistances.
 
         Afterwards :attr:`arrays` contains the resistances and :attr:`invalid_codes` the number of invalid
-        codes. Raises ValueError if ``codes`` has another shape or is not uint32.
+        codes. Raises ValueError if ``codes`` has the wrong shape or is not uint32.
         """
         start = perf_counter()
         self.arrays.codes[:] = checked_codes(codes, self.layout)
         return self._advance(stage.DECODE | stage.SCALE, start)
 
     def _advance(self, stages: int, start: float) -> FieldFrame:
-        """Return the field of the frame in :attr:`arrays`; run ``stages`` before its solve."""
+        """Run ``stages`` on the frame in :attr:`arrays`, solve it and return its field."""
         solver, arrays = self._stream.solver, self.arrays
         sigma, until, units = self._sigma, start + self._seconds, math.inf
         if self._leaves_out:
@@ -225,7 +226,7 @@ class ExactTracker:
         return residual
 
     def _complete(self) -> None:
-        """Write the a that the missing equations of solved wires would have."""
+        """Write the values of ``a`` that the missing equations of solved wires would have."""
         stream, arrays = self._stream, self.arrays
         solved = arrays.good & (stream.solver.report[:, wires.HELD] == 0)
         for u in np.flatnonzero(solved & (arrays.used == 0).any(axis=1)).tolist():
@@ -244,7 +245,7 @@ class ExactTracker:
             arrays.predictable[u] = False
 
     def distrust(self, wires_: NDArray[np.bool_]) -> None:
-        """Solve these wires (U,) from rest in the next frame, whatever the outcome of this one."""
+        """Solve these wires (U,) from rest in the next frame, whatever the outcome in this frame."""
         problem, arrays = self._stream.problem, self.arrays
         arrays.x[wires_], arrays.a_solved[wires_] = problem.rest[wires_], problem.a_rest[wires_]
         arrays.predictable[wires_] = False

@@ -17,7 +17,7 @@ OLD = {
 def test_an_old_path_finds_the_same_object_and_warns(old: str) -> None:
     new, *names = OLD[old]
     for name in names:
-        with pytest.warns(DeprecationWarning, match=f"{old}.{name} is {new}.{name} now"):
+        with pytest.warns(DeprecationWarning, match=f"{old}.{name} has moved to {new}.{name}"):
             found = getattr(import_module(old), name)
         assert found is getattr(import_module(new), name)
 

@@ -116,7 +116,7 @@ def test_bad_geometry_is_named(arguments, complaint):
         ({"pitch_m": 0.0}, "pitch_m: got 0.0, must be positive"),
         ({"height_m": float("nan")}, "height_m: got nan"),
         ({"upper_wires": 0}, "upper_wires: got 0, must be at least 1"),
-        ({"lower_wires": 10**6, "lower_electrodes": 10**6}, "must be at most 41943 beside 100 upper"),
+        ({"lower_wires": 10**6, "lower_electrodes": 10**6}, "must be at most 41943 with 100 upper"),
     ],
 )
 def test_bad_presets_are_named(options, complaint):

@@ -371,7 +371,7 @@ def test_codes_that_mean_nothing_are_refused(layout: sk.PatchLayout) -> None:
     codes = np.zeros(layout.shape, np.uint32)
     with pytest.raises(ValueError, match="method: got 'posterior', must be exact to accept codes"):
         sk.Tracker(layout, method="posterior", codes=code_map(layout)).update_codes(codes)
-    with pytest.raises(ValueError, match="codes: got none, must be given on construction"):
+    with pytest.raises(ValueError, match="codes: got None, must be a CodeMap passed to the constructor"):
         sk.Tracker(layout, method="exact").update_codes(codes)
     tracker = sk.Tracker(layout, method="exact", codes=code_map(layout))
     for wrong in (codes[:1], codes.astype(np.int64), codes.tolist(), codes.T, None):

@@ -1,4 +1,4 @@
-"""Bus and node that a command works on, as given by its options: an interface, or a bus of a hand file."""
+"""Finds the bus and node for a command from its options: an interface, or a bus of a hand file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus and the hand that it belongs to."""
+    """A bus, and the hand to which it belongs."""
 
     bus: BusConfig
     hand: HandConfig | None
@@ -126,7 +126,7 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and node-ID of NODE: a node-ID, or the name of a patch on any bus of the hand.
+    """Return the bus and node-ID for NODE, which is a node-ID or the name of a patch on any bus of the hand.
 
     The other arguments are as for :func:`find_buses`.
 
@@ -143,7 +143,7 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
     Args:
         node: A node-ID or the name of a patch.
         places: Buses to search.
-        key: Name of the argument with the value ``node``, for error messages.
+        key: Name of the command-line argument that ``node`` comes from, for error messages.
 
     Raises:
         ConfigError: No patch has the name, or the node-ID may be on several buses.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for a pipe, in columns: more than skinnode's longest line."""
+"""Console width for a pipe, in columns; greater than the length of skinnode's longest line."""
 
 
 def print_json(value: Any) -> None:
@@ -31,11 +31,11 @@ def print_json(value: Any) -> None:
 
 
 def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
-    """Return the console of all commands.
+    """Return the console that all commands use.
 
-    It prints square brackets and colons literally, because names may contain them; styles are passed as
-    arguments of ``print``. The console is as wide as the terminal. Output to a pipe or file is not wrapped,
-    so that programs can read whole lines, unless ``COLUMNS`` sets a width.
+    The console prints square brackets and colons literally, because names may contain them; styles are passed
+    as arguments of ``print``. The console is as wide as the terminal. Output to a pipe or file is not
+    wrapped, so that programs can read whole lines, unless ``COLUMNS`` sets a width.
 
     Args:
         stderr: Print to stderr instead of stdout.

@@ -1,4 +1,4 @@
-"""JSON form of a field's contacts."""
+"""JSON representation of a field's contacts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def contact_tables(field: FieldFrame | None) -> list[dict[str, Any]] | None:
-    """Return the contacts of a field, strongest first, each value with its standard deviation.
+    """Return the contacts of a field, strongest first, with the standard deviation of each value.
 
     Returns:
         Lengths in m, areas in m², forces in N. None if there is no field yet, or if the field does not come

@@ -12,13 +12,13 @@ from skinnode.cli._exit_status import COULD_NOT_RUN, FINE, closed_pipe
 from skinnode.errors import ConfigError, SkinError
 from skinnode.text.printable import PrintableStream
 
-_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click or typer's copy of it
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # from click, or from typer's copy of click
 
 
 def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
     """Run ``app`` and return its exit status.
 
-    A SkinError, a file error or an invalid argument gives one line on stderr and status 2.
+    A SkinError, a file error or an invalid argument results in one line on stderr and status 2.
 
     Args:
         app: The application.
@@ -34,7 +34,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return closed_pipe()
     except SystemExit as ended:
-        if isinstance(ended.__context__, BrokenPipeError):  # typer has turned this into status 1
+        if isinstance(ended.__context__, BrokenPipeError):  # typer returns status 1 for a closed pipe
             return closed_pipe()
         raise
     except (SkinError, ValueError, OSError) as error:
@@ -43,7 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Return ``stream`` limited to printable text, with characters that its encoding lacks escaped."""
+    """Return a wrapper of ``stream`` that escapes control characters and those its encoding lacks."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
@@ -64,7 +64,7 @@ def _wants_help(error: Any) -> bool:
     """Return whether a command group was called without a command, in which case its help is printed."""
     if type(error).__name__ != "NoArgsIsHelpError":
         return False
-    text = error.ctx.get_help()  # rich prints the help itself and returns nothing
+    text = error.ctx.get_help()  # rich prints the help and returns nothing
     if text:
         typer.echo(text, err=True)
     return True
@@ -73,8 +73,8 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    Typer's own text is kept except for missing and invalid values, where it does not state the meaning of the
-    argument, the value given or the whole range.
+    Typer's own text is kept, except for missing and invalid values, where it omits the argument's meaning,
+    the value given or the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")
     param, kind = getattr(error, "param", None), type(error).__name__
@@ -104,7 +104,7 @@ def _meaning(param: Any) -> str:
 
 
 def _values(param: Any) -> str:
-    """Return the allowed numbers or words; empty for other types. Typer stores them in two places."""
+    """Return the allowed numbers or words, which Typer stores in two places; empty for other types."""
     converter = getattr(param, "type", param)
     described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
     if get_origin(described) is Literal:

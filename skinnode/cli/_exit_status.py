@@ -11,9 +11,9 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-Nothing is printed about a signal, because its sender knows about it. Open resources are closed first. SIGHUP
-stays ignored if it was ignored at the start, as it is under nohup. This module imports nothing slow, so that
-its handlers are installed before anything else is loaded.
+Nothing is printed about a signal, because its sender knows about it; open resources are closed before the
+exit. SIGHUP stays ignored if it was ignored at the start, as it is under nohup. This module imports nothing
+slow, so its handlers are installed before anything else is loaded.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def status_of(number: int) -> int:
 
 
 class Stopped(SystemExit):
-    """A signal stopped the command."""
+    """Raised when a signal stops the command."""
 
 
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
@@ -78,8 +78,8 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 def _stop(number: int, frame: FrameType | None) -> None:
     """Unwind the stack, or exit immediately if an import is running and there is no other thread.
 
-    During an import, some of Python's callbacks would lose the exception or print it. Without another thread,
-    nothing is open yet.
+    During an import, some of Python's callbacks would swallow the exception or print it. As long as there is
+    only one thread, nothing has been opened.
     """
     import threading
 

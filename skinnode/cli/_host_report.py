@@ -1,4 +1,4 @@
-"""Reports of ``skinnode host``: a line or JSON object every second, and the faults at the end."""
+"""Reports of ``skinnode host``: lines or a JSON object every second, and the faults at the end."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _EXPLAINED_BY_SLOWNESS: Final = (
     "chunks_lost",
     "summaries_lost",
 )
-"""Counters of missing and late frames, which a node on a slow computer explains. Wrong frames stay faults."""
+"""Counters of missing and late frames that a slow computer explains; wrong frames remain faults."""
 
 
 def operational_text(running: Host) -> str:
-    """Return how many patches are operational by their heartbeats, and the condition of each other patch."""
+    """Return how many patches report the operational state, and the conditions of the others."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
@@ -51,7 +51,7 @@ def operational_text(running: Host) -> str:
 
 
 def final_state_text(plan: HandConfig) -> str:
-    """Return the NMT state in which the host leaves the nodes of each bus."""
+    """Return the NMT state in which the host leaves the nodes on each bus."""
     ends = {"master": "pre-operational", "guest": "left to their master"}
     used = [bus for bus in plan.buses if plan.patches_on(bus.name)]
     if len({bus.role for bus in used}) == 1:
@@ -63,7 +63,7 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
     """Return the faults of the run, and notes that are not faults, one line each.
 
     A node that skips scans because its own computer is too slow sends EMCY 0x8110. Its missing and late
-    frames, and that emergency if still active at the end, are then reported as notes. Wrong frames stay
+    frames, and that emergency if still active at the end, are then reported as notes. Wrong frames remain
     faults.
     """
     _let_overruns_end(running)
@@ -149,7 +149,7 @@ def _let_overruns_end(running: Host) -> None:
 
 
 class Second:
-    """Figures of one second; its attribute names are the keys of the JSON object."""
+    """Figures for one second; the attribute names are the keys of the JSON object."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the depth of the deepest electrode and its standard deviation; a press moves it to −z."""
+    """Return the deepest electrode's depth and its standard deviation; a press moves it towards −z."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]
@@ -217,17 +217,17 @@ def _percentile(ordered: Sequence[float], share: float) -> float | None:
 
 
 class Report(Protocol):
-    """Destination of the host's reports: a person or a program."""
+    """Report format of the host, for a person or for a program."""
 
     def note(self, text: str) -> None:
         """Report an event or a fault."""
 
     def second(self, second: Second) -> None:
-        """Report the figures of one second."""
+        """Report the figures for one second."""
 
 
 class TextReport:
-    """Prints one line for the buses and one line per patch, every second."""
+    """Prints one line for the buses and one per patch every second."""
 
     def note(self, text: str) -> None:
         """Print ``text``."""

@@ -47,7 +47,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 from a nearby start with our solvers, SciPy's and Ceres' on the same F and J."""
+    """Solve one wire to 1e-9 from a nearby start with skinnode, SciPy and Ceres on the same F and J."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)
@@ -74,7 +74,7 @@ def stability(
     seeds: Annotated[int, typer.Option(min=1, help="Number of streams for each hard case.")] = 50,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve cases in parallel.")] = 1,
 ) -> None:
-    """Solve every hard case with many seeds and report error, standard deviation, status and verdict.
+    """Solve every hard case with many seeds; report error, standard deviation, status and verdict.
 
     Exit status 1 if any wire is CONVERGED and wrong.
     """
@@ -109,7 +109,7 @@ def accuracy(
     ] = 200,
     rounds: Rounds = 31,
 ) -> None:
-    """Measure error against time, noise and code width, the coverage of intervals, and the time per frame.
+    """Measure error versus time, noise and code width; the coverage of intervals; and the time per frame.
 
     Exit status 1 if a requirement is not met; times depend on the machine and are not counted.
     """
@@ -262,7 +262,7 @@ def soak(
 
 
 def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
-    """Run the soak in a child process with a damaged copy of the kernel cache, and return its exit status."""
+    """Run the soak in a child process on a damaged copy of the kernel cache, and return its exit status."""
     import subprocess
     import sys
     import tempfile
@@ -289,7 +289,7 @@ def _print_must(must: list[dict[str, Any]]) -> None:
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
-    """Check that the files can be written, and announce a longer run if kernels must be compiled."""
+    """Check that the files can be written, and announce if kernels must first be compiled."""
     from skinnode.compiled.jit import is_cold
     from skinnode.files.output_file import require_writable
     from skinnode.files.plot_file import require_matplotlib

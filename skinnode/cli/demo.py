@@ -1,4 +1,4 @@
-"""``skinnode demo``: presses simulated patches, reads them over a virtual CAN bus, decodes and scores."""
+"""``skinnode demo``: presses simulated patches, reads them over a virtual CAN bus and scores the result."""
 
 from __future__ import annotations
 

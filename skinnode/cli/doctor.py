@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: finds what is wrong, how certain the finding is, and what to do."""
+"""``skinnode doctor [HAND.toml]``: reports faults, the certainty of each finding, and the remedy."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def _frame_table(plan: BusPlan) -> Table:
 
 
 def _other_table(plan: BusPlan) -> Table:
-    """Return a table of the longest wait of each other device's frame for frames with lower identifiers."""
+    """Return a table of the longest time that each frame of another device waits to be sent."""
     table = _table("others", "bytes", "every ms", "queued to sent ms")
     for frame in plan.others:
         worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"

@@ -46,7 +46,7 @@ def host(
     report = JsonReport() if as_json else TextReport()
     if is_cold():
         report.note("compiling the kernels once; this takes a few seconds")
-    for patch in plan.patches:  # compiles; nothing is open yet, so Ctrl-C ends the program
+    for patch in plan.patches:  # compiles before anything is open, so Ctrl-C simply ends the program
         check_solvable(patch, plan.solver)
     with stop_on_signal() as stop:
         status = _run(plan, seconds, report, stop)
@@ -55,9 +55,9 @@ def host(
 
 
 def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threading.Event) -> int:
-    """Run the hand until it is stopped or time is up, and return the exit status.
+    """Run the hand until stopped or time is up, and return the exit status.
 
-    The host logs each frame whose content does not match its identifier; Python writes the log to stderr.
+    The host logs each frame whose content does not match its identifier; Python prints the log on stderr.
     """
     from skinnode.cli._host_report import faults_and_notes, final_state_text, operational_text
     from skinnode.host import BringUpCancelled, Host

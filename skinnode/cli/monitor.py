@@ -162,7 +162,7 @@ def _running(
             stack.enter_context(simulated(plan))
         tell(f"bringing up {counted(len(plan.patches), 'patch', 'patches')}")
         stack.enter_context(responsive_threads())
-        stack.enter_context(without_long_collections())  # the garbage is collected before the first SYNC
+        stack.enter_context(without_long_collections())  # collects garbage before the first SYNC
         host = stack.enter_context(Host.from_config(plan, cancelled=stop.is_set))
     return stack.enter_context(HostSource(host))
 
@@ -182,10 +182,10 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
     app = MonitorApp(
         source, folder=output, colours=terminal_colours(os.environ), over=stop.is_set, seconds=seconds
     )
-    app.run(mouse=False)  # leaves the mouse to the terminal, for selecting and copying text
+    app.run(mouse=False)  # the terminal keeps the mouse, for selecting and copying text
     if app.failure is not None:
         raise app.failure
-    if app.return_code:  # a defect of the screen, which textual has printed
+    if app.return_code:  # a defect of the screen; textual has printed it
         raise typer.Exit(2)
     if app.terminal_is_deaf:  # output would not be visible
         raise typer.Exit(1 if app.faults.lines else 0)

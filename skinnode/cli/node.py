@@ -125,7 +125,7 @@ def node(
 
 @contextmanager
 def _memory(store: Path | None) -> Iterator[FileMemory | None]:
-    """Yield the memory in ``store``, locked for this process."""
+    """Yield the non-volatile memory in the file ``store``, locked for this process."""
     from skinnode.errors import ConfigError
     from skinnode.files.file_lock import FileInUse, NotARegularFile
     from skinnode.node.memory_file import FileMemory

@@ -126,7 +126,7 @@ def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
 
 
 def _dump(remote: RemoteOd, sheet: DataSheet, tell: Callable[[str], None]) -> list[Reading]:
-    """Read the whole dictionary: the objects of the data sheet, or of CiA 301 if the sheet has none."""
+    """Read the whole dictionary: the objects in the data sheet or, if it has none, those of CiA 301."""
     from skinnode.diagnose.object_dictionary import dump, dump_standard
 
     return list(dump(remote, sheet.eds, tell) if sheet.eds.entries else dump_standard(remote, tell))
@@ -157,8 +157,8 @@ def _note(sheet: DataSheet) -> None:
 def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the data sheet of the node.
 
-    It has no entries for a third-party device without an EDS, or for a node that refuses to identify itself;
-    the objects are then named by CiA 301.
+    The sheet has no entries for a third-party device without an EDS, or for a node that refuses to identify
+    itself; its objects are then named by CiA 301.
     """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of
@@ -176,7 +176,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. A single object must be readable; among several, refused objects are listed."""
+    """Read the objects. A refusal raises if there is only one object; otherwise it is listed."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

@@ -1,4 +1,4 @@
-"""``skinnode replay RECORDING``: decodes and solves a recording with the code of a live host."""
+"""``skinnode replay RECORDING``: decodes and solves a recording with the same code as a live host."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def field_table(field: FieldFrame) -> dict[str, Any]:
         "method": field.method,
         "displacement_m": field.displacement_m.tolist(),
         "contacts": contact_tables(field),
-        # JSON has no infinity: an unknown value has no standard deviation
+        # JSON has no infinity, which is the standard deviation of an unknown value
         "displacement_std_m": [
             [[v if v < float("inf") else None for v in electrode] for electrode in wire]
             for wire in field.displacement_std_m.tolist()

@@ -85,7 +85,7 @@ def _faults(found: Discovery, place: Place) -> list[str]:
 
 
 def _as_json(scans: list[tuple[Place, Discovery]], faults: list[str]) -> dict[str, object]:
-    """Return the scans as JSON; same shape for one bus as for several: each node names its bus."""
+    """Return the scans as JSON; each node names its bus, even if there is only one bus."""
     from dataclasses import asdict
 
     first = scans[0][0].bus

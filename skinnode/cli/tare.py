@@ -73,7 +73,7 @@ def tare(
 
 
 def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
-    """Tare the nodes of one bus. Opens the bus only if at least one of them may be tared."""
+    """Tare nodes on one bus. Opens the bus only if at least one node may be tared."""
     from skinnode.diagnose.bus_connection import BusConnection
     from skinnode.diagnose.tare import Tared, refusal, tare
 

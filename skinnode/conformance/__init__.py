@@ -1,8 +1,8 @@
 """Conformance suite for CANopen nodes: 127 cases built on raw frames, for any node on any interface.
 
-``eds_reader`` parses what the device claims to support, and ``tester`` sends and receives frames. ``sdo`` and
+``eds_reader`` parses the device's EDS, and ``tester`` sends and receives frames. ``sdo`` and
 ``dut`` (the device under test) build on both and serve the cases. ``run`` resets the device before each case
-and puts its configuration back; ``report`` and ``html_report`` write the results.
+and restores its configuration; ``report`` and ``html_report`` write the results.
 
 The suite knows a node only through its EDS and its frames. It deliberately has its own tester, SDO client,
 EDS reader and constants, because code shared with the node would share the node's errors.

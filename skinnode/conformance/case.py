@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 class NotApplicable(Exception):
     """The device does not offer what the case checks.
 
-    The text names the object, EDS entry or response that shows this.
+    The text names the object, EDS entry or response that proves it.
     """
 
 
@@ -45,7 +45,7 @@ class Case:
     """Area and number: "SDO-07"."""
     title: str
     clause: str
-    """Clause that the case checks: of CiA 301 v4.2.0 unless another document is named."""
+    """Clause that the case checks, in CiA 301 v4.2.0 unless another document is named."""
     run: Callable[[Dut], None]
 
     @property
@@ -61,11 +61,10 @@ class Result:
     case: Case
     verdict: Verdict
     why: str = ""
-    """Expected and received data, the doubtful point, or why the case does not apply; empty if the device
-    passed."""
+    """Expected and received data, the doubtful point, or why the case does not apply; empty for a pass."""
     seconds: float = 0.0
     trace: tuple[TraceLine, ...] = field(default=(), repr=False)
-    """The frames of the case."""
+    """Frames sent and received during the case."""
 
 
 def case(id: str, title: str, clause: str) -> Callable[[Callable[[Dut], None]], Case]:

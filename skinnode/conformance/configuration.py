@@ -1,4 +1,4 @@
-"""Saves the configuration of the device before the tests and restores it afterwards."""
+"""Saves the device's configuration before the tests and restores it afterwards."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _PDO_PARAMETERS: Final = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _MAPPINGS: Final = (*range(0x1600, 0x1800), *range(0x1A00, 0x1C00))
 _INVALID: Final = 1 << 31
 _LAST: Final = {_SYNC_COUNTER: 1, _PERIOD: 2, _SYNC: 3, _VERIFY: 4}
-"""Write order: the counter can be written only while the period is 0, the producer starts after both, and
-0x1020 comes last because writing any other object clears it."""
+"""Write order: the counter can be written only while the period is 0; the producer starts after both; 0x1020
+comes last, because writing any other object clears it."""
 
 
 def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
-    """Read all values that can be read and written, except commands and values of variable length."""
+    """Read all readable and writable values, except commands and values of variable length."""
     values: dict[tuple[int, int], bytes] = {}
     for entry in dut.eds.between(0x1000, 0x9FFF):
         if entry.index in _COMMANDS or not entry.size or not (entry.readable and entry.writable):
@@ -34,9 +34,9 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Put the configuration back after a case stored or restored parameters and the node was reset.
+    """Put the configuration back, after a case that stored or restored parameters and a reset of the node.
 
-    Restores the defaults, writes each value of ``before`` that differs, and stores the result.
+    Restores the defaults, writes each value in ``before`` that differs from them, and stores the result.
 
     Args:
         dut: The device.
@@ -71,7 +71,7 @@ def write_back(dut: Dut, before: Values) -> list[str]:
 
 
 def _parameter_of(index: int) -> int:
-    """Return the communication parameter of the PDO to which ``index`` belongs; 0 for other objects."""
+    """Return the index of the PDO communication parameter to which ``index`` belongs; 0 for other objects."""
     if index in _MAPPINGS:
         return index - 0x200
     return index if index in _PDO_PARAMETERS else 0

@@ -20,7 +20,7 @@ STATES: Final = {0: "initialising", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OP
 _HEARTBEATS: Final = tuple(bytes((state,)) for state in STATES if state)
 
 BOOT_S: Final = 5.0
-"""Maximum start-up time of a device."""
+"""Maximum start-up time of a device, s."""
 
 _ASK_EACH_S: Final = 0.25
 
@@ -28,7 +28,7 @@ HEARTBEAT: Final = 0x1017
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 STORE, RESTORE = 0x1010, 0x1011
 _ABSENT: Final = (0x0602_0000, 0x0609_0011)
-"""SDO abort codes: object does not exist, sub-index does not exist."""
+"""SDO abort codes for a missing object and a missing sub-index."""
 
 
 class Dut:
@@ -38,13 +38,13 @@ class Dut:
         self.bus, self.node_id, self.eds = bus, node_id, eds
         self.sdo = SdoClient(bus, node_id)
         self.stored = False
-        """Whether parameters were stored or restored since the configuration was last put back."""
+        """Whether a case has stored or restored parameters since the configuration was last put back."""
         self.up = False
         """Whether the node came up after the last reset."""
 
     @property
     def error_control_id(self) -> int:
-        """COB-ID of heartbeats and guarding."""
+        """COB-ID of heartbeats and node guarding."""
         return 0x700 + self.node_id
 
     @property
@@ -66,7 +66,7 @@ class Dut:
             self.error_control_id,
             "the boot-up message",
             BOOT_S,
-            lambda frame: frame.data not in _HEARTBEATS,  # heartbeats from before the reset
+            lambda frame: frame.data not in _HEARTBEATS,  # heartbeats sent before the reset
         )
         self.bus.forget()
         if frame.data != b"\0":
@@ -75,11 +75,11 @@ class Dut:
     def prepare(self) -> None:
         """Reset the node and bring it to PRE-OPERATIONAL.
 
-        A node that answers counts as ready here and is commanded to enter PRE-OPERATIONAL. Case STATE-01
+        A node that answers counts as ready here, and is commanded to enter PRE-OPERATIONAL. Case STATE-01
         checks the boot-up message and whether the node starts by itself.
 
         Raises:
-            NodeTimeout: The node stays silent.
+            NodeTimeout: The node does not answer.
         """
         self._await_reset()
         self.nmt(PRE_OPERATIONAL)
@@ -108,7 +108,7 @@ class Dut:
     # --- error control
 
     def start_heartbeat(self, period_ms: int = 20) -> None:
-        """Start the heartbeat of the node, unless it supports only guarding.
+        """Start the node's heartbeat, unless the node supports only guarding.
 
         Raises:
             NotApplicable: The node supports neither heartbeat nor guarding.
@@ -121,8 +121,8 @@ class Dut:
     def state(self, what: str) -> int:
         """Return the NMT state from a heartbeat, or from guarding if the node has no heartbeat.
 
-        Uses the second heartbeat, because the first may have been sent already. Call :meth:`start_heartbeat`
-        first.
+        Uses the second heartbeat to arrive, because the first may have been sent before the call. Call
+        :meth:`start_heartbeat` first.
         """
         if self.eds.find(HEARTBEAT) is None:
             return (self.guard(what) or 0) & 0x7F
@@ -140,7 +140,7 @@ class Dut:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Request the state by a remote frame and return the response byte; None without a response."""
+        """Request the state by a remote frame and return the response byte; None if there is no response."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -151,7 +151,7 @@ class Dut:
     # --- object dictionary
 
     def need(self, index: int, subindex: int = 0) -> EdsEntry:
-        """Return an entry of the EDS. Raises NotApplicable if there is none."""
+        """Return an entry of the EDS. Raises NotApplicable if the EDS has no such entry."""
         entry = self.eds.find(index, subindex)
         if entry is None:
             raise NotApplicable(f"the EDS has no object 0x{index:04X}:{subindex:02X}")
@@ -175,7 +175,7 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Restore the node's defaults, if it can restore them on command, and reset it."""
+        """Restore the node's defaults if it supports this on command, and reset the node."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)

@@ -1,4 +1,4 @@
-"""Reads the electronic data sheet of a device (CiA 306), for testing.
+"""Reads the electronic data sheet (CiA 306) of a device under test.
 
 The reader uses :mod:`configparser` only, so that its result depends neither on the EDS writer of this project
 nor on the canopen library. Contradictions within the file are kept for case EDS-01 (:func:`parse_eds`); a
@@ -25,8 +25,7 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Size of a value in bytes, by data type (CiA 301 v4.2.0, table 44); types not listed have variable
-length."""
+"""Size of a value in bytes by data type (CiA 301 v4.2.0, table 44); other types have variable length."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -58,9 +57,9 @@ class EdsEntry:
     high: int | None
     mappable: bool
     flags: int
-    """ObjFlags: bit 0 refuse write on download, bit 1 refuse read on scan."""
+    """ObjFlags: bit 0 is "refuse write on download", bit 1 is "refuse read on scan"."""
     given: bytes | None = None
-    """Default as raw bytes, if the file gives it in that form and :attr:`default` is empty."""
+    """Default as raw bytes if the file gives bytes; :attr:`default` is then empty."""
 
     @property
     def size(self) -> int:
@@ -99,8 +98,8 @@ class EdsEntry:
             node_id: Replaces $NODEID.
 
         Returns:
-            The bytes; a string is transferred as in the file. None if the file gives no default, or none that
-            can be encoded in the type.
+            The bytes; a string is transferred as in the file. None if the file gives no default, or one that
+            the type cannot encode.
 
         Raises:
             ValueError: A number is malformed.
@@ -129,9 +128,9 @@ class Eds:
     """Parsed EDS: device information, and entries in ascending order of index and sub-index."""
 
     source: str
-    """Origin of the EDS, for messages."""
+    """Origin of the EDS, for use in messages."""
     device: Mapping[str, str]
-    """Section DeviceInfo; keys in lower case."""
+    """Section DeviceInfo, with keys in lower case."""
     dummies: frozenset[int]
     """Data types that may be mapped as dummy entries."""
     entries: Mapping[tuple[int, int], EdsEntry]
@@ -177,7 +176,7 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; ``source`` of the result names the encoding unless it is ASCII.
+    """Read an EDS or DCF in any encoding; the ``source`` of the result names an encoding other than ASCII.
 
     Args:
         path: The file.
@@ -246,7 +245,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
 def _entries(
     sections: Mapping[str, Mapping[str, str]], source: str
 ) -> tuple[dict[tuple[int, int], EdsEntry], list[str]]:
-    """Return the entries of all sections, and one line per section that contradicts itself."""
+    """Return the entries of all sections, and one line for each section that contradicts itself."""
     found: list[str] = []
     entries: dict[tuple[int, int], EdsEntry] = {}
     for title in sorted(sections, key=_order):
@@ -285,7 +284,7 @@ def _object(
     if compact > 254:
         found.append(f"[{index:04X}]: CompactSubObj={compact}, must be at most 254")
         compact = 0
-    if compact:  # identical sub-objects, not described individually
+    if compact:  # identical sub-objects without sections of their own
         count = {"parametername": "NrOfObjects", "datatype": "5", "accesstype": "ro", "pdomapping": "0"}
         _add(entries, index, 0, {**count, "defaultvalue": str(compact)})
         for subindex in range(1, compact + 1):
@@ -312,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield objects that are only listed or only described, and lists with a wrong count."""
+    """Yield a line per object that is only listed or only described, and per list with a wrong count."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

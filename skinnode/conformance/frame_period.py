@@ -1,6 +1,6 @@
 """Checks frame intervals against a period.
 
-A busy machine delays individual frames. Both mean and median are checked: a delayed frame lengthens one
+A busy machine delays individual frames, so both mean and median are checked. A delayed frame lengthens one
 interval and shortens the next, which hardly changes the mean, and a few late frames do not change the median.
 """
 
@@ -20,13 +20,13 @@ def gaps_ms(frames: Sequence[Frame]) -> list[float]:
 
 
 def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_sooner: bool = False) -> None:
-    """Raise Failed unless frames have the period ``period_ms``.
+    """Raise Failed unless frames arrive with the period ``period_ms``.
 
     Args:
         frames: At least two frames.
         period_ms: Expected period.
         what: Name of the frames, for the message.
-        or_sooner: Whether events may trigger further frames in between.
+        or_sooner: Whether events may trigger additional frames in between.
     """
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms

@@ -1,4 +1,4 @@
-"""Writes run results as one self-contained HTML file: verdicts by area, and the frames of every case."""
+"""Writes the results of a run as one self-contained HTML file: verdicts by area, and each case's frames."""
 
 from __future__ import annotations
 

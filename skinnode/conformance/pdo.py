@@ -1,4 +1,4 @@
-"""Lists PDOs of the device under test, sets them up and awaits their frames."""
+"""Lists the PDOs of the device under test, sets them up and waits for their frames."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Pdo:
 
 
 class Unsupported(Exception):
-    """A PDO rejects a transmission type, or lacks a sub-index; the standard permits both."""
+    """Raised if a PDO rejects a transmission type or lacks a sub-index; the standard permits both."""
 
 
 def rpdos(dut: Dut) -> list[Pdo]:
@@ -61,7 +61,7 @@ def tpdos(dut: Dut) -> list[Pdo]:
 
 
 def sync(dut: Dut, counter: int | None = None) -> int:
-    """Send a SYNC and return its time, ns."""
+    """Send a SYNC and return its transmission time, ns."""
     return dut.bus.send(SYNC_ID, b"" if counter is None else bytes((counter,)))
 
 
@@ -79,7 +79,7 @@ def mapped(dut: Dut, pdo: Pdo) -> list[int]:
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Return the length of a PDO with these mapping entries, bytes."""
+    """Return the length in bytes of a PDO with these mapping entries."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 
@@ -100,7 +100,7 @@ class PdoSetup:
 def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
     """Disable the PDO, write its parameters and enable it.
 
-    Discards frames that the PDO has already sent, for example on a node that starts by itself.
+    Discards the frames that the PDO has already sent, for example because the node starts by itself.
 
     Args:
         dut: The device.
@@ -145,7 +145,7 @@ Trial = Callable[[Dut, Pdo], None]
 
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
-    """Run ``trial`` on each TPDO that maps something, with all others disabled; reset after each trial.
+    """Run ``trial`` on each TPDO that maps something, with all others disabled; reset the node after each.
 
     Raises:
         NotApplicable: No TPDO supports the trial.
@@ -181,7 +181,7 @@ def expect_pdo(dut: Dut, can_id: int, length: int, what: str) -> Frame:
 
 
 def drain(dut: Dut, can_id: int) -> None:
-    """Discard frames until none arrives for a while, at most for half a second."""
+    """Discard frames until none arrives for a while, but for at most half a second."""
     end_s = time.monotonic() + 0.5
     while time.monotonic() < end_s and dut.bus.take(can_id, _PAUSE_S) is not None:
         pass

@@ -1,4 +1,4 @@
-"""Provokes errors over the bus: a PDO that is too short, a missing heartbeat, missing guarding."""
+"""Provokes errors over the bus: a PDO that is too short, a missing heartbeat, missing guarding requests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def emcy_code(frame: Frame) -> int:
 
 
 def expect_emcy(dut: Dut, code: int, what: str) -> Frame:
-    """Await and return the next emergency message with ``code``."""
+    """Wait for the next emergency message with ``code`` and return it."""
     return dut.bus.expect(
         dut.emcy_id, f"EMCY 0x{code:04X} {what}", match=lambda frame: emcy_code(frame) == code
     )
@@ -54,7 +54,7 @@ def foreign_id(dut: Dut) -> int:
 
 
 def consume(dut: Dut, node_id: int, within_ms: int, subindex: int = 1) -> None:
-    """Make the device expect heartbeats of ``node_id``."""
+    """Make the device expect heartbeats from ``node_id``."""
     dut.need(CONSUMER, subindex)
     dut.sdo.write_integer(CONSUMER, subindex, node_id << 16 | within_ms, 4)
 
@@ -70,7 +70,7 @@ def beat(dut: Dut, node_id: int, times: int = 1, each_s: float = 0.0, state: int
 
 
 def lose_partner(dut: Dut, within_ms: int = 100) -> None:
-    """Make the device miss a heartbeat or, if it has no heartbeat consumer, a guarding request.
+    """Withhold a heartbeat that the device expects or, if it has no heartbeat consumer, a guarding request.
 
     Raises:
         NotApplicable: The device has neither heartbeat consumer nor life guarding.

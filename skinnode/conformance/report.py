@@ -16,20 +16,20 @@ _VERDICT_WIDTH = 15
 
 
 def result_line(result: Result) -> str:
-    """Return id, verdict and title on one line, with the reason if there is one."""
+    """Return ID, verdict and title on one line, followed by the reason if there is one."""
     head = f"{result.case.id:{_ID_WIDTH}} {result.verdict:{_VERDICT_WIDTH}}{result.case.title}"
     return _one_line(f"{head}: {result.why}" if result.why else head)
 
 
 def list_lines(cases: Iterable[Case]) -> list[str]:
-    """Return id, title and clause of each case, one case per line."""
+    """Return the ID, title and clause of each case, one case per line."""
     listed = list(cases)
     width = max((len(case.title) for case in listed), default=0)
     return [f"{case.id:{_ID_WIDTH}} {case.title:{width}}  {case.clause}" for case in listed]
 
 
 def summary_line(report: Report) -> str:
-    """Return the number of cases by verdict, in one line."""
+    """Return one line with the number of cases for each verdict."""
     not_applicable = report.count(Verdict.NOT_APPLICABLE)
     applicable = len(report.results) - not_applicable
     seconds = sum(result.seconds for result in report.results)
@@ -41,7 +41,7 @@ def summary_line(report: Report) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the run as JSON data for programs.
+    """Return the run as JSON-compatible data.
 
     Frames are strings: seconds since the case began, Tx (sent by the tester) or Rx, COB-ID, length, data.
     """
@@ -70,8 +70,8 @@ def as_json(report: Report) -> dict[str, Any]:
 def as_junit(report: Report) -> str:
     """Return JUnit XML with one suite per area.
 
-    A failure contains the frames of its case. A case that does not apply counts as skipped. A warning is
-    reported as output of a passed test.
+    A failure contains the frames of the failed case. A case that does not apply counts as skipped. A warning
+    appears as the output of a passed test.
     """
     root = ElementTree.Element("testsuites", name="CANopen conformance")
     areas: dict[str, list[Result]] = {}

@@ -1,4 +1,4 @@
-"""Runs each case after a reset and within bounded time, and puts the node's configuration back."""
+"""Runs each case after a reset and in bounded time, and restores the node's configuration."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of successive cases in which the node stays silent before the remaining cases are not run."""
+"""Number of successive cases with a silent node after which the remaining cases are not run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of a run, and problems in putting the configuration back."""
+    """Results of a run, and problems in restoring the configuration."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]
@@ -38,7 +38,7 @@ class Report:
         return self.count(Verdict.FAILED)
 
     def count(self, verdict: Verdict) -> int:
-        """Return the number of cases with a verdict."""
+        """Return the number of cases with the given verdict."""
         return sum(result.verdict is verdict for result in self.results)
 
 
@@ -48,7 +48,8 @@ def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
     Args:
         port: The bus.
         node_id: The node.
-        eds: Its EDS. A patch of this project needs no EDS, because it follows from its descriptor (0x2000).
+        eds: Its EDS. A patch of this project needs no EDS, because its EDS follows from its descriptor
+            (0x2000).
 
     Raises:
         NodeTimeout: No node answers.
@@ -91,7 +92,8 @@ def _own_eds(sdo: SdoClient) -> Eds:
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
     """Run ``cases`` one after another.
 
-    Any behaviour of the node leads to a result. The node is finally reset and has its original configuration.
+    Any behaviour of the node leads to a result. At the end the node is reset, with its original
+    configuration.
 
     Args:
         dut: The device.

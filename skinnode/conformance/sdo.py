@@ -1,7 +1,7 @@
-"""An SDO client in raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
+"""SDO client built on raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
-The client is written for testing: it checks every answer byte by byte and can violate the protocol on
-request. It shares no code with this project's server.
+The client is made for testing: it checks every answer byte by byte, and can violate the protocol on request.
+It shares no code with this project's server.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skinnode.text.words import counted
 from skinnode.transport import Frame
 
 GENERAL_ERROR: Final = 0x0800_0000
-"""A device may send this code instead of a more specific one."""
+"""General-error abort code, which a device may send instead of a more specific code."""
 
 MEANINGS: Final = {
     0x0503_0000: "toggle bit not alternated",
@@ -53,12 +53,12 @@ MEANINGS: Final = {
 """Abort codes of CiA 301 v4.2.0, table 22."""
 
 _SEGMENT: Final = 7
-_MOST_BYTES: Final = 1 << 20  # ends an upload whose last segment never comes
+_MOST_BYTES: Final = 1 << 20  # stops an upload whose last segment never arrives
 _BLOCK_SIZE: Final = 20
 
 
 class Aborted(Failed):
-    """The device aborted a transfer that it should have served; ``code`` is the abort code."""
+    """Raised if the device aborts a transfer that it should serve; ``code`` is the abort code."""
 
     def __init__(self, what: str, code: int) -> None:
         self.code = code
@@ -66,7 +66,7 @@ class Aborted(Failed):
 
 
 def name(code: int) -> str:
-    """Return an abort code in hexadecimal and in words."""
+    """Return an abort code as text, in hexadecimal and in words."""
     return f"0x{code:08X} ({MEANINGS.get(code, 'not a code of CiA 301')})"
 
 
@@ -81,7 +81,7 @@ def crc16(data: bytes) -> int:
 
 
 def mux(index: int, subindex: int) -> bytes:
-    """Return the multiplexor: index and sub-index as transferred."""
+    """Return the multiplexor: index and sub-index in transfer order."""
     return struct.pack("<HB", index, subindex)
 
 
@@ -99,7 +99,7 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next answer. Raises Failed if none arrives or its length is not eight bytes."""
+        """Return the next answer. Raises Failed if no answer arrives or its length is not eight bytes."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
@@ -189,7 +189,7 @@ class SdoClient:
         Args:
             index: Index.
             subindex: Sub-index.
-            crc: Whether the client asks for a CRC.
+            crc: Whether the client requests a CRC.
             size: Segments per sub-block.
         """
         what = f"block read of 0x{index:04X}:{subindex:02X}"
@@ -217,7 +217,7 @@ class SdoClient:
         return data
 
     def _read_sub_block(self, size: int, what: str) -> tuple[bytes, int, bool]:
-        """Return the bytes, the number of segments, and whether they include the last of the transfer."""
+        """Return the bytes, the number of segments, and whether the transfer's last segment is among them."""
         data = b""
         for number in range(1, size + 1):
             segment = _not_aborted(self.answer(f"segment {number}, {what}"), what)
@@ -244,7 +244,7 @@ class SdoClient:
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:
-        """Download in segments, even if the value would fit an expedited transfer."""
+        """Download in segments, even if the value would fit in an expedited transfer."""
         what = f"segmented write to 0x{index:04X}:{subindex:02X}"
         start = b"\x21" + mux(index, subindex) + struct.pack("<I", len(data))
         _check(self.served(start, what), b"\x60" + mux(index, subindex) + bytes(4), what)
@@ -282,7 +282,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request for an expedited download of one to four bytes, with its size indicated."""
+    """Return the request for an expedited download of one to four bytes, which indicates their number."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

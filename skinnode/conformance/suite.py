@@ -1,4 +1,4 @@
-"""All cases in order, and their selection by area or id."""
+"""All cases in order, and their selection by area or ID."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ CASES: Final[tuple[Case, ...]] = tuple(
 
 
 def select(names: Sequence[str]) -> tuple[Case, ...]:
-    """Select cases by area or id.
+    """Select cases by area or ID.
 
     Args:
-        names: Areas and ids; empty for all cases.
+        names: Areas and IDs; empty for all cases.
 
     Returns:
         The cases in the order of the suite.
 
     Raises:
-        ConfigError: A name is neither an area nor an id.
+        ConfigError: A name is neither an area nor an ID.
     """
     if not names:
         return CASES

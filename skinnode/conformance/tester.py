@@ -1,7 +1,7 @@
-"""Sends and awaits raw frames on a bus, and keeps a trace of them.
+"""Sends and receives raw frames on a bus, and keeps a trace of them.
 
-Received frames wait in an inbox, in order of arrival, until a case asks for them, so that a PDO that arrives
-before the SDO answer is not lost. Every wait is bounded.
+Received frames wait in an inbox, in order of arrival, until a case asks for them. A PDO that arrives before
+the SDO answer is therefore not lost. Every wait is bounded.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Final, NamedTuple
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""Maximum wait for an answer: far longer than a device needs, so that a busy machine fails no case."""
+"""Maximum wait for an answer; far longer than a device needs, so that a busy machine fails no case."""
 
 QUIET_S: Final = 0.06
-"""Time without a frame that counts as silence."""
+"""Time without frames that counts as silence."""
 
 _INBOX_FRAMES: Final = 20_000
 _TRACE_FRAMES: Final = 400
 
 
 class Failed(Exception):
-    """The device did not do what the standard requires."""
+    """Raised if the device does not do what the standard requires."""
 
     def __init__(self, expected: str, got: str) -> None:
         self.expected, self.got = expected, got
@@ -55,12 +55,12 @@ def describe(frame: Frame | None) -> str:
 
 
 class Tester:
-    """Sender and receiver of raw frames; for use by one thread."""
+    """Sender and receiver of raw frames, for use by a single thread."""
 
     def __init__(self, port: CanPort) -> None:
         self._port = port
         self.fd = port.config.fd
-        """Whether PDOs may be CAN FD frames of up to 64 bytes."""
+        """Whether PDOs may be sent in CAN FD frames of up to 64 bytes."""
         self._inbox: deque[Frame] = deque(maxlen=_INBOX_FRAMES)
         self._trace: deque[TraceLine] = deque(maxlen=_TRACE_FRAMES)
         self._begun_ns = time.monotonic_ns()
@@ -73,11 +73,11 @@ class Tester:
 
     @property
     def trace(self) -> tuple[TraceLine, ...]:
-        """The newest frames since :meth:`begin`."""
+        """Newest frames since :meth:`begin`."""
         return tuple(self._trace)
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> int:
-        """Send a frame and return its monotonic time, ns."""
+        """Send a frame and return its transmission time on the monotonic clock, ns."""
         now_ns = time.monotonic_ns()
         self._note(now_ns, True, can_id, data, remote)
         self._port.send(can_id, data, remote=remote)
@@ -95,7 +95,7 @@ class Tester:
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """Return the first matching frame with ``can_id``, from the inbox or still to arrive.
+        """Return the first matching frame with ``can_id``, from the inbox or yet to arrive.
 
         Args:
             can_id: CAN-ID of a data frame.
@@ -139,7 +139,7 @@ class Tester:
         return self.pending(can_id)
 
     def wait(self, for_s: float) -> None:
-        """Wait; frames that arrive are kept in the inbox."""
+        """Wait; frames that arrive meanwhile are kept in the inbox."""
         end_s = time.monotonic() + for_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._receive(left_s)
@@ -159,7 +159,7 @@ class Tester:
             raise Failed(f"no {what}", describe(frame))
 
     def _fetch(self) -> None:
-        for _ in range(_INBOX_FRAMES):  # bounded: a fully loaded bus is never silent
+        for _ in range(_INBOX_FRAMES):  # bounded, because a fully loaded bus is never silent
             if not self._receive(0.0):
                 return
 

@@ -9,11 +9,11 @@ from skinnode.config import HandConfig, parse_hand
 
 _NAMES: Final = ("palm", "thumb", "index", "middle", "ring", "little", "wrist", "back")
 _SYNC_MS_PER_PATCH: Final = 20
-"""A 10 × 30 patch needs up to 101 × 135 bits per scan; at 20 ms per patch a plan loads 1 Mbit/s to 68 %."""
+"""SYNC period per patch, ms: 101 frames of up to 135 bits per scan load a 1 Mbit/s bus to 68 %."""
 
 
 def demo_hand(patches: int, seed: int) -> HandConfig:
-    """Return a hand of reference patches on one virtual bus that no other program uses.
+    """Return a hand of reference patches on one virtual bus, which no other program uses.
 
     Args:
         patches: Number of patches, 1 to 127.

@@ -1,4 +1,4 @@
-"""Plot of a demo: truth, estimate and error for each patch."""
+"""Plot of a demo run: truth, estimate and error of each patch."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class PatchTrace:
     error_m: Float
     """(T,), RMS error of the field."""
     reported_m: Float
-    """(T,), RMS of the reported standard deviations."""
+    """(T,), RMS of the field's reported standard deviations."""
     snapshot_truth_m: Float
     """(U, N, 3), true displacement in the deepest scan."""
     snapshot_m: Float
-    """(U, N, 3), decoded displacement of that scan."""
+    """(U, N, 3), decoded displacement in the deepest scan."""
 
 
 def _map(  # noqa: PLR0913 - the options of an image
     axes: Any, field_m: Float, rest_m: Float, *, scale_um: float, colours: str, low: float
 ) -> Any:
-    """Draw the depth as an image over the patch, axes in mm."""
+    """Draw the depth as an image of the patch, with axes in mm."""
     x, y = 1e3 * rest_m[..., 0], 1e3 * rest_m[..., 1]
     half = 0.5 * (x[0, 1] - x[0, 0]) if x.shape[1] > 1 else 1.0
     extent = (x.min() - half, x.max() + half, y.min() - half, y.max() + half)
@@ -59,7 +59,7 @@ def draw_demo(file: Path, traces: Sequence[PatchTrace]) -> None:
     """Draw one column per patch: truth, estimate, their difference, and error over time.
 
     Args:
-        file: File to write; its suffix sets the format.
+        file: File to write; its suffix determines the format.
         traces: Data of each patch.
 
     Raises:

@@ -34,7 +34,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Seconds without a field that show a SYNC's scans are solved and the next scans have not yet arrived."""
+"""Pause without fields, s, which shows that all scans of a SYNC are solved and no others have arrived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +46,10 @@ class PatchReport:
     scans_sent: int
     scans_solved: int
     scans_skipped: int
-    """Scans replaced by a newer scan before a solver was free."""
+    """Number of scans replaced by a newer scan before a solver was free."""
     scans_torn: int
     frames_lost: int
-    """PDOs from the node that did not become part of a scan."""
+    """Number of PDOs sent by the node that did not become part of a scan."""
     latency_p50_ms: float
     latency_p99_ms: float
     score: Score
@@ -57,20 +57,20 @@ class PatchReport:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Figures of the whole run."""
+    """Results of the whole run."""
 
     seconds: float
     scan_rate_hz: float
     patches: tuple[PatchReport, ...]
     frames_sent: int
-    """PDOs that the nodes sent."""
+    """Number of PDOs that the nodes sent."""
     frames_received: int
-    """PDOs that became part of a scan."""
+    """Number of PDOs that became part of a scan."""
     frames_lost: int
     bus_load: float
     """Fraction of a 1 Mbit/s bus that all frames of the scan phase would have used, including stuff bits."""
     faults: tuple[str, ...]
-    """Reasons for exit status 1; empty if there are none."""
+    """Reasons for exit status 1; empty if all is well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class _Watch:
     arrivals_s: deque[float] = field(default_factory=lambda: deque(maxlen=32))
     latency_ms: list[float] = field(default_factory=list)
     history: list[tuple[float, float, float, float]] = field(default_factory=list)
-    """Time, true depth, RMS error and RMS reported standard deviation for each scan."""
+    """Time, true depth, RMS error and RMS reported standard deviation of each scan."""
     deepest: tuple[float, Float, Float] | None = None
     newest: FieldFrame | None = None
 
@@ -187,12 +187,12 @@ class _Progress:
 
 
 def play(hand: HandConfig, seconds: float, console: Console) -> Run:
-    """Play a hand and score the decoded fields against the truth.
+    """Run a hand and score the decoded fields against the truth.
 
     Args:
         hand: The hand, on a virtual bus.
         seconds: Duration of the run, from the first scan.
-        console: Console that progress is printed to.
+        console: Console on which progress is printed.
 
     Raises:
         SkinError: The hand cannot be run.
@@ -211,7 +211,8 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
         soft_wrap=True,
     )
     with responsive_threads(), Fleet(hand) as fleet:
-        with without_long_collections(), Host.from_config(hand) as host:  # it collects before the first SYNC
+        # Garbage is collected before the first SYNC.
+        with without_long_collections(), Host.from_config(hand) as host:
             bits_before = _bits(host)
             t_start_ns = time.monotonic_ns()
             progress = _Progress(console, hand, list(watches.values()), seconds)
@@ -224,7 +225,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                     if frame is not None:
                         unscored.append(frame)
                         continue
-                    # Between two scans, so that scoring and drawing do not delay the host.
+                    # Score and draw between two scans, so as not to delay the host.
                     if unscored:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
@@ -267,7 +268,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
 
 def _take(frame: FieldFrame, watches: dict[str, _Watch], fleet: Fleet, t_start_ns: int) -> None:
     assert frame.stamp is not None  # the host stamps every field
-    if frame.stamp.device_time_us == 0:  # summary lost, so the time to look the truth up at is unknown
+    if frame.stamp.device_time_us == 0:  # summary lost, so the scan's time is unknown
         return
     true_upper_m = fleet.truth_m(frame.stamp.patch, frame.stamp.device_time_us)
     watches[frame.stamp.patch].take(frame, true_upper_m, t_start_ns)
@@ -278,7 +279,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the losses known to the host: frames dropped by its queue, and chunks that never arrived."""
+    """Return the number of losses that the host knows of: frames its queue dropped, and missing chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())

@@ -1,6 +1,6 @@
 """Simulated patches for commands that show a host at work.
 
-They run in a separate process, so that, as with a real hand, they share no interpreter with the host and the
+The patches run in a separate process. As with a real hand, they share no interpreter with the host, so the
 host's figures cover the host alone.
 """
 
@@ -18,7 +18,7 @@ from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
-    """Return the same hand on unused buses that connect processes on this machine.
+    """Return a copy of the hand on unused buses that connect processes on this machine.
 
     Simulated nodes must not appear on a bus with real nodes.
     """
@@ -68,7 +68,7 @@ def _run_nodes(hand: HandConfig, parent: Connection) -> None:
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group, but the parent ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all of the group, but the parent ends this process
     try:
         with Fleet(hand):
             parent.send("")

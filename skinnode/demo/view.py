@@ -20,12 +20,12 @@ from skinnode.monitor.field_map import MapStyle, Surface, mean_shear_m, paint_ma
 from skinnode.monitor.patch_panel import shear_text
 
 MAP_SIZE = 16
-"""Width of a height map in characters. Each shows two pixels, one above the other, so the map is square."""
+"""Width of a height map in characters; each character is two pixels high, so that the map is square."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """View data of one patch. Lengths in metres, NaN if not yet known."""
+    """View data of one patch. Lengths are in metres, NaN if not yet known."""
 
     name: str
     health: str
@@ -53,7 +53,7 @@ class BusView:
 
 
 class HeightMap:
-    """Draws the depth of a surface as the monitor does, with the first upper wire at the bottom."""
+    """Draws the depth of a surface in the monitor's style, with the first upper wire at the bottom."""
 
     def __init__(self, surface: Surface, full_scale_m: float) -> None:
         height = MAP_SIZE // 2
@@ -69,7 +69,7 @@ class HeightMap:
 
 
 def _surface(displacement_m: Float | None) -> Surface:
-    """Return the surface of a field without its standard deviations, or a flat one before the first field."""
+    """Return the surface of a field without standard deviations, or a flat surface before the first field."""
     moved = np.zeros((2, 2, 3)) if displacement_m is None else displacement_m
     unknown = np.zeros(moved.shape[:2], dtype=np.bool_)
     return Surface(-moved[..., 2], np.moveaxis(moved[..., :2], -1, 0), np.zeros(unknown.shape), unknown, 1.0)

@@ -1,4 +1,4 @@
-"""An open bus: SDO to any node, LSS, NMT, and everything heard on the bus."""
+"""An open bus: SDO to any node, LSS, NMT, and a record of all messages received."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from skinnode.host.mainline import Mainline
 from skinnode.host.sdo_client import RemoteOd
 
 LONGEST_HEARTBEAT_S: Final = 2.5
-"""Maximum wait for a heartbeat; a node with a longer period is not detected by it."""
+"""Maximum wait for a heartbeat; nodes with a longer period are not detected by their heartbeats."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum waits for the answer to a remote frame: a node or machine may be busy the first time."""
+"""Maximum waits for the answer to a first and a second remote frame; a node may be busy the first time."""
 
 _POLL_S: Final = 0.002
 
@@ -40,7 +40,7 @@ class State(NamedTuple):
 
 
 def no_answer(wrong: str) -> str:
-    """Describe a node without a valid SDO answer; ``wrong``: its newest answer, empty for none."""
+    """Describe a node without a valid SDO answer; ``wrong`` is its newest answer, or empty."""
     if not wrong:
         return "does not answer SDO requests"
     return f"answers SDO requests with data that is no answer of CiA 301 (newest: {wrong})"
@@ -53,14 +53,14 @@ class BusConnection:
         bus: The bus.
 
     Raises:
-        BusError: The bus does not open.
+        BusError: The bus cannot be opened.
     """
 
     def __init__(self, bus: BusConfig) -> None:
         self.bus = bus
         self.listener = BusListener()
         self.defect: SkinError | None = None
-        """Error of this program on the thread that receives."""
+        """Internal error raised on the receiving thread."""
         self._remotes: dict[int, RemoteOd] = {}
         self._abandoned = threading.Event()
         self.link = BusLink(bus, {}, self._on_defect)
@@ -113,11 +113,11 @@ class BusConnection:
         return [data for t_ns, data in answers if t_ns >= since_ns]
 
     def require_answer(self, node_id: int, more: Callable[[], str] = str) -> None:
-        """Read the device type of a node, twice if need be.
+        """Read the device type of a node, with one retry.
 
         Args:
             node_id: The node.
-            more: Returns text for the end of the message.
+            more: Returns text to append to the error message.
 
         Raises:
             NodeError: There is no valid answer.
@@ -131,7 +131,7 @@ class BusConnection:
 
         Args:
             node_id: A node without a valid answer.
-            since_ns: Earliest time of the frame.
+            since_ns: Earliest reception time of the frame.
 
         Returns:
             Hexadecimal text; empty if there was no frame.
@@ -151,8 +151,8 @@ class BusConnection:
     def guarded(self, node_id: int) -> bool:
         """Return whether a master guards the node.
 
-        A remote frame from here would then start the node's life guarding, and it would take our silence for
-        the loss of its master.
+        A remote frame sent from here would start life guarding in the node, which would later mistake our
+        silence for the loss of its master.
         """
         remote = self.od(node_id)
         try:
@@ -167,7 +167,7 @@ class BusConnection:
             node_id: The node.
             heartbeat_s: Result of :meth:`heartbeat_s`.
             guarding: Whether remote frames are allowed.
-            since_ns: Earliest time of the heartbeat.
+            since_ns: Earliest reception time of the heartbeat.
         """
         if heartbeat_s != 0:
             wait_s = LONGEST_HEARTBEAT_S if heartbeat_s is None else 1.5 * heartbeat_s + 0.1

@@ -1,6 +1,6 @@
-"""Keeps what is heard on a bus: heartbeats, emergency messages, SDO answers, COB-IDs in use.
+"""Records the messages received on a bus: heartbeats, emergencies, SDO answers, COB-IDs in use.
 
-One thread writes; other threads read copies, because there are no locks.
+One thread writes the record; other threads read copies of it, because there are no locks.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Messages kept of each kind and node: over half a minute of heartbeats at 4 Hz."""
+"""Number of messages kept per kind and node: over half a minute of heartbeats at 4 Hz."""
 
 
 class Beat(NamedTuple):
-    """A boot-up, a heartbeat or the answer to guarding (CiA 301, 7.2.8.3)."""
+    """A boot-up message, a heartbeat or an answer to node guarding (CiA 301, 7.2.8.3)."""
 
     t_ns: int
     state: int
-    """0 for a boot-up; without the toggle bit of guarding."""
+    """NMT state without the toggle bit of guarding; 0 for a boot-up message."""
 
 
 class Emergency(NamedTuple):
@@ -37,19 +37,19 @@ class Emergency(NamedTuple):
 
 @dataclass(slots=True)
 class NodeTraffic:
-    """Messages heard from one node-ID."""
+    """Messages received from one node-ID."""
 
     beats: deque[Beat] = field(default_factory=lambda: deque(maxlen=_KEPT))
     boot_ups: int = 0
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """Time and eight bytes of each answer."""
+    """Time and the eight data bytes of each answer."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Time and data, of any length, of the newest frame on the COB-ID of SDO answers."""
+    """Time and data of the newest frame on the COB-ID of SDO answers, whatever its length."""
 
 
 class BusListener:
-    """Messages heard since construction; a link calls :meth:`on_frames`."""
+    """Record of the messages received since construction; a link calls :meth:`on_frames`."""
 
     def __init__(self) -> None:
         self._nodes: dict[int, NodeTraffic] = {}
@@ -59,7 +59,7 @@ class BusListener:
         """Count of NMT commands by their two bytes, command specifier and node-ID; ``b""`` for commands of
     another length."""
         self.extended = self.remote = self.errors = 0
-        """Numbers of frames with 29-bit identifiers, of remote frames, of error frames."""
+        """Counts of frames with 29-bit identifiers, remote frames and error frames."""
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:
@@ -67,7 +67,7 @@ class BusListener:
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:
-        """Return the messages of one node-ID; empty if nothing was heard."""
+        """Return the messages of one node-ID; empty if none were received."""
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
@@ -77,7 +77,7 @@ class BusListener:
         return newest if newest is not None and newest.t_ns > since_ns else None
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
-        """Note a batch of frames."""
+        """Record a batch of frames."""
         for frame in frames:
             if frame.error:
                 self.errors += 1

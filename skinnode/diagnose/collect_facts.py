@@ -1,4 +1,4 @@
-"""Collects the facts of one bus.
+"""Collects the facts about one bus.
 
 It listens and reads. Unless ``active``, it changes nothing, so that a running hand continues undisturbed.
 """
@@ -32,16 +32,16 @@ from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
-"""Number of scans for an estimate of noise: its standard deviation is then known to a tenth."""
+"""Number of scans for a noise estimate; they determine its standard deviation to 10 %."""
 
 LONGEST_S: Final = 15.0
 """Maximum wait for scans, whatever the period."""
 
 DEFAULT_NOISE: Final = 3e-6
-"""Relative noise of the converter without a hand file."""
+"""Relative noise assumed for the converter if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses before each attempt to read a node: a host reads a baseline in 0.1 to 0.3 s."""
+"""Pauses before the attempts to read a node; a host that reads a baseline occupies it for 0.1 to 0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -55,13 +55,13 @@ Answer = TypeVar("Answer")
 def collect_facts(
     bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
 ) -> BusFacts:
-    """Collect all facts of one bus. A bus that fails is a fact, not an error.
+    """Collect all facts about one bus; a bus failure is recorded as a fact and raises nothing.
 
     Args:
         bus: The bus.
         hand: The hand; None without a hand file.
-        active: Whether to start nodes that do not run and send SYNC if no other node does; the nodes are
-            returned to PRE-OPERATIONAL at the end.
+        active: Whether to start nodes that are not running, and to send SYNC if no other node does. The
+            started nodes are returned to PRE-OPERATIONAL at the end.
         progress: Receives a text for each step.
     """
     facts = BusFacts(
@@ -167,7 +167,7 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Return the answer, or why there is none, after several attempts.
+    """Ask several times if necessary; return the answer, or the reason why there is none.
 
     A running host may access the node at the same time, and a server handles one transfer at a time.
     """
@@ -191,10 +191,10 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
     active: bool,
     progress: Callable[[str], None],
 ) -> tuple[bool, float]:
-    """Capture scans of the running patches; start the others if ``active``.
+    """Capture scans of the running patches; with ``active``, start the others first.
 
     Returns:
-        Whether SYNC was sent from here, and the load of the bus in the busiest second.
+        Whether this program sent SYNC, and the bus load in the busiest second.
     """
     overflows: dict[int, int] = {}
     for node_id, profile in profiles.items():
@@ -233,8 +233,8 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
     """Return the shortest SYNC period, s, for a node that no host has configured; 0 for any other node.
 
-    A node with its default inhibit time needs it to finish each scan before the next; bring-up sets an
-    inhibit time that fits the hand's period.
+    At its default inhibit time, a node needs at least this period to finish each scan before the next.
+    Bring-up sets an inhibit time that fits the hand's period.
     """
     profile = profiles.get(patch.node_id)
     if profile is None or patch.info is None or patch.found is None or patch.found.state == "operational":
@@ -269,10 +269,10 @@ def _with_scans(
 
 
 def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
-    """Count NMT commands that a host of this hand does not send.
+    """Count the NMT commands that a host of this hand would not send.
 
-    A host starts its patches one by one, and commands them to PRE-OPERATIONAL. A second host of the same hand
-    is detected by its SYNCs.
+    A host only starts its patches and commands them to PRE-OPERATIONAL, each by its node-ID. A second host of
+    the same hand is detected by its SYNCs.
     """
     return sum(
         count
@@ -286,8 +286,8 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
     """Count the frames of each COB-ID that neither services, nodes nor ``others`` of the hand file explain.
 
-    COB-IDs in the pre-defined connection set of a node that was found belong to it, whatever the device;
-    those of a patch that does not answer come from a host that polls it.
+    COB-IDs in the pre-defined connection set of a node that was found are attributed to it, whatever the
+    device; those of a patch that does not answer, to a host that polls it.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}
@@ -295,7 +295,7 @@ def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> d
 
 
 def link_facts(bus: BusConfig) -> tuple[str | None, int | None]:
-    """Return state and bit rate of a kernel interface from ``ip``; None if unknown."""
+    """Return the state and bit rate of a kernel interface, as reported by ``ip``; None if unknown."""
     if bus.interface != "socketcan":
         return None, None
     try:

@@ -1,8 +1,7 @@
 """The electronic data sheet of a node: generated for a patch, read from a file for another device.
 
-The reader is that of the conformance suite: it preserves defaults as written, which the canopen library does
-not.
-The host's check of a patch's EDS uses the library, as an independent reader.
+It uses the reader of the conformance suite, which preserves defaults as written; the canopen library does
+not. The host checks a patch's EDS with that library, as an independent reader.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from skinnode.protocol.profile import BusType, PatchProfile
 
 
 class DataSheet(NamedTuple):
-    """An electronic data sheet, read and as text."""
+    """An electronic data sheet, parsed and as text."""
 
     eds: Eds
     text: str
     """Content; see :class:`~skinnode.canopen.eds_encoding.EdsText`."""
     codec: str = "utf-8"
-    """Codec of its non-ASCII characters."""
+    """Codec of the non-ASCII characters in the text."""
     note: str = ""
-    """Encoding that was assumed, in one line; empty for an ASCII file."""
+    """One line that names the assumed encoding; empty for an ASCII file."""
 
 
 def read_profile(remote: RemoteOd) -> PatchProfile | None:
@@ -50,7 +49,7 @@ def load_data_sheet(path: Path) -> DataSheet:
 
     Raises:
         ConfigError: The file cannot be read.
-        ProfileError: The file is neither.
+        ProfileError: The file is neither an EDS nor a DCF.
     """
     eds, read = parse_eds_file(path)
     return DataSheet(eds, read.text, read.codec, f"{path} {read.note}" if read.note else "")
@@ -64,7 +63,7 @@ def data_sheet_of(remote: RemoteOd, path: Path | None) -> DataSheet:
         path: Its EDS; a patch needs none.
 
     Raises:
-        ProfileError: Another device, without a file.
+        ProfileError: The node is not a patch, and no file is given.
     """
     if path is not None:
         return load_data_sheet(path)

@@ -27,7 +27,7 @@ _BYTES_KEY: Final = ";ParameterBytes"
 _BYTES_LINE: Final = re.compile(r"^;(ParameterBytes=)", re.MULTILINE)
 _SECTION: Final = re.compile(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?", re.IGNORECASE)
 _VALUES: Final = ("parametervalue", "parameterbytes", _BYTES_KEY.lower())
-_COMMISSIONING: Final = "DeviceComissioning"  # spelt like this in CiA 306
+_COMMISSIONING: Final = "DeviceComissioning"  # this spelling is in CiA 306
 _STRINGS: Final = {"VISIBLE_STRING": "ascii", "UNICODE_STRING": "utf-16-le"}
 _OCTETS: Final = ("OCTET_STRING", "DOMAIN")
 _VISIBLE_STRING: Final = 0x09
@@ -42,11 +42,11 @@ class Dcf(NamedTuple):
     values: int
     """Number of the node's values in the file."""
     as_bytes: tuple[Reading, ...]
-    """Readings that the standard has no form for, written byte by byte."""
+    """Readings that CiA 306 cannot express; they are written byte by byte."""
 
 
 def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_bps: int, name: str) -> Dcf:
-    """Return the DCF of a device: its EDS with the value of each writable object, and device commissioning.
+    """Return the DCF of a device: its EDS with device commissioning and the value of each writable object.
 
     The file is UTF-8, whatever the encoding of the EDS; a string that UTF-8 would change is written byte by
     byte.
@@ -93,7 +93,7 @@ def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_
 
 
 def expected(sheet: DataSheet) -> Eds:
-    """Return the EDS with its defaults replaced by the values of a DCF; unchanged if it has none."""
+    """Return the EDS with its defaults replaced by its DCF values; unchanged if the sheet has none."""
     parser = _parser(_BYTES_LINE.sub(r"\1", sheet.text))
     entries = dict(sheet.eds.entries)
     for section in parser.sections():
@@ -111,10 +111,8 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
         try:
             return replace(entry, given=bytes.fromhex(as_bytes))
         except ValueError:
-            return entry  # a comment by another tool
-    if (
-        value and entry.data_type == _VISIBLE_STRING
-    ):  # exactly these bytes: trailing zeros are written as bytes
+            return entry  # not bytes: written by another tool
+    if value and entry.data_type == _VISIBLE_STRING:  # exact, because trailing zeros are written as bytes
         return replace(entry, given=octets(value.strip()))
     return replace(entry, default=value.strip()) if value else entry
 
@@ -127,9 +125,9 @@ def _is_configuration(reading: Reading) -> bool:
 
 
 def _standard_form(reading: Reading, data: bytes) -> str | None:
-    """Return the value in the form of CiA 306; None if no form preserves its bytes.
+    """Return the value in the notation of CiA 306; None if no notation preserves its bytes.
 
-    Numbers are hexadecimal, reals their bit pattern, as conforming tools expect.
+    Numbers are hexadecimal and reals are bit patterns, as conforming tools expect.
     """
     if reading.data_type in _STRINGS:
         return _plain(data, _STRINGS[reading.data_type])
@@ -143,7 +141,7 @@ def _standard_form(reading: Reading, data: bytes) -> str | None:
 
 
 def _plain(data: bytes, codec: str) -> str | None:
-    """Return the bytes as text if every INI reader preserves it, otherwise None."""
+    """Return the bytes as text if every INI reader preserves that text, otherwise None."""
     try:
         text = data.decode(codec)
     except UnicodeDecodeError:

@@ -1,6 +1,6 @@
 """Finds the nodes on a bus, by SDO, by heartbeats and by LSS.
 
-Every node-ID is asked for its device type; heartbeats are heard meanwhile; LSS finds nodes without a node-ID.
+Every node-ID is asked for its device type while heartbeats are recorded. LSS finds nodes without a node-ID.
 Nothing is written except LSS mode switches, which concern only nodes without a node-ID.
 """
 
@@ -20,22 +20,22 @@ from skinnode.errors import NodeError
 from skinnode.text.printable import printable
 
 PACE_S: Final = 0.001
-"""Interval of requests: a sixth of a bus at 1 Mbit/s, so that PDOs are not delayed."""
+"""Interval between requests; it limits their load to a sixth of a 1 Mbit/s bus, so PDOs are not delayed."""
 
 ANSWER_S: Final = 0.12
-"""Wait for answers after the last request of a sweep."""
+"""Wait time for answers after the last request of a sweep."""
 
 SWEEPS: Final = 2
-"""Number of sweeps: a node that was busy gets a second request."""
+"""Number of sweeps; a busy node gets a second request."""
 
 LISTEN_S: Final = 1.2
-"""Minimum time of listening: stopped nodes send nothing but heartbeats."""
+"""Minimum listening time; stopped nodes send nothing but heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time for finding nodes without a node-ID; the rest is reported as "more"."""
+"""Maximum time to search for nodes without a node-ID; any others are reported as "more"."""
 
 OTHERS_S: Final = 1.0
-"""Maximum wait for other SDO clients."""
+"""Maximum wait for other SDO clients to finish."""
 
 _QUIET_S: Final = 0.1
 _THREADS: Final = 16
@@ -45,14 +45,14 @@ _ASK_SERIAL: Final = upload_request(od.IDENTITY, od.IDENTITY_SERIAL)
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """A node-ID that was heard. Figures are None if the node lacks them or did not answer."""
+    """A node that was found. Values are None if the node lacks them or did not answer."""
 
     node_id: int
     answers: bool
-    """Whether it answers SDO; a stopped node does not."""
+    """Whether the node answers SDO requests; a stopped node does not."""
     state: str
     state_known_by: str
-    """How the state is known, or why not."""
+    """How the state is known, or why it is unknown."""
     name: str | None
     """Device name (0x1008)."""
     device_type: int | None
@@ -65,11 +65,11 @@ class FoundNode:
     serial: int | None
     heartbeat_ms: int | None
     boot_ups: int
-    """Boot-up messages heard meanwhile."""
+    """Boot-up messages received during the search."""
     duplicate: str
     """Evidence for two nodes with this node-ID; empty if there is none."""
     wrong_answer: str = ""
-    """Newest frame instead of an SDO answer, as hexadecimal text, if no answer was valid."""
+    """Newest frame on the COB-ID of SDO answers, as hexadecimal text, if no answer was valid."""
 
     @property
     def profile(self) -> str:
@@ -99,7 +99,7 @@ class Discovery:
     """The nodes found."""
 
     nodes: tuple[FoundNode, ...]
-    """In ascending order of node-IDs."""
+    """Nodes with a node-ID, in ascending order."""
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
@@ -130,7 +130,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
             unconfigured, more = lss.result()
-        except BaseException:  # also at Ctrl-C: the threads of the pool must end
+        except BaseException:  # also after Ctrl-C: the pool's threads must end
             connection.abandon()
             raise
     heard = connection.listener.nodes
@@ -140,9 +140,9 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
 
 def _let_others_finish(connection: BusConnection) -> None:
-    """Wait while another client's SDO transfers are under way: a request would abort them.
+    """Wait until other clients' SDO transfers have ended, because a request would abort them.
 
-    A host transfers at bring-up, and not while it runs.
+    A host transfers data during bring-up, but not while it runs.
     """
     end_s = time.monotonic() + OTHERS_S
     while time.monotonic() < end_s:
@@ -158,7 +158,7 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Return nodes without a node-ID, and whether there are more than time allowed to find.
+    """Return the nodes without a node-ID, and whether there are others that time did not allow to find.
 
     The nodes return to LSS waiting mode.
     """
@@ -178,7 +178,7 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
 
 
 def _sweep(connection: BusConnection) -> dict[int, int]:
-    """Return the node-IDs that answer, with the number of answers to one request."""
+    """Return the node-IDs that answer, each with its number of answers to one request."""
     answers: dict[int, int] = {}
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()
@@ -225,7 +225,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
 
 
 def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> FoundNode | None:
-    """Return a node with heartbeats but without a valid SDO answer; None if it has no heartbeats."""
+    """Return a node that sends heartbeats but no valid SDO answer; None if it sends no heartbeats."""
     beat = connection.listener.newest_beat(node_id)
     if beat is None:
         return None
@@ -247,7 +247,7 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 
 
 def _two_serials(connection: BusConnection, node_id: int) -> str:
-    """Return evidence for two nodes; empty if the second answer was a late one to an earlier request."""
+    """Return evidence for two nodes; empty if the second answer belonged to an earlier request."""
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
     if len(answers) < 2:

@@ -1,4 +1,4 @@
-"""The facts of a bus and its patches, as plain data: the checks see nothing else."""
+"""Facts about a bus and its patches, as plain data; the checks use nothing else."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Sure(StrEnum):
     """Certainty of a finding."""
 
     CERTAIN = "certain"
-    """A node or a counter reports it."""
+    """A node or a counter reports the fault."""
     LIKELY = "likely"
-    """The figures hardly have another cause."""
+    """The figures can hardly have another cause."""
     POSSIBLE = "possible"
-    """It may be intended; a person must look."""
+    """The condition may be intended; a person must decide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,21 +49,21 @@ class ScanFacts:
     """Captured scans of one patch: T scans, U upper wires, K lower wires."""
 
     ratio: Float
-    """(T, U, K) R/R0; NaN where there is no measurement."""
+    """(T, U, K) R/R0; NaN for a crossing without a measurement."""
     n_open: Counts
     n_short: Counts
     n_over: Counts
-    """(U, K) number of scans in which a crossing was open, shorted, out of range."""
+    """(U, K) number of scans in which a crossing was open, shorted or out of range, respectively."""
     t_s: Float
-    """(T,) time of the last frame since the first scan, s."""
+    """(T,) time from the end of the first scan to the end of each scan, s."""
     latency_s: Float
-    """(T,) time from SYNC to the last frame, s; NaN if no SYNC was heard."""
+    """(T,) time from SYNC to the last frame, s; NaN if no SYNC was received."""
     device_us: Counts
     """(T,) clock of the node, µs; -1 if the summary was lost."""
     complete: NDArray[np.bool_]
     """(T,)"""
     step: float
-    """One code as a share of R0."""
+    """Width of one code relative to R0."""
     stated_noise: float
     """Relative noise of the converter in the hand file."""
     stats: AssemblerStats
@@ -76,7 +76,7 @@ class ScanFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchFacts:
-    """One patch: its configuration and what was found; None if unknown."""
+    """One patch: its configuration and the observations, which are None if unknown."""
 
     name: str
     node_id: int
@@ -84,15 +84,15 @@ class PatchFacts:
     layout_hash: int | None = None
     """Layout hash of the hand file."""
     inhibit_100us: int | None = None
-    """Inhibit time that the host sets; None if it configures no node of this bus."""
+    """Inhibit time that the host sets; None if the host does not configure the nodes of this bus."""
     eds_problem: str = ""
-    """Why the EDS of the hand file is not that of the patch; empty if it is, or none is given."""
+    """Why the EDS in the hand file does not match the patch; empty if it matches or none is given."""
     found: FoundNode | None = None
     info: NodeInfo | None = None
     failure: str = ""
     """Why ``info`` is missing although the node was found."""
     boot_ups: int = 0
-    """Boot-up messages heard while listening."""
+    """Boot-up messages received while listening."""
     emergencies: tuple[Emergency, ...] = ()
     scans: ScanFacts | None = None
 
@@ -106,15 +106,15 @@ class BusFacts:
     channel: str
     bitrate_bps: int
     failure: str = ""
-    """Why the bus does not open, or failed; empty if it works."""
+    """Why the bus could not be opened, or failed; empty if it works."""
     link_state: str | None = None
-    """State of the controller in the kernel (ERROR-ACTIVE …)."""
+    """State of the CAN controller according to the kernel (ERROR-ACTIVE …)."""
     link_bitrate_bps: int | None = None
     seconds: float = 0.0
-    """Time of listening."""
+    """Listening time."""
     frames: int = 0
     load: float = 0.0
-    """Share of the bus taken by frames, in the busiest second of scans; without scans, in the last second."""
+    """Bus load as a fraction, in the busiest second of scans or, without scans, in the last second."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0
@@ -126,23 +126,23 @@ class BusFacts:
     period_s: float | None = None
     """SYNC period in the hand file."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
-    """Times of SYNCs heard, s; empty if the doctor sends them."""
+    """Times of the SYNCs received, s; empty if the doctor sends SYNC."""
     sync_counters: tuple[int, ...] = ()
-    """Their counters; 0 if a SYNC has none."""
+    """Counters of the SYNCs received; 0 for a SYNC without a counter."""
     sync_ours: bool = False
     own_period_s: float = 0.0
-    """Period of the doctor's own SYNC; 0 if another node sends it. Longer than ``period_s`` if a node that
-    no host has configured needs longer for a scan."""
+    """Period of the doctor's own SYNC; 0 if another node sends it. Longer than ``period_s`` if a node that no
+    host has configured needs more time for a scan."""
     active: bool = False
-    """Whether nodes that did not run were to be started."""
+    """Whether the doctor was allowed to start nodes that were not running."""
     role: str = "master"
-    """Role of the host on this bus in the hand file."""
+    """Host's role on this bus, from the hand file."""
     nmt_commands: int = 0
-    """NMT commands heard that a host of this hand does not send."""
+    """Number of NMT commands received that a host of this hand would not send."""
     master_node_id: int | None = None
-    """Node-ID of the host's heartbeat in the hand file."""
+    """Node-ID of the host's heartbeat, from the hand file."""
     master_beats_s: Float | None = None
-    """Times at which that heartbeat was heard, s."""
+    """Times at which the host's heartbeat was received, s."""
     heartbeat_ms: int | None = None
     """Heartbeat period in the hand file."""
     patches: tuple[PatchFacts, ...] = ()

@@ -34,7 +34,7 @@ def as_html(buses: Sequence[BusFacts], groups: Sequence[Group], title: str) -> s
     """Return the report. Needs matplotlib if there are scans.
 
     Args:
-        buses: Facts of each bus.
+        buses: Facts about each bus.
         groups: Findings by root cause.
         title: Name of the hand, or of the bus.
     """
@@ -105,7 +105,7 @@ def _table(rows: Sequence[tuple[str, object]]) -> str:
 
 
 def _maps(scans: ScanFacts) -> str:
-    """Draw maps of noise and of R/R0."""
+    """Plot maps of noise and R/R0."""
     analysis = analyse_noise(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
     title = "noise / stated noise, grey: none" + (
@@ -129,7 +129,7 @@ def _map(  # noqa: PLR0913 - one image
 
 
 def _timeline(scans: ScanFacts) -> str:
-    """Draw the time of each scan after its SYNC, and mark incomplete scans."""
+    """Plot the delay of each scan after its SYNC, and mark incomplete scans."""
     figure, (axes,) = _figure(1, 1, height_in=2.6)
     late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # an incomplete scan has no last frame
     if np.isfinite(late_ms).any():

@@ -1,4 +1,4 @@
-"""Gives a node its node-ID and bit rate by LSS (CiA 305)."""
+"""Sets the node-ID and bit rate of a node by LSS (CiA 305)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skinnode.errors import ConfigError
 from skinnode.host.lss_master import LssFailed
 
 BOOT_S: Final = 5.0
-"""Maximum boot time at the new node-ID."""
+"""Maximum time to boot with the new node-ID."""
 
 _ASKED_S: Final = 0.15
 _ASK_DEVICE_TYPE: Final = upload_request(od.DEVICE_TYPE, 0)
@@ -29,19 +29,19 @@ class Commissioned:
 
     address: LssAddress
     node_id_before: int | None
-    """Node-ID before; None if it had none."""
+    """Previous node-ID; None if the node had none."""
     node_id: int | None
     """New node-ID; None if unchanged."""
     bitrate_bps: int | None
     """New bit rate, valid from the next power-on; None if unchanged."""
     stored: bool
     booted: bool
-    """Whether the node booted at the new node-ID, or kept its node-ID."""
+    """Whether the node booted with its new node-ID; also True if the node-ID is unchanged."""
     faults: tuple[str, ...]
 
 
 def only_unconfigured(connection: BusConnection) -> LssAddress:
-    """Return the only node without a node-ID. Raises ConfigError if there is none, or several."""
+    """Return the only node without a node-ID. Raises ConfigError if there is none or more than one."""
     found, more = find_unconfigured(connection)
     if len(found) != 1 or more:
         serials = ", ".join(str(address.serial_number) for address in found)
@@ -54,14 +54,14 @@ def only_unconfigured(connection: BusConnection) -> LssAddress:
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """What to set in a node."""
+    """Values to set in a node."""
 
     node_id: int | None
     """New node-ID; None to keep it."""
     bitrate_bps: int | None
     """New bit rate; None to keep it."""
     store: bool
-    """Whether to store both, so that they survive power-off."""
+    """Whether to store both settings, so that they survive power-off."""
 
 
 def commission(
@@ -75,14 +75,15 @@ def commission(
     Args:
         connection: The bus.
         address: The node.
-        wanted: What to set.
-        agreed: Called with the present node-ID before anything is written; False ends the commissioning.
+        wanted: Values to set.
+        agreed: Called with the present node-ID before anything is written; if it returns False, nothing is
+            written.
 
     Returns:
         The result; None if ``agreed`` returned False.
 
     Raises:
-        ConfigError: The node-ID is taken, or there is no such node.
+        ConfigError: Another node has the node-ID, or no node has the address.
         LssFailed: The node refuses.
     """
     node_id = wanted.node_id
@@ -96,7 +97,7 @@ def commission(
         if not agreed(before):
             return None
         fault = _configure(connection, wanted)
-    finally:  # a node without a node-ID boots when it is released
+    finally:  # a node without a node-ID boots on release
         connection.lss.release()
     faults = [fault] if fault else []
     booted = True
@@ -112,7 +113,7 @@ def commission(
 
 
 def _configure(connection: BusConnection, wanted: Commissioning) -> str:
-    """Set and store; return why storing failed, empty if it did not."""
+    """Set the values and store them; return why storing failed, or an empty string."""
     if wanted.bitrate_bps is not None:
         connection.lss.set_bit_rate(wanted.bitrate_bps)
     if wanted.node_id is not None:

@@ -13,7 +13,7 @@ from skinnode.canopen.nmt import AFTER_COMMAND, ALL_NODES, NmtCommand, encode, s
 from skinnode.diagnose.bus_connection import BusConnection, State
 
 FOLLOW_S: Final = 1.5
-"""Maximum time, besides its heartbeat period, for a node to report its new state."""
+"""Maximum time, in addition to two heartbeat periods, for a node to report its new state."""
 
 BOOT_S: Final = 5.0
 """Maximum boot time of a node."""
@@ -54,12 +54,12 @@ class Change:
     after: str
     followed: bool
     known_by: str
-    """How the new state is known, or why the node counts as not following."""
+    """How the new state is known, or why the node is considered not to have obeyed."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Watch:
-    """What is known of a node before a command."""
+    """State of a node before a command."""
 
     node_id: int
     heartbeat_s: float | None
@@ -71,13 +71,13 @@ class _Watch:
 def command_nodes(
     connection: BusConnection, node_ids: Sequence[int], command: Command, *, at_once: bool
 ) -> list[Change]:
-    """Command nodes and observe what they do.
+    """Send a command to nodes and observe its effect.
 
     Args:
         connection: The bus.
         node_ids: The nodes.
         command: The command.
-        at_once: Whether to send one message to all nodes of the bus instead of one to each.
+        at_once: Whether to send a single message addressed to all nodes instead of one message per node.
 
     Raises:
         BusError: The bus failed.
@@ -92,7 +92,7 @@ def command_nodes(
 
 
 def _watch(connection: BusConnection, node_id: int) -> _Watch:
-    """Read what a stopped node would not answer any more."""
+    """Read the values that the node can no longer return once it is stopped."""
     heartbeat_s = connection.heartbeat_s(node_id)
     guarding = not connection.guarded(node_id)
     before = connection.state(node_id, heartbeat_s, guarding=guarding)
@@ -100,7 +100,7 @@ def _watch(connection: BusConnection, node_id: int) -> _Watch:
 
 
 def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_ns: int) -> Change:
-    """Return whether the node reports the commanded state."""
+    """Wait until the node reports the commanded state, or until time is up."""
     wanted, since_ns = AFTER_COMMAND[_SPECIFIERS[command]], sent_ns
     end_s = time.monotonic() + FOLLOW_S + 2 * (watch.heartbeat_s or 0.0)
     while True:
@@ -115,7 +115,7 @@ def _followed(connection: BusConnection, watch: _Watch, command: Command, sent_n
 
 
 def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
-    """Return whether the node booted, and its state then."""
+    """Wait until the node has booted, and read its state."""
     node_id = watch.node_id
     if not connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > watch.boot_ups, BOOT_S):
         why = f"no boot-up message within {BOOT_S:g} s"
@@ -123,7 +123,7 @@ def _booted(connection: BusConnection, watch: _Watch, sent_ns: int) -> Change:
         after = "silent" if now is None else state_name(now.state)
         return Change(node_id, str(watch.before), after, False, why)
     booted_ns = time.monotonic_ns()
-    heartbeat_s = connection.heartbeat_s(node_id)  # the reset may have changed it
+    heartbeat_s = connection.heartbeat_s(node_id)  # the reset may have changed the period
     guarding = not connection.guarded(node_id)
     now_in = connection.state(node_id, heartbeat_s, guarding=guarding, since_ns=booted_ns)
     how = "boot-up message" + (f", {now_in.how}" if now_in.state is not None else "")

@@ -26,7 +26,7 @@ from skinnode.text.words import counted
 
 @dataclass(frozen=True, slots=True)
 class PatchInfo:
-    """What only a patch of ours has."""
+    """Information that only a skinnode patch provides."""
 
     upper_wires: int
     lower_wires: int
@@ -40,14 +40,14 @@ class PatchInfo:
     code_hi: float
     pdo_bytes: int
     baseline_missing: int
-    """Crossings without R0."""
+    """Number of crossings without R0."""
     baseline_ohm: tuple[float, float, float] | None
-    """Least, median and greatest R0; None where there is none."""
+    """Minimum, median and maximum R0, ohm; None without a baseline."""
     send_changed_only: bool
     send_threshold_codes: int
     send_refresh_scans: int
     period_ms: int
-    """0: a scan at each SYNC."""
+    """Period of the node's own scan timer, ms; 0 for one scan per SYNC."""
     averaging: int
     open_upper: tuple[int, ...]
     shorted_upper: tuple[int, ...]
@@ -56,12 +56,12 @@ class PatchInfo:
     """Wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
-    """Frames that it ignored, by what was wrong; those that there were."""
+    """Number of frames that the node ignored, by reason; reasons with none are left out."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """What is known of a node; None for what it lacks."""
+    """Information about a node; fields that the node lacks are None."""
 
     node_id: int
     state: str
@@ -76,7 +76,7 @@ class NodeInfo:
     serial: int | None
     error_register: int | None
     errors: tuple[str, ...]
-    """Error history, the newest first."""
+    """Error history, newest first."""
     heartbeat_ms: int | None
     heartbeats_watched: tuple[str, ...]
     guarding: str
@@ -89,7 +89,7 @@ class NodeInfo:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Faults that the node reports itself."""
+        """Faults that the node itself reports."""
         found = [f"error register: {register_text(self.error_register)}"] if self.error_register else []
         if self.patch is not None:
             if self.patch.baseline_missing:
@@ -106,7 +106,7 @@ class NodeInfo:
 
 
 class _Reader:
-    """Reads optional objects of a node."""
+    """Reads a node's optional objects."""
 
     def __init__(self, remote: RemoteOd) -> None:
         self.remote = remote
@@ -131,12 +131,12 @@ class _Reader:
 
 
 def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None) -> NodeInfo:
-    """Read everything about a node.
+    """Read all information about a node.
 
     Args:
         connection: The bus.
         node_id: The node.
-        sheet: Names of the objects of a device that is not a patch.
+        sheet: EDS with the object names of a device other than a patch.
 
     Raises:
         NodeError: The node does not answer.
@@ -150,7 +150,7 @@ def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None)
     read = _Reader(remote)
     try:
         profile = read_profile(remote)
-    except SdoAbort:  # a node without an identity, or a patch without a descriptor
+    except SdoAbort:  # the node has no identity, or the patch has no descriptor
         profile = None
     if profile is not None and sheet is None:
         sheet = parse_eds(eds_text(profile), "profile")
@@ -284,7 +284,7 @@ def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
 
 
 def _masks(read: _Reader, index: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the open and the shorted wires of 0x2030 or 0x2031."""
+    """Return the open and the shorted wires that 0x2030 or 0x2031 reports."""
     wires: tuple[list[int], list[int]] = ([], [])
     for sub in range(1, (read.number(index) or 0) + 1):
         word, first = read.number(index, sub) or 0, (sub - 1) // 2 * 32

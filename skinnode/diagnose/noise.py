@@ -1,11 +1,11 @@
 """Estimates the noise of each crossing and wire, even while the skin is touched. Pure functions.
 
-There are two estimates. Second differences of successive scans (variance 6 σ²) are insensitive to a slow
-touch. The residual of a crossing after projection on the other wires is insensitive to a quick one: a touch
-moves crossings of many wires by a few functions of time, noise has a function of its own for each crossing.
-Both are upper bounds of the noise, so the smaller counts. A quick, deep and small touch leaves a rest in
-both. On touched skin a wire is therefore judged by its smallest singular values, which a touch hardly
-reaches, compared with those of its neighbours, and the patch by its own.
+There are two estimates. Second differences of successive scans (variance 6 σ²) are insensitive to slow
+touches. The residual of a crossing after projection on the other wires is insensitive to quick touches: a
+touch moves the crossings of many wires by a few functions of time, whereas the noise of each crossing is
+independent. Both are upper bounds of the noise, so the smaller value counts. A quick, deep and small touch
+affects both. On touched skin a wire is therefore judged by comparing its smallest singular values, which a
+touch hardly affects, with those of its neighbours; the patch is judged by its own.
 """
 
 from __future__ import annotations
@@ -21,42 +21,42 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum scans: the standard deviation of fewer is known to worse than a quarter."""
+"""Minimum number of scans; fewer give the standard deviation with an error of more than a quarter."""
 
 _MOST_SCANS: Final = 64
-"""Maximum scans used, the newest: computing time grows with their square."""
+"""Maximum number of scans used, the newest; computing time grows with its square."""
 
 _FLOOR: Final = 8
-"""Number of singular values that form the floor of a patch; their noise level is known to a fifth."""
+"""Number of singular values that form the floor of a patch; they give the noise level to a fifth."""
 
 _MOVED: Final = 6.0
 """Minimum motion of a touched crossing, in units of the stated noise."""
 _EXPLAINED: Final = 2.0
-"""Minimum ratio of the motion of a touched crossing to its unexplained rest. Noise with 25 degrees of
+"""Minimum ratio of the motion of a touched crossing to its unexplained residual. Noise with 25 degrees of
 freedom exceeds it once in a million."""
 _TOUCHED: Final = 2
-"""Minimum crossings that move together on touched skin: a loose contact moves one."""
+"""Minimum number of crossings that move together on touched skin; a loose contact moves only one."""
 _STEP: Final = 20.0
 """Minimum height of a jump, in units of the stated noise."""
 _STAYS: Final = 0.3
-"""Maximum difference between a jump and the change of the median, as a share of the jump."""
+"""Maximum difference between a jump and the change of the median, as a fraction of the jump."""
 _STILL: Final = 0.1
-"""Maximum standard deviation of a crossing besides its jump, as a share of the jump."""
+"""Maximum standard deviation of a crossing once its jump is removed, as a fraction of the jump."""
 _EVEN: Final = 0.2
-"""Maximum noise of a crossing besides the common noise, as a share of the common noise, if the supply is
-noisy."""
+"""Maximum noise of a crossing once the common noise is removed, as a fraction of the common noise, for the
+supply to count as noisy."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseAnalysis:
-    """Noise of a patch; arrays are (U, K), one value for each crossing, unless stated otherwise."""
+    """Noise of a patch; arrays are (U, K), one value per crossing, unless stated otherwise."""
 
     noise: Float
-    """Noise relative to R0, with the rest that a touch leaves; NaN if unknown."""
+    """Noise relative to R0, including the residual effect of a touch; NaN if unknown."""
     stated: Float
-    """Noise that converter and codes explain."""
+    """Noise expected from the converter and the code width, relative to R0."""
     level: Float
     """Median R/R0."""
     touched: Mask
@@ -66,14 +66,14 @@ class NoiseAnalysis:
     step_at: Counts
     step_by: Float
     upper: Float
-    """(U,) noise of each upper wire divided by the stated noise, without the effect of touch as far as
+    """(U,) noise of each upper wire divided by the stated noise; the effect of touch is removed as far as
     possible."""
     lower: Float
-    """(K,) the same for each lower wire."""
+    """(K,) noise of each lower wire, as for ``upper``."""
     floor: float
-    """The same for all crossings together."""
+    """Noise of all crossings together, as for ``upper``."""
     supply: float
-    """Noise common to all crossings divided by the stated noise; 0 if they differ."""
+    """Noise common to all crossings divided by the stated noise; 0 if the crossings differ."""
 
     @property
     def is_touched(self) -> bool:
@@ -119,10 +119,10 @@ def _roughness(series: Float) -> Float:
 
 
 def _unexplained(moved: Float) -> Float:
-    """Return (U, K) standard deviations that the other wires do not explain.
+    """Return the (U, K) standard deviations of the motion that the other wires do not explain.
 
-    The leading half of the functions of time of all other upper wires, or of all other lower wires, is
-    projected out; the larger rest counts. ``moved`` has mean 0.
+    The leading half of the temporal components of all other upper wires is projected out, then likewise for
+    all other lower wires; the larger residual counts. ``moved`` has mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -140,7 +140,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Return the smaller of floor and median crossing of each wire of the first axis; 0 if unknown."""
+    """Return, for each wire of the first axis, the smaller of floor and median crossing; 0 if unknown."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():
@@ -150,7 +150,7 @@ def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
 
 
 def _floor(moved: Float, values: int) -> float:
-    """Return the smallest singular values of (T, n) data divided by those of unit noise."""
+    """Return the norm of the smallest singular values of (T, n) data, divided by that of unit noise."""
     return _smallest(moved, values) / _of_noise(moved.shape, values) if moved.shape[1] else 0.0
 
 
@@ -166,9 +166,10 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return scan and height of the largest jump of each crossing, and whether nothing else happened.
+    """Return scan and height of each crossing's largest jump, and whether the crossing is otherwise constant.
 
-    The medians before and after differ by the jump, and little else varies.
+    An otherwise constant crossing has medians before and after that differ by the jump, and little other
+    variation.
     """
     jumps = np.diff(safe, axis=0)
     at = np.abs(jumps).argmax(axis=0)

@@ -1,4 +1,4 @@
-"""Reads and writes the object dictionary of a node: named and typed by its EDS (CiA 306), dumped, compared.
+"""Reads, writes, dumps and compares a node's object dictionary, using names and types of its EDS (CiA 306).
 
 Objects without an EDS are named by CiA 301 (``standard_objects``).
 """
@@ -39,7 +39,7 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""Objects that hold a node's state, whatever default its EDS gives."""
+"""Objects that hold the state of a node, even if its EDS gives a default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
@@ -54,19 +54,19 @@ class Reading:
     data_type: str
     access: str
     value: Value | None
-    """The value; None if the bytes have no simple value, or the node refused."""
+    """The value; None if the bytes represent no simple value, or the node refused."""
     data: bytes | None
     """The bytes transferred; None if the node refused."""
     refused: str
-    """Reason of the refusal; empty if there was none."""
+    """Reason for the refusal; empty if there was none."""
     refused_code: int = 0
-    """SDO abort code of the refusal, 0 if the read succeeded."""
+    """SDO abort code of the refusal; 0 if the read succeeded."""
 
     @property
     def content(self) -> bytes | None:
         """Value as bytes; None if the node refused.
 
-        Many nodes refuse to read an empty string for lack of data; its content is empty.
+        Many nodes refuse to return an empty string, because there is no data; its content is empty bytes.
         """
         if self.refused_code == AbortCode.NO_DATA and self.data_type in _STRINGS:
             return b""
@@ -89,13 +89,13 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An object whose value differs from a file."""
+    """An object whose value on the node differs from that in a file."""
 
     index: int
     subindex: int
     name: str
     node: str
-    """Value of the node, or why it is unknown."""
+    """The node's value, or why it is unknown."""
     file: str
 
 
@@ -119,7 +119,7 @@ def hex_text(data: bytes) -> str:
 
 
 def decode(entry: EdsEntry, data: bytes) -> Value | None:
-    """Return the value in ``data``; None if it is neither number nor text, or has a wrong length."""
+    """Return the value in ``data``; None if it is neither a number nor text, or has the wrong length."""
     if entry.data_type == _TEXT:
         return printable(data)
     if entry.size != len(data):
@@ -132,7 +132,7 @@ def decode(entry: EdsEntry, data: bytes) -> Value | None:
 
 
 def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
-    """Return the bytes of a value written by a person.
+    """Return the bytes of a value that the user typed.
 
     Args:
         entry: The object.
@@ -160,7 +160,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """Read a value; an abort is a reading too. Raises NodeError if the node does not answer."""
+    """Read a value; an abort also returns a reading. Raises NodeError if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -171,7 +171,7 @@ def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
 
 
 def type_name(entry: EdsEntry) -> str:
-    """Return the name of the data type in CiA 301."""
+    """Return the CiA 301 name of the entry's data type."""
     return _TYPES.get(entry.data_type, "" if not entry.data_type else f"0x{entry.data_type:X}")
 
 
@@ -190,7 +190,7 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
     """Return the entries at an address.
 
     Args:
-        eds: Names of the objects; an object missing there is named by CiA 301, or accessed without a name.
+        eds: Names of the objects; an object missing there has its CiA 301 name, or no name.
         index: Index.
         subindex: One value; None for all values of the object.
         count: Reads sub-index 0 of the object.
@@ -205,7 +205,7 @@ def entries_at(eds: Eds, index: int, subindex: int | None, count: Callable[[], i
 
 
 def dump_standard(remote: RemoteOd, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
-    """Read every object of CiA 301 that the node has: the dump that needs no EDS."""
+    """Read every object of CiA 301 that the node has; this dump needs no EDS."""
     progress("objects of CiA 301")
     for index in SINGLE:
         yield from _standard(remote, index)
@@ -227,7 +227,7 @@ def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
         count = b""
     for entry in standard_entries(index, count[0] if count and has_subindices(index) else 0):
         reading = read_entry(remote, entry)
-        if reading.refused_code != AbortCode.NO_SUBINDEX:  # an object may leave some out
+        if reading.refused_code != AbortCode.NO_SUBINDEX:  # an object may omit sub-indices
             yield reading
 
 
@@ -249,7 +249,7 @@ def compare(
         remote: The node.
         eds: The file; each readable value given there is compared, except the node's state.
         node_id: Replaces $NODEID.
-        progress: Receives a text now and then.
+        progress: Receives a text from time to time.
 
     Returns:
         The values that differ.
@@ -279,9 +279,9 @@ def compare(
 
 
 def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
-    """Return whether the node's value equals that of the file.
+    """Return whether the node's value equals the file's.
 
-    Trailing zeros of a string count only if the file gives the bytes: the default of an EDS cannot express
+    Trailing zeros of a string count only if the file gives the bytes, because an EDS default cannot express
     them.
     """
     spelt_out = entry.data_type != _TEXT or entry.given is not None
@@ -289,9 +289,9 @@ def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
 
 
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
-    """Return the texts of two different values.
+    """Return two different values as texts that differ.
 
-    Equal texts are followed by the bytes from the first difference.
+    If the plain texts are equal, the bytes from the first difference follow.
     """
     if got.data is None or expected.data is None or got.text != expected.text:
         return got.text, expected.text

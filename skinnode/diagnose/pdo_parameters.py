@@ -25,7 +25,7 @@ _KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """One PDO. Times are in the units of CiA 301; None if the node lacks the sub-index."""
+    """One PDO. Times are in CiA 301 units; a value is None if the node lacks the sub-index."""
 
     direction: Direction
     number: int
@@ -38,7 +38,7 @@ class Pdo:
     event_timer_ms: int | None
     sync_start: int | None
     mapped: tuple[int, ...]
-    """Mapping entries: index, sub-index, bits."""
+    """Mapping entries, each made up of index, sub-index and length in bits."""
 
     @property
     def bits(self) -> int:
@@ -92,7 +92,7 @@ def _optional(remote: RemoteOd, index: int, subindex: int, kind: str) -> int | N
 
 
 def kind_text(pdo: Pdo) -> str:
-    """Return when the PDO is sent, or when its data is used."""
+    """Return in words when a TPDO is sent, or when the data of an RPDO is used."""
     if 1 <= pdo.kind <= 240:
         every = "every SYNC" if pdo.kind == 1 else f"every {pdo.kind} SYNCs"
         return every if pdo.direction == "TPDO" or pdo.kind == 1 else "at the next SYNC"
@@ -102,7 +102,7 @@ def kind_text(pdo: Pdo) -> str:
 
 
 def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
-    """Return the PDO in one line; ``name_of`` returns the name of an index and sub-index."""
+    """Return the PDO as one line of text; ``name_of`` returns the name of an object."""
     name = f"{pdo.direction}{pdo.number}"
     if not pdo.enabled:
         return f"{name} off"
@@ -120,7 +120,7 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
 
 
 def _shortened(names: list[str]) -> str:
-    """Merge runs of numbered names."""
+    """Merge runs of names that differ only in their number."""
     shown: list[str] = []
     for name in names:
         stem, _, number = name.rpartition(" ")

@@ -1,9 +1,9 @@
-"""Groups findings by root cause: a consequence of another finding is listed below it.
+"""Groups findings by root cause: a finding that follows from another is listed below it.
 
 One overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All these findings
-are true, but none of them is the fault to repair. A rule names a cause and its possible consequences, at the
-same patch or at every patch of a bus. If the finding alone does not decide, the evidence does: an emergency
-follows from an overload only if each of its texts reports an overrun.
+are true, but none of them is the fault that must be repaired. A rule names a cause and its possible
+consequences, at the same patch or at every patch of a bus. If the text of a finding does not decide, its
+evidence does: emergencies follow from an overload only if each of their texts reports an overrun.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Group:
 
     @property
     def rank(self) -> int:
-        """Rank of its most certain finding; 0 is certain."""
+        """Rank of the most certain finding in the group; 0 is certain."""
         return min(_RANK[finding.sure] for finding in (self.cause, *self.consequences))
 
 
@@ -39,8 +39,8 @@ class Rule:
     cause: str
     follow: tuple[str, ...]
     evidence: Mapping[str, str]
-    """For a pattern of ``follow``: a pattern that each part of the evidence must contain, so that the
-    finding counts as a consequence."""
+    """By pattern of ``follow``: a pattern that each part of the evidence must match for the finding to count
+    as a consequence."""
 
 
 _HOLES: Final = ("scans with holes", "whole scans are missing")
@@ -56,7 +56,7 @@ _CONFIGURED_BY_OTHERS: Final = (
     "the patch scans by its own timer",
 )
 _UNEXPLAINED: Final = "^error register 0x|^last: none reported$"
-"""Pattern of the evidence of an error report that names no cause."""
+"""Pattern for the evidence of an error report that names no cause."""
 _OVERRUN: Final = dict.fromkeys(_ERRORS, f"overrun|{_UNEXPLAINED}")
 _WIRE: Final = dict.fromkeys(_ERRORS, f"wire open or shorted|overrun|{_UNEXPLAINED}")
 _RESTARTED: Final = dict.fromkeys(_ERRORS, f"SYNC of unexpected length|heartbeat|overrun|{_UNEXPLAINED}")
@@ -64,8 +64,8 @@ _COLLISION: Final = dict.fromkeys(_ERRORS, f"collision|{_UNEXPLAINED}")
 _CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_UNEXPLAINED}")
 _ANYTHING: Final[Mapping[str, str]] = {}
 
-# The first rule that fits a finding takes it. Rules about a patch come before rules about its bus; a rule
-# comes before those whose causes may be its consequences.
+# The first rule that matches a finding applies. Rules about a patch precede rules about its bus, and a rule
+# precedes any rule whose cause may be its consequence.
 RULES: Final = (
     Rule(
         "two nodes have its node-ID",
@@ -145,14 +145,14 @@ RULES: Final = (
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
     """Return all findings of these buses, grouped by root cause.
 
-    Groups with the most certain finding come first, then those with the most consequences.
+    Groups are sorted by their most certain finding, then by their number of consequences.
     """
     groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
     return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))
 
 
 def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]:
-    """Return each distinct finding once, with its places: an overload affects every patch."""
+    """Return each distinct finding once, with its places; an overload, for example, affects every patch."""
     places: dict[str, list[Finding]] = {}
     for finding in findings:
         places.setdefault(finding.what, []).append(finding)

@@ -24,14 +24,14 @@ _LONGEST_NS: Final = 10_000_000_000
 
 
 class ScanCapture:
-    """Assembles the scans of some patches and notes every SYNC.
+    """Assembles the scans of several patches and records every SYNC.
 
-    :meth:`on_frames` runs on the receiving thread of a link; read the results when it has stopped.
+    :meth:`on_frames` runs on the receiving thread of a link; read the results once that thread has stopped.
     """
 
     def __init__(self) -> None:
         self.syncs: deque[tuple[int, int]] = deque(maxlen=_MOST_SYNCS)
-        """Time, ns, and counter of each SYNC; counter 0 if it has none."""
+        """Time, ns, and counter of each SYNC; the counter is 0 if the SYNC has none."""
         self._patches: dict[int, _Patch] = {}
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 
@@ -52,7 +52,7 @@ class ScanCapture:
         self._takers = {**takers, od.summary_cob_id(node_id): (patch, False)}
 
     def scans(self, node_id: int) -> int:
-        """Return the number of scans of a patch."""
+        """Return the number of scans captured from a patch."""
         return len(self._patches[node_id].scans)
 
     def on_frames(self, frames: Sequence[Frame]) -> None:
@@ -64,7 +64,7 @@ class ScanCapture:
                 self.note_sync(frame.t_ns, frame.data[0] if frame.data else 0)
             elif (taker := self._takers.get(frame.can_id)) is not None:
                 patch, chunk = taker
-                if not patch.begun:  # the first scan was under way when listening began
+                if not patch.begun:  # its first scan began before the capture
                     patch.begun = not chunk
                     continue
                 take = patch.assembler.on_chunk if chunk else patch.assembler.on_summary
@@ -73,11 +73,11 @@ class ScanCapture:
             patch.keep(patch.assembler.poll(frames[-1].t_ns), self._sync_ns)
 
     def note_sync(self, t_ns: int, counter: int) -> None:
-        """Note a SYNC that was heard or sent."""
+        """Record a SYNC that was received or sent."""
         self.syncs.append((t_ns, counter))
 
     def facts(self, node_id: int, scale: CodeScale, stated_noise: float) -> ScanFacts | None:
-        """Return the scans of a patch; None if there are none.
+        """Return the scans captured from a patch; None if there are none.
 
         Args:
             node_id: The node.
@@ -109,7 +109,7 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of a scan's SYNC: the newest before its first frame, of the same counter."""
+        """Return the time of a scan's SYNC: the newest one before its first frame with the same counter."""
         for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None

@@ -1,6 +1,6 @@
-"""Objects whose names and types CiA 301 v4.2 (7.5.2) defines, to describe a device without its EDS.
+"""Objects whose names and types CiA 301 v4.2 (7.5.2) defines, for describing a device without an EDS.
 
-Sub-index 0 of an array or a record is the number of entries; it is read from the device.
+Sub-index 0 of an array or record is the number of entries, which is read from the device.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _GROUPS: Final = {1: "all", 2: "communication", 3: "application"}
 
 
 class _Object(NamedTuple):
-    """One object, or a range of identical objects."""
+    """One object, or a range of objects of the same structure."""
 
     name: str
     data_type: int
@@ -88,11 +88,11 @@ _MANY: Final = (
 SINGLE: Final = tuple(_ONE)
 """Indices of objects that occur once."""
 SERIES: Final = tuple(indices for indices, _ in _MANY)
-"""Index ranges of objects that may occur several times, contiguous from the first."""
+"""Index ranges of objects that may occur several times, in contiguous order from the first index."""
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:
-    """Return the entry that CiA 301 defines; None if it defines no such object or sub-index."""
+    """Return the entry as CiA 301 defines it; None if it defines no such object or sub-index."""
     item = _find(index)
     if item is None:
         return None
@@ -129,7 +129,7 @@ def standard_entries(index: int, count: int) -> Iterator[EdsEntry]:
 
 
 def has_subindices(index: int) -> bool:
-    """Return whether CiA 301 defines an array or a record there."""
+    """Return whether CiA 301 defines an array or a record at this index."""
     item = _find(index)
     return item is not None and (item.array or bool(item.subs))
 

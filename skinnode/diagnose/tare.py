@@ -2,8 +2,8 @@
 
 The node responds to the write to 0x2021:4 after it has measured, so the response is the confirmation. The
 summary of its next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
-server handles one transfer at a time, so a request from here would abort that upload: the baseline is read
-back once the node's SDO channel is quiet.
+server handles one transfer at a time, so a request from here would abort the host's upload. The baseline is
+therefore read back only when the node's SDO channel is quiet.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Silence of a node's SDO channel that shows that no other client is in a transfer with it."""
+"""Silence on a node's SDO channel that shows that no other client has a transfer under way."""
 
 HOST_BEGINS_S: Final = 1.0
-"""Maximum time, besides a SYNC period, from the tare to the host's first SDO request; 0.3 s on an idle
-host."""
+"""Maximum time, in addition to a SYNC period, from the tare to the host's first SDO request; an idle host
+takes 0.3 s."""
 
 OTHERS_S: Final = 4.0
-"""Maximum wait for other SDO clients."""
+"""Maximum wait for other SDO clients to finish."""
 
 _ATTEMPTS: Final = 3
 _POLL_S: Final = 0.02
@@ -42,18 +42,18 @@ _POLL_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Tared:
-    """Result of a tare of one patch."""
+    """Result of taring one patch."""
 
     patch: str
-    """Its name; empty if no hand names it."""
+    """Name of the patch; empty if no hand file names it."""
     node_id: int
     bus: str
     problem: str
     """Why the patch was not tared; empty if it was."""
     crossings: int = 0
-    """Crossings with a new R0."""
+    """Number of crossings with a new R0."""
     median_ohm: float | None = None
-    """Median R0 afterwards."""
+    """Median R0 after the tare."""
     median_change: float | None = None
     """Median of the ratio of new to old R0, minus one; None if there was no old R0."""
 
@@ -85,12 +85,12 @@ def tare(
     Args:
         connection: The bus.
         node_id: The node.
-        patch: Name of the patch; empty if no hand names it.
+        patch: Name of the patch; empty if no hand file names it.
         sync_period_s: SYNC period of a host that may be running.
         progress: Receives a text for each step.
 
     Returns:
-        The result, also if the node does not answer or refuses.
+        The result, even if the node does not answer or refuses.
 
     Raises:
         BusError: The bus failed.
@@ -135,7 +135,7 @@ def _tare(
 
 
 def _runs(connection: BusConnection, node_id: int) -> bool:
-    """Return whether a host has started the node: it then sends chunks, or operational heartbeats."""
+    """Return whether a host has started the node, which then sends chunks or operational heartbeats."""
     beat = connection.listener.newest_beat(node_id)
     operational = beat is not None and beat.state == NmtState.OPERATIONAL
     return operational or connection.listener.cob_ids[od.chunk_cob_id(node_id)] > 0
@@ -164,7 +164,7 @@ def _baseline(connection: BusConnection, remote: RemoteOd, profile: PatchProfile
 def _let_others_finish(connection: BusConnection, node_id: int, *, at_least_s: float) -> None:
     """Wait, at most OTHERS_S, until the node's SDO channel has been quiet for QUIET_S.
 
-    Wait ``at_least_s`` if no other client begins.
+    Waits at least ``at_least_s`` unless another client begins a transfer.
     """
     begun_s = quiet_s = time.monotonic()
     request, response = od.sdo_request_cob_id(node_id), od.sdo_response_cob_id(node_id)

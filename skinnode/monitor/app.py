@@ -28,7 +28,7 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between pictures."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor spent on drawing; slow pictures are drawn less often."""
+"""Maximum fraction of one processor to spend on drawing; slow pictures are drawn less often."""
 SLOWEST_S: Final = 0.5
 
 _LOG_LINES: Final = 500
@@ -59,7 +59,7 @@ class MonitorApp(App[None]):
         source: Host or recording; the caller closes it.
         folder: Folder of recordings.
         colours: Colours of the terminal.
-        over: Called on each update; True ends the monitor.
+        over: Called on each update; the monitor ends when it returns True.
         seconds: Maximum duration; None for no limit.
     """
 
@@ -106,7 +106,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Result of each tare, with its severity."""
+        """Result of each tare, with a severity."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
@@ -124,7 +124,7 @@ class MonitorApp(App[None]):
         self._turn()
 
     def on_unmount(self) -> None:
-        """Return log messages to the program."""
+        """Stop capturing log messages for the event log."""
         logging.getLogger().removeHandler(self._records)
 
     @property
@@ -164,7 +164,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns())
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # at start-up every patch becomes operational
+            if not begins:  # at start-up, all patches become operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:
@@ -315,7 +315,7 @@ class _Records(logging.Handler):
 
 
 def terminal_colours(environment: Mapping[str, str]) -> Colours:
-    """Return the colours of the terminal, as rich derives them from environment variables."""
+    """Return the terminal's colours, which rich derives from environment variables."""
     from rich.console import Console
 
     if environment.get("NO_COLOR"):

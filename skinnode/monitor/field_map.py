@@ -1,8 +1,8 @@
 """Draws a displacement field as characters: depth as brightness, shear as arrows. Pure functions.
 
 The x axis, along the upper wires, points right; the y axis, across them, points up. Two pixels, one above the
-other, form a character, so a pixel is roughly square. Without colours, a character shows the mean of its two
-pixels as a sign; a denser sign means deeper.
+other, form a character, so a pixel is roughly square. Without colours, each character represents the mean of
+its two pixels; a denser character means deeper.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ Colours = Literal["rgb", "ansi", "none"]
 """Colours of the terminal: 256 or more, the 16 ANSI colours, or none (NO_COLOR)."""
 
 Line = list[Segment]
-"""Line of the screen, or part of a line."""
+"""Line of the screen, or a part of it."""
 
-# Five points of matplotlib's "magma" (CC0): equal steps of depth look like equal steps of brightness.
+# Five points of matplotlib's "magma" (CC0), in which equal steps of depth look equally bright apart.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
 """Number of shades. More shades would be indistinguishable and take longer to draw and to transmit."""
 _UNKNOWN: Final = -1
-"""Level of skin without a measurement."""
+"""Level drawn for skin without a measurement."""
 _SIGNS: Final = "·:-=+*#%@"
-"""Signs from untouched to deep, in order of increasing density."""
+"""Characters from untouched to deep, in order of increasing density."""
 _ANSI: Final = ("black", "blue", "magenta", "red", "yellow", "bright_white")
 ARROWS: Final = "→↗↑↖←↙↓↘"
 
@@ -52,12 +52,12 @@ _STEPS_M: Final = tuple(
 _LEAST_M: Final = 5e-5
 """Minimum full scale, m, so that noise does not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which a deep press determines the scale."""
+"""Time for which a deep press determines the scale, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Part of a displacement field that maps show. Arrays are (U, N), upper wire 0 first, in metres."""
+    """Part of a displacement field that a map shows. Arrays are (U, N), upper wire 0 first, in metres."""
 
     depth_m: Float
     """Positive where the skin is pressed inwards."""
@@ -76,7 +76,7 @@ class Surface:
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """Return the part of a field that maps show.
+    """Return the part of a field that a map shows.
 
     Args:
         field: Newest field of the patch.
@@ -140,9 +140,9 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Depth drawn brightest: the smallest round number above the deepest recent press.
+    """Depth drawn at full brightness: the smallest round number above the deepest recent press.
 
-    All patches share the scale, so that their maps are comparable.
+    All patches share this scale, so that their maps are comparable.
     """
 
     def __init__(self) -> None:
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn brightest, m: rubber moves less along the surface than into it."""
+        """Shear drawn at full brightness, m; rubber moves less along the surface than into it."""
         return 0.25 * self.full_m
 
 
@@ -193,7 +193,7 @@ def paint_map(
 
 
 def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> dict[tuple[int, int], str]:
-    """Return arrows by column and line, spaced so that a press covers several."""
+    """Return arrows by column and line, spaced so that a press covers several arrows."""
     down = 1 if height < 7 else 2 if height < 18 else 3
     across = 2 * down
     rows, columns = (
@@ -214,7 +214,7 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
     """Draw shear as arrows; larger shear is brighter.
 
-    Each electrode has an arrow if there is room; more room allows arrows in between.
+    If there is room, each electrode has an arrow; with more room there are arrows in between.
     """
     colours = style.colours
     wires, electrodes = surface.depth_m.shape
@@ -241,7 +241,7 @@ def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> l
 
 
 def legend(style: MapStyle, width: int, text: Style) -> Line:
-    """Draw the colours from untouched to brightest, with the depth of the brightest colour."""
+    """Draw the colour scale from untouched to brightest, labelled with the depth of the brightest colour."""
     levels = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int).tolist()
     return [*_depth_line(levels, levels, {}, style.colours), Segment(f" {1e6 * style.full_m:.0f} µm", text)]
 

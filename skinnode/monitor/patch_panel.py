@@ -17,11 +17,11 @@ from skinnode.monitor.theme import Paint, Theme, beside, centred, pad, spread
 from skinnode.monitor.view_model import PatchView
 
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
-"""Conditions in which the newest field is out of date."""
+"""Patch conditions in which the newest field is out of date."""
 _AROUND: Final = 3
 """Lines of a tile besides its map."""
 _LEAST_OUTLINED: Final = (8, 5)
-"""Minimum size of a box, in characters and lines, for a map with an outline."""
+"""Minimum size of a box for a map with an outline, in characters and lines."""
 _LABEL: Final = 10
 """Width of the names of figures, characters."""
 
@@ -65,7 +65,8 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
     """Draw the height map centred in its box.
 
     The map has an outline because untouched skin is as dark as the screen. If a patch stops sending data, its
-    last map loses its colours and shows the condition across it, so that it cannot be mistaken for live data.
+    last map loses its colours and has the condition written across it, so that it cannot be mistaken for live
+    data.
     """
     theme = paint.theme
     if patch.surface is None:
@@ -95,7 +96,7 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
 
 
 def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
-    """Return width and height of the largest map in a box, and the characters taken by its outline.
+    """Return width and height of the largest map in a box, and the number of characters its outline takes.
 
     A small box has no outline.
     """
@@ -126,7 +127,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw the condition with the first fault or, without a fault, the rate."""
+    """Draw the condition with the first fault or, if there is no fault, with the rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)

@@ -14,10 +14,10 @@ from skinnode.monitor.touches import Touch
 from skinnode.monitor.view_model import History, PatchView, View
 
 SETTLE_NS: Final = 3_000_000_000
-"""Time after which a patch that is not operational counts as a fault."""
+"""Time after which a patch that is not operational counts as a fault, ns."""
 
 LOOK_S: Final = 0.1
-"""Interval at which the source is checked for faults."""
+"""Interval at which the source is checked for faults, s."""
 
 LINE_S: Final = 1.0
 """Interval between JSON lines."""
@@ -37,11 +37,11 @@ class FaultBook:
         return list(self._found.values())
 
     def update(self, view: View, real_ns: int, *, ending: bool = False) -> None:
-        """Note every fault in a view.
+        """Record every fault in a view.
 
         Args:
             view: Current view of the hand.
-            real_ns: Monotonic time of the monitor, ns; not the time of a recording.
+            real_ns: Monotonic time of the monitor, ns, rather than that of a recording.
             ending: Whether the session is ending, so that patches not yet operational count as faults.
         """
         if self._begun_ns is None:
@@ -66,7 +66,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return the faults other than the condition, each as an identifying key and a text."""
+    """Return the faults other than the condition, each as an identifying key and its text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:

@@ -17,7 +17,7 @@ from skinnode.text.words import counted
 
 LEAST_WIDTH: Final = 50
 LEAST_HEIGHT: Final = 16
-"""Minimum size of the screen, characters; a smaller screen shows only the required size."""
+"""Minimum size of the screen in characters; on a smaller screen, only the required size is shown."""
 
 
 def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
@@ -77,7 +77,7 @@ def _header(view: View, ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _losses(view: View, bus: BusView) -> str:
-    """Describe the losses of the patches on a bus, naming the worst; empty if there are none."""
+    """Describe the losses of the patches on a bus, and name the worst patch; empty if there are none."""
     counts = [patch.stream.assembler for patch in view.patches if patch.bus == bus.name]
     for name, one, several in (
         ("chunks_lost", "chunk lost", "chunks lost"),
@@ -131,7 +131,7 @@ def _keys(ui: UiState, theme: Theme, width: int) -> Line:
 
 
 def _lower(view: View, paint: Paint, log: Sequence[LogLine], width: int, height: int) -> list[Line]:
-    """Draw touches above events or, on a wide screen, beside them, with figures of the selected patch."""
+    """Draw touches above events or, on a wide screen, beside events and the selected patch's figures."""
     theme, ui = paint.theme, paint.ui
     chosen = view.patch(ui.selected)
     patches = (chosen,) if ui.zoomed else view.patches
@@ -197,7 +197,7 @@ def _touch_line(patch: PatchView, touch: Touch, theme: Theme, name: int) -> Line
 
 
 def _quiet(view: View) -> str:
-    """Return the text of an empty event log; a fault may be older than the log."""
+    """Return the text for an empty event log, which names faults that are older than the log."""
     wrong = [f"{patch.name} {patch.condition}" for patch in view.patches if patch.level == "bad"]
     wrong += [bus.name for bus in view.buses if bus.level == "bad"]
     if wrong:

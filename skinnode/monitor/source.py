@@ -27,12 +27,12 @@ from skinnode.record import Recorder, Replay
 
 _CAPACITY: Final = 1
 _EVENTS: Final = 500
-"""Maximum events kept until the screen is drawn."""
+"""Maximum number of events kept until the screen is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """State of a hand at one instant, by patch or by bus."""
+    """State of a hand at one instant, keyed by patch or bus."""
 
     t_ns: int
     """Monotonic time of the host, ns; for a recording, of the recording host."""
@@ -54,7 +54,7 @@ class Recording:
 
 
 class Source(Protocol):
-    """Data source of the screen. All methods return at once, except record and stop_recording."""
+    """Data source of the screen. All methods return immediately, except record and stop_recording."""
 
     hand: HandConfig
     title: str
@@ -93,7 +93,7 @@ class Source(Protocol):
 
 
 class HostSource:
-    """Source for a running host; the host's owner closes the host."""
+    """Source for a running host, which its owner closes."""
 
     live = True
 
@@ -101,13 +101,13 @@ class HostSource:
         self.hand, self.title = host.hand, host.hand.name
         self._host = host
         self._events = host.events(capacity=_EVENTS)
-        self._fields = host.fields(capacity=_CAPACITY)  # subscribers receive the reason for a host failure
+        self._fields = host.fields(capacity=_CAPACITY)  # subscribers receive the cause of a host failure
         self._recorder: Recorder | None = None
         self._untap: Callable[[], None] | None = None
 
     def snapshot(self) -> Snapshot:
         """Return the hand now."""
-        for _ in range(_CAPACITY + 1):  # a failure may follow the fields
+        for _ in range(_CAPACITY + 1):  # a failure may arrive after the fields
             self._fields.get(0.0)
         host, stats = self._host, self._host.stats()
         return Snapshot(
@@ -258,7 +258,7 @@ class ReplaySource:
                 pass
             for flaw in self._run.flaws:
                 self._all_events.publish(HealthEvent(self._run.clock(), self.title, "recording", flaw))
-        except Exception as error:  # the user must see every failure
+        except Exception as error:  # every failure must reach the user
             self._failure = error if isinstance(error, SkinError) else SkinError(f"replay: {error!r}")
 
     def _health(self) -> dict[str, PatchHealth]:

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 _STDOUT: Final = 1
 
 _MAX_QUEUED: Final = 30
-"""Maximum writes queued for the terminal: a few pictures."""
+"""Maximum number of writes queued for the terminal: a few pictures."""
 
 _END_S: Final = 1.0
-"""Maximum wait at the end for the terminal to accept queued output."""
+"""Maximum wait at the end for the terminal to accept queued output, s."""
 
 
 class _Writer(threading.Thread):
@@ -52,7 +52,7 @@ class _Writer(threading.Thread):
 
 
 class PatientDriver(LinuxDriver):
-    """Textual driver that reports a slow or missing terminal instead of waiting for it."""
+    """Textual driver that reports a slow or vanished terminal instead of waiting for it."""
 
     def __init__(self, app: App[Any], **options: Any) -> None:
         super().__init__(app, **options)
@@ -68,7 +68,7 @@ class PatientDriver(LinuxDriver):
         super().start_application_mode()  # type: ignore[no-untyped-call]
 
     def write(self, data: str) -> None:
-        """Queue ``data`` for the terminal; discard it if the queue is full."""
+        """Queue ``data`` for the terminal, or discard it if the queue is full."""
         try:
             if self._writer is not None:
                 self._writer.queue.put_nowait(data)

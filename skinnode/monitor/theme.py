@@ -99,7 +99,7 @@ class UiState:
 
 @dataclass(frozen=True, slots=True)
 class Paint:
-    """Drawing parameters common to every part of the screen."""
+    """Drawing parameters for all parts of the screen."""
 
     theme: Theme
     ui: UiState
@@ -134,7 +134,7 @@ def width_of(line: Line) -> int:
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Align ``right`` with the right end of a line; ``left`` is cut if there is no room for both."""
+    """Align ``right`` with the right end of a line; cut ``left`` if there is no room for both."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 

@@ -11,7 +11,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of touched skin, as a fraction of the deepest, if contacts are found by depth alone. Under
+"""Minimum depth of touched skin, as a fraction of the maximum, if contacts are found by depth alone. Under
 Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
 """Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds it once in 10 million
@@ -23,7 +23,7 @@ LEAST_TOUCH_M: Final = 1e-5
 class Touch:
     """One contact on a patch; unknown figures are None.
 
-    The posterior estimates forces. An exact field without a stiffness gives only place, area and depth.
+    The posterior estimates forces. An exact field without a known stiffness gives only place, area and depth.
     """
 
     x_m: float
@@ -66,7 +66,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
 
 def _depth_at(field: FieldFrame, rest_m: Float, place_m: Float) -> float:
-    """Return the depth, m, of the electrode nearest to a place."""
+    """Return the depth, m, at the electrode nearest to a place."""
     away = np.hypot(rest_m[..., 0] - place_m[0], rest_m[..., 1] - place_m[1])
     return float(-field.displacement_m[..., 2].flat[int(away.argmin())])
 

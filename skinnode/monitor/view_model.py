@@ -24,9 +24,9 @@ from skinnode.monitor.source import Snapshot
 from skinnode.monitor.touches import Touch, touches_of
 
 Level = Literal["good", "note", "bad"]
-"""Severity: good, worth checking, fault."""
+"""Severities: good, worth checking, fault."""
 HISTORY_NS: Final = 2_000_000_000
-"""Period over which rates and latencies are computed."""
+"""Period over which rates and latencies are computed, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class PatchView:
     condition: str
     level: Level
     words: tuple[str, ...]
-    """Faults other than the condition, worst first."""
+    """Faults other than the condition, the worst first."""
     health: PatchHealth
     stream: StreamStats
     rate_hz: float
@@ -72,7 +72,7 @@ class BusView:
     """Fraction of the last second occupied by frames."""
     frames_hz: float
     lost: int
-    """Frames dropped by the kernel or the host."""
+    """Number of frames dropped by the kernel or the host."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Fields per second of the fastest patch: the SYNC rate if all is well."""
+    """Fields per second of the fastest patch; equals the SYNC rate if all is well."""
     fields_hz: float
     """Fields per second of all patches together."""
     latency_s: float | None
@@ -101,7 +101,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """One event with its time of day."""
+    """One event and its time of day."""
 
     time: str
     subject: str
@@ -120,7 +120,7 @@ class History:
         """Add the newest snapshot and return its view."""
         kept = self._kept
         if kept and kept[-1].t_ns > snapshot.t_ns:
-            kept.clear()  # the time of a recording may jump back
+            kept.clear()  # a recording's time may jump back
         elif kept and kept[-1].t_ns == snapshot.t_ns:
             kept.pop()
         kept.append(snapshot)
@@ -214,7 +214,7 @@ def upper_m(layout: LayoutConfig) -> Float:
 def judge_patch(
     health: PatchHealth, stream: StreamStats, before: StreamStats
 ) -> tuple[str, Level, tuple[str, ...]]:
-    """Return the condition, its severity, and all other faults."""
+    """Return the condition, its severity and all other faults."""
     condition = health.condition
     if condition is Condition.STALE and not stream.solved and not stream.withheld:
         return "starting", "note", ()

@@ -17,13 +17,13 @@ from textual.widgets import Static
 from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
-"""Function that returns the lines of a picture for a width and a height."""
+"""Function that returns the lines of a picture of given width and height."""
 
 
 class Canvas(Widget):
     """Shows the lines of a painter; only lines that changed go to the terminal.
 
-    No Textual widget compares lines; its own widgets would redraw the whole picture each time.
+    Textual's own widgets do not compare lines, and would redraw the whole picture each time.
     """
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
@@ -49,7 +49,7 @@ class Canvas(Widget):
         self._paint()
 
     def render_line(self, y: int) -> Strip:
-        """Return line ``y`` for Textual to draw."""
+        """Return line ``y``, for Textual to draw."""
         return self._strips[y] if y < len(self._strips) else Strip.blank(self.size.width)
 
     def _paint(self) -> None:
@@ -98,6 +98,6 @@ class Dialog(ModalScreen[bool]):
     def on_key(self, event: Key) -> None:
         """Close the box with the answer."""
         event.stop()
-        if not self._answered:  # keys typed ahead arrive while the box closes
+        if not self._answered:  # keys typed ahead can arrive while the box closes
             self._answered = True
             self.dismiss(self._question and event.key in ("y", "enter"))

@@ -1,4 +1,4 @@
-"""Case EDS-01: the data sheet is consistent with itself, CiA 301 and the device's identity."""
+"""Case EDS-01: the data sheet is consistent with itself, with CiA 301 and with the device's identity."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _missing(eds: Eds) -> Iterator[str]:
 
 
 def _miscounted(eds: Eds) -> Iterator[str]:
-    """Yield each PDO count of DeviceInfo that differs from the number of PDOs described."""
+    """Yield each PDO count in DeviceInfo that differs from the number of PDOs described."""
     for key, name, first in (("nrofrxpdo", "NrOfRXPDO", 0x1400), ("nroftxpdo", "NrOfTXPDO", 0x1800)):
         stated, count = eds.device.get(key) or "", len(eds.indices(first, first + 0x1FF))
         try:
@@ -93,7 +93,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:
-    """Yield each property that the standard permits but some tools cannot handle."""
+    """Yield each property that the standard permits, but that some tools cannot handle."""
     if entry.mappable and not entry.size and entry.data_type in _TEXTS and entry.data_type != _DOMAIN:
         yield f"{entry}: mappable, but of variable length"
     if entry.low is not None and entry.high is not None and entry.low > entry.high:

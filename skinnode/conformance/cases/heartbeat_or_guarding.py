@@ -1,4 +1,4 @@
-"""HBVG 1 to 7: a device uses either heartbeat or guarding; heartbeat has priority (7.2.8.2.2)."""
+"""HBVG 1 to 7: a device uses either heartbeat or guarding, and heartbeat has priority (7.2.8.2.2)."""
 
 from __future__ import annotations
 

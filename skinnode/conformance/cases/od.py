@@ -1,4 +1,4 @@
-"""OD 1 to 9: every EDS object on the device; 1 to 6 for objects of CiA 301, 7 to 9 for objects above."""
+"""OD 1 to 9: all EDS objects on the device; 1 to 6 for objects up to 0x1FFF, 7 to 9 for objects above."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def _none(expected: str, faults: list[str]) -> None:
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
     """Compare default values with the EDS.
 
-    0x1010 and 0x1011 return the device's capabilities, not defaults: a difference there is a warning.
+    0x1010 and 0x1011 return the device's capabilities rather than defaults, so a difference there is a
+    warning.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -124,7 +125,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Mappings (PDO-25), the error field (only 0) and signatures have their own rules.
+        # Mappings (PDO-25), the error field (only 0) and signatures follow other rules.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):

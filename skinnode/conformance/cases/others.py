@@ -26,7 +26,7 @@ RESTRICTED = (
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Write non-default values to harmless objects; return the values before and after."""
+    """Write non-default values to harmless objects; return their values before and after."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -47,10 +47,10 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
-    """Check that a wrong signature is refused and changes nothing, either at once or after a reset."""
+    """Check that a wrong signature is refused and changes nothing, either immediately or after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
-    # If the device accepts the signature, the stored parameters must be put back.
+    # If the device accepts the signature, its stored parameters must be put back.
     dut.stored = True
     for signature in (b"wron", b"\0\0\0\0", b"SAVE", b"LOAD"):
         request = expedited(index, subindex, signature)
@@ -70,7 +70,7 @@ def _store(dut: Dut, subindex: int) -> None:
 
 
 def _restore(dut: Dut, subindex: int) -> None:
-    """Check that defaults take effect at the next reset and not earlier."""
+    """Check that defaults take effect at the next reset, but not earlier."""
     dut.need_storage(RESTORE, subindex)
     if dut.eds.find(STORE, subindex) is not None:
         _store(dut, subindex)

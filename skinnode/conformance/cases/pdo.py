@@ -30,13 +30,13 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum wait after a SYNC for the first TPDO of a cycle, which may follow a later SYNC."""
+"""Maximum wait after a SYNC for the first TPDO of a cycle; a later SYNC may be the one that triggers it."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check COB-IDs (the first four pre-defined, valid COB-IDs distinct) and transmission types."""
+    """Check COB-IDs (the first four as pre-defined, valid COB-IDs distinct) and transmission types."""
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -90,7 +90,7 @@ def remote(dut: Dut) -> None:
 
 
 def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
-    """Set a PDO up for remote frames; return its CAN-ID and length.
+    """Set a PDO up to answer remote frames; return its CAN-ID and length.
 
     Raises Unsupported if bit 30 of the COB-ID forbids remote frames.
     """
@@ -224,7 +224,7 @@ def _for_start(dut: Dut, pdo: Pdo) -> int:
     return set_up(dut, pdo, PdoSetup(2, start=3))
 
 
-# --- STOPPED, and PRE-OPERATIONAL after OPERATIONAL: the same triggers, and nothing is sent
+# --- STOPPED, and PRE-OPERATIONAL after OPERATIONAL: the same triggers send nothing
 
 
 def _silent(command: int, kind: int, state: str, *, event_ms: int = 0, start: bool = False) -> Trial:

@@ -1,4 +1,4 @@
-"""PDO 21 to 33: default mapping; remapping by the procedure, without it, and to invalid entries."""
+"""PDO 21 to 33: default mapping; remapping by the standard procedure, without it, and to invalid entries."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Fits = Callable[[EdsEntry], bool]
 
 
 def _changeable(dut: Dut, pdos: list[Pdo]) -> list[Pdo]:
-    """Return the PDOs that can be remapped. Raises NotApplicable if there is none."""
+    """Return the PDOs that can be remapped. Raises NotApplicable if there are none."""
     found = []
     for pdo in pdos:
         count, cob_id = dut.eds.find(pdo.mapping, 0), dut.eds.find(pdo.parameter, 1)
@@ -59,7 +59,7 @@ def _any_for(dut: Dut, pdo: Pdo) -> EdsEntry:
 
 
 def _clear(dut: Dut, pdo: Pdo) -> int:
-    """Disable the PDO and its mapping, the first steps of the procedure; return the previous COB-ID."""
+    """Disable the PDO and its mapping, the first steps of remapping; return the previous COB-ID."""
     cob_id = disable(dut, pdo)
     dut.sdo.write_integer(pdo.mapping, 0, 0, 1)
     return cob_id
@@ -217,7 +217,7 @@ def _accepts(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
 
 
 def _refuses(dut: Dut, pdos: list[Pdo], fits: Fits, lack: str) -> None:
-    """Check that the device refuses the entry or, if it checks only at the end, the number of entries."""
+    """Check that the device refuses the entry or, if it validates only at the end, the number of entries."""
     for pdo, word in _each(dut, pdos, fits, lack):
         what = f"{pdo}: mapping of 0x{word:08X}"
         request = expedited(pdo.mapping, 1, word.to_bytes(4, "little"))

@@ -31,7 +31,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that fits. Raises NotApplicable, naming what is missing."""
+    """Return the first entry that fits. Raises NotApplicable with the text of what is missing."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -39,7 +39,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """Return a readable object of more than four bytes and its value: a name or version if there is one."""
+    """Return a readable object of more than four bytes and its value, preferably a name or version."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):
@@ -111,7 +111,7 @@ def no_object(dut: Dut) -> None:
 def unknown_command(dut: Dut) -> None:
     what = "command specifier 7"
     answer = dut.sdo.ask(b"\xe0" + mux(_DEVICE_TYPE, 0), what)
-    # The standard does not specify which object this abort names.
+    # The standard does not specify which object the abort must name.
     index, subindex = struct.unpack("<HB", answer[1:4])
     dut.sdo.check_abort(answer, index, subindex, UNKNOWN_COMMAND, what)
     dut.sdo.read(_DEVICE_TYPE)
@@ -161,7 +161,7 @@ def _unchanged(dut: Dut, entry: EdsEntry, before: bytes) -> None:
 
 
 def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
-    """Return the value just beyond a limit; None if the type cannot hold it, or there is no limit."""
+    """Return the value just beyond a limit; None if there is no limit or the type cannot hold that value."""
     if limit is None or not entry.writable or entry.data_type not in (*SIGNED, *UNSIGNED):
         return None
     try:

@@ -1,4 +1,4 @@
-"""SDO 19 to 30: block transfer, and SDOs besides the default SDO."""
+"""SDO 19 to 30: block transfer, and SDOs other than the default SDO."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BLOCK_SIZE, _SEQUENCE, _CRC = 0x0504_0002, 0x0504_0003, 0x0504_0004
 
 
 def _block(transfer: Callable[[], bytes | None]) -> bytes | None:
-    """Run a block transfer. Raises NotApplicable if the server does not support it."""
+    """Run a block transfer. Raises NotApplicable if the server does not support block transfers."""
     try:
         return transfer()
     except Aborted as abort:

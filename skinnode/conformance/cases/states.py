@@ -46,7 +46,7 @@ def boot_up(dut: Dut) -> None:
         other = bytes(byte ^ 0x5A for byte in value)
         request = bytes((0x23 | (4 - len(other)) << 2,)) + mux(index, subindex) + other
         if len(other) <= 4:
-            # The device may refuse the write, but no new value may survive the reset.
+            # The device may refuse the write, but a new value must not survive the reset.
             changed += dut.sdo.ask(request, f"write to 0x{index:04X}:{subindex:02X}")[0] == 0x60
     if not changed:
         raise Failed("at least one parameter of 0x1000 to 0x1FFF that can be changed", "none")
@@ -85,7 +85,7 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """Set TPDOs up to be sent every 20 ms in OPERATIONAL; return their lengths by CAN-ID."""
+    """Set TPDOs up to be sent every 20 ms in OPERATIONAL; return their lengths, keyed by CAN-ID."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):
@@ -98,7 +98,7 @@ def _timed(dut: Dut) -> dict[int, int]:
 
 
 def _no_pdos(dut: Dut, state: str) -> None:
-    """Check that no TPDO is sent, either at the event timer or after SYNC."""
+    """Check that no TPDO is sent at the event timer or after SYNC."""
     can_ids = _timed(dut) if state == "PRE-OPERATIONAL" else {}
     sync(dut)
     for can_id in can_ids:
@@ -167,7 +167,7 @@ def stopped(dut: Dut) -> None:
 
 
 def _no_emcy(dut: Dut) -> None:
-    """Check that an RPDO without data, an error in OPERATIONAL, causes no emergency message."""
+    """Check that an RPDO without data, which is an error in OPERATIONAL, causes no emergency message."""
     dut.bus.pending(dut.emcy_id)
     dut.bus.send(0x200 + dut.node_id)
     dut.bus.expect_silence(dut.emcy_id, "emergency message in STOPPED")

@@ -26,7 +26,7 @@ def consume_only(dut: Dut) -> None:
 
 
 def produce(dut: Dut, period_ms: int = PERIOD_MS) -> None:
-    """Start the SYNC producer. Raises NotApplicable if the device has none."""
+    """Start the SYNC producer. Raises NotApplicable if the device has no producer."""
     dut.need(COB_ID)
     dut.need(PERIOD)
     dut.sdo.write_integer(PERIOD, 0, period_ms * 1000, 4)
@@ -78,7 +78,7 @@ def count(dut: Dut) -> None:
 
 
 def _synchronous(dut: Dut) -> Pdo:
-    """Return a TPDO that is synchronous by default, otherwise the first that maps something."""
+    """Return a TPDO that is synchronous by default or, failing that, the first TPDO that maps something."""
     usable = [pdo for pdo in tpdos(dut) if mapped(dut, pdo)]
     if not usable:
         raise NotApplicable("no TPDO maps anything by default")

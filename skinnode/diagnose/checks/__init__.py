@@ -1,4 +1,4 @@
-"""The doctor's checks: pure functions from facts to findings, one file for each area.
+"""The doctor's checks: pure functions from facts to findings, one file per area.
 
-They know nothing of buses; ``run`` calls them all.
+They do not access a bus. ``run`` calls all of them.
 """

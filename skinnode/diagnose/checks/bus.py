@@ -15,12 +15,12 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum share of SYNC counters that do not follow their predecessor. Two producers break half of them; lost
-SYNCs break few."""
+"""Maximum fraction of SYNC counters that do not follow their predecessor. Two producers break the sequence at
+half of the counters; lost SYNCs break it at a few."""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
-"""Minimum heartbeat period, as a share of the configured one: two senders halve it."""
+"""Minimum heartbeat period as a fraction of the configured period; two senders halve it."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
@@ -90,7 +90,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_masters(bus: BusFacts) -> Iterator[Finding]:
-    """Check that there is one sender of everything that only a master sends."""
+    """Check that each message reserved for a master has only one sender."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)

@@ -1,4 +1,4 @@
-"""Checks of the configuration of the nodes: sizes, layout, EDS, PDOs, times."""
+"""Checks of the nodes' configuration: sizes, layout, EDS, PDOs, times."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
 
 
 def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
-    """Compare the PDOs with those that the host sets; a value that the host has yet to write is no fault."""
+    """Compare the PDOs with the host's settings; a value that the host has yet to write is not a fault."""
     info = patch.info
     assert info is not None
     if info.patch is None or patch.found is None:
@@ -106,7 +106,7 @@ def _check_inhibit(
     profile = PatchProfile(*sizes, bus="classic" if own.pdo_bytes == 8 else "fd")
     at_default = chunk.inhibit_100us == profile.default_inhibit_100us
     if at_default and not running and patch.inhibit_100us is not None:
-        return  # no host has configured the node since it was powered up; bring-up replaces the default
+        return  # not configured by a host since power-up; bring-up replaces the default
     chunks, inhibit_s = profile.n_chunks, (chunk.inhibit_100us or 0) * 1e-4
     if chunks * inhibit_s > period_s:
         yield found(

@@ -13,7 +13,7 @@ from skinnode.text.words import counted, known
 
 
 def check_nodes(bus: BusFacts) -> Iterator[Finding]:
-    """Check that the nodes are present, the right ones, running and without errors."""
+    """Check that each node is present, is the expected device, runs and reports no error."""
     if bus.failure:
         return
     if bus.patches and all(patch.found is None for patch in bus.patches):

@@ -16,7 +16,7 @@ _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 
 def run_checks(facts: BusFacts) -> list[Finding]:
-    """Return all findings of a bus; within each area the most certain first."""
+    """Return all findings of a bus, with the most certain findings of each area first."""
     checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
         bus.check_bus,
         bus.check_masters,
@@ -38,7 +38,7 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 def others(facts: BusFacts) -> list[str]:
     """Describe each device that is neither a patch nor in the hand file, in one line.
 
-    The lines say what the device is, not what is wrong.
+    The lines identify the devices; they do not report faults.
     """
     lines = []
     for node in facts.strangers:
@@ -58,7 +58,7 @@ def others(facts: BusFacts) -> list[str]:
 
 
 def not_judged(facts: BusFacts) -> list[str]:
-    """Return what could not be judged, and why, one line each."""
+    """Return one line for each check that could not be made, with the reason."""
     if facts.failure:
         return [f"{facts.name}: nothing but the interface"]
     lines = []

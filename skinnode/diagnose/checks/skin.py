@@ -17,16 +17,16 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum noise of a noisy crossing, in units of the stated noise: far beyond the uncertainty of 20 scans."""
+"""Minimum noise of a noisy crossing, in units of the stated noise; not reached by chance in 20 scans."""
 
 _DRIFT: Final = 0.003
-"""Minimum |R/R0 − 1| at rest that is worth a tare: 100 times the noise of a good converter, 1 % of a
+"""Minimum |R/R0 − 1| at rest that justifies a tare: 100 times the noise of a good converter, 1 % of a
 press."""
 
 _MANY: Final = 0.8
 _FEW: Final = 0.1
 _SHARE: Final = 0.7
-"""Minimum share of noisy crossings on a noisy wire: some may be quiet by chance."""
+"""Minimum fraction of noisy crossings on a noisy wire; some crossings may be quiet by chance."""
 
 
 def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysis]]:
@@ -36,7 +36,7 @@ def _judged(bus: BusFacts) -> Iterator[tuple[PatchFacts, ScanFacts, NoiseAnalysi
 
 
 def check_wires(bus: BusFacts) -> Iterator[Finding]:
-    """Check for open, shorted and out-of-range wires and crossings, by the node's masks and by codes."""
+    """Check the node's masks and the codes for open, shorted and out-of-range wires and crossings."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         upper: set[int] = set()
@@ -59,8 +59,8 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
 def _check_crossings(
     patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
 ) -> Iterator[Finding]:
-    """Check crossings besides the wires that are at fault as a whole."""
-    whole = max(1, int(scans.complete.sum()))  # the missing part of a torn scan is unknown
+    """Check the crossings that are not on a wholly faulty wire."""
+    whole = max(1, int(scans.complete.sum()))  # crossings missing from a torn scan are unknown
     rest = np.ones(scans.n_open.shape, dtype=np.bool_)
     rest[sorted(upper), :] = False
     rest[:, sorted(lower)] = False
@@ -75,7 +75,7 @@ def _check_crossings(
     ):
         always, sometimes = rest & (counts >= whole), rest & (counts > 0) & (counts < whole)
         for side, wires in (("upper", always.all(axis=1)), ("lower", always.all(axis=0))):
-            if wires.any():  # the node's masks were read before these scans
+            if wires.any():  # the masks are older than these scans
                 yield Finding(
                     "wires",
                     patch.name,
@@ -106,7 +106,7 @@ def _check_crossings(
 
 
 def check_noise(bus: BusFacts) -> Iterator[Finding]:
-    """Check noise against the hand file, jumps, and values that do not change."""
+    """Check for more noise than the hand file states, for jumps, and for values that do not change."""
     for patch, scans, analysis in _judged(bus):
         yield from _check_frozen(patch, scans)
         yield from _check_noise(patch, scans, analysis)
@@ -168,7 +168,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
 
 
 def _stands_out(levels: Float, wire: int) -> bool:
-    """Return whether a wire is noisy where its neighbours are not; a touch affects the next wires too."""
+    """Return whether a wire is noisy but its neighbours are not; a touch affects adjacent wires too."""
     neighbours = [levels[i] for i in (wire - 1, wire + 1) if 0 <= i < len(levels)]
     return bool(neighbours) and bool(levels[wire] > NOISY * max(1.0, *neighbours))
 
@@ -198,24 +198,24 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether all codes are constant although the stated noise is too small to prove a defect."""
+    """Return whether all codes are constant, but the stated noise is too small for that to prove a defect."""
     known, still = _still(scans)
     return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
 
 
 def _shows(scans: ScanFacts) -> bool:
-    """Return whether the stated noise soon changes every code."""
+    """Return whether the stated noise is large enough to change every code within a few scans."""
     return scans.stated_noise > scans.step
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Return the crossings that were always measured, and of them those that never changed."""
+    """Return masks of the crossings measured in every scan, and of those among them that never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 
 
 def check_baseline(bus: BusFacts) -> Iterator[Finding]:
-    """Check for a baseline that is missing, or no longer that of the skin at rest."""
+    """Check for a baseline that is missing or no longer matches the skin at rest."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         if own is not None and own.baseline_missing:
@@ -257,7 +257,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
 
 
 def is_touched(scans: ScanFacts) -> bool:
-    """Return whether something touched the skin, so that not everything could be judged."""
+    """Return whether something touched the skin, which prevents some of the checks."""
     return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
 
 
@@ -274,6 +274,6 @@ def _listed(wires: tuple[int, ...]) -> str:
 
 
 def _places(mask: Mask) -> str:
-    """Return crossings as upper/lower wire numbers."""
+    """Return the first crossings of a mask as text: upper/lower wire numbers."""
     places = [f"{row}/{column}" for row, column in np.argwhere(mask)[:6]]
     return ", ".join(places) + (" …" if mask.sum() > 6 else "")

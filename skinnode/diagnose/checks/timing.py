@@ -11,20 +11,20 @@ from skinnode.diagnose.facts import BusFacts, Finding, Sure
 from skinnode.text.words import counted
 
 _JITTER: Final = 0.1
-"""Maximum SYNC jitter, as a share of the period."""
+"""Maximum SYNC jitter as a fraction of the period."""
 
 _PERIOD_ERROR: Final = 0.02
 _LATE: Final = 0.95
-"""Maximum duration of a scan, as a share of the period."""
+"""Maximum time from SYNC to the end of a scan, as a fraction of the period."""
 
 
 def check_timing(bus: BusFacts) -> Iterator[Finding]:
-    """Check SYNC, and the delay of scans after it."""
+    """Check SYNC and the delay from SYNC to the end of each scan."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)
 
-    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # another master must send it
+    awaited = (bus.running and not bus.sync_ours) or bus.role == "guest"  # another master must send SYNC
     if awaited and len(bus.sync_s) == 0 and bus.seconds > 0 and not bus.failure:
         timers = any(p.info and p.info.patch and p.info.patch.period_ms for p in bus.patches)
         if not timers:
@@ -91,7 +91,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Check where frames were lost: in this machine, on the bus, at the node."""
+    """Check for lost frames, and where they were lost: in this machine, on the bus or at the node."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)

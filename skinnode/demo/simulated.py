@@ -68,7 +68,7 @@ def _run_nodes(hand: HandConfig, parent: Connection) -> None:
 
     from vcan_sim.fleet import Fleet
 
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all of the group, but the parent ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to the whole group; the parent ends this process
     try:
         with Fleet(hand):
             parent.send("")

@@ -64,7 +64,10 @@ def simulate(
     reports = fleet.report()
     _say(_summary(reports))
     if slow := sum(report.slow_overruns for report in reports):
-        _say(f"note: {counted(slow, 'scan')} skipped because this machine was too busy; no fault of the hand")
+        _say(
+            f"note: {counted(slow, 'scan')} skipped because this machine was too busy; "
+            "the hand is not at fault"
+        )
     for line in injected:
         _say(line)
 

@@ -79,7 +79,7 @@ class Faults:
     miscounted_by: int | None = None
     """Error of the ``miscounted`` counter, modulo 256; None for a random error."""
     corrupted: float = 0.0
-    """One code differs from the code that the node packed; length and counters are correct."""
+    """One code differs from the code packed by the node; length and counters are correct."""
 
     # --- fractions of the scans
     torn: float = 0.0
@@ -90,8 +90,9 @@ class Faults:
     displaced: float = 0.0
     """A chunk has the counter of the next scan, whose own chunk with that index is lost."""
     understated: float = 0.0
-    """A chunk is lost, and the summary claims that only changed chunks were sent, one fewer. Its check, if
-    any, is correct for that summary. A scan that sends only changed chunks just loses the chunk."""
+    """A chunk is lost; the summary claims that only changed chunks were sent, and counts one chunk fewer. Its
+    check, if any, is correct for that summary. A scan that really sends only changed chunks just loses the
+    chunk."""
     unchecked: float = 0.0
     """The summary carries no check, as in revision 1.0."""
     struck: int | None = None
@@ -129,7 +130,7 @@ class Faults:
     frozen: bool = False
     """The converter keeps returning the same values."""
     unplugged: bool = False
-    """The node is disconnected from bus and supply; it boots when this ends."""
+    """The node is disconnected from bus and supply; it boots when the fault ends."""
     wrong_identity: bool = False
     """The node reports a different product code."""
     wrong_layout: bool = False

@@ -1,7 +1,7 @@
 """A real node with faults. Every frame between the node and its bus passes through this module.
 
-Reading faults are in :mod:`vcan_sim.sensor`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults are drawn
-from a seed and the order of the frames, not from the clock, except for events at a rate.
+Reading faults are in :mod:`vcan_sim.sensor`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults depend on a
+seed and the order of the frames, not on the clock, except for events at a rate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vcan_sim.tally import Kind, Tally, kind_of
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
 """Pacing of a simulated node. The node may stall for half a SYNC period of the reference hand and still
-finish its scan in time, because a busy machine is not part of the simulation. Four nodes then send bursts of
+finish its scan in time, because the load of the host machine is not simulated. Four nodes then send bursts of
 up to 270 frames, which fit the default receive buffer of a socket."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
@@ -141,7 +141,7 @@ class FaultyNode(PatchNode):
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Let the node and the events at a rate do everything due at ``t_ns``."""
+        """Do everything due at ``t_ns``: the node's own work and the events at a rate."""
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
         if self._unplugged:
@@ -151,7 +151,7 @@ class FaultyNode(PatchNode):
         self._do_due_events(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when to call :meth:`on_timer` next, or None if not before the next frame."""
+        """Return when to call :meth:`on_timer` next, or None if nothing is due before the next frame."""
         faults = self.faults
         if faults.unplugged != self._unplugged:
             return 0

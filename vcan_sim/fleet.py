@@ -45,9 +45,9 @@ class NodeReport:
 class Fleet:
     """A hand's patches as CANopen nodes, each with its own scene.
 
-    A scene begins when its node has sent its first scan: bring-up may take any time, and a tare at power-on
-    sees an untouched patch. :meth:`start` opens the buses and powers the nodes on. :meth:`stop` sets the
-    nodes to pre-operational and closes the buses. A ``with`` block does both.
+    A scene begins when its node has sent its first scan, so bring-up may take any time, and a tare at
+    power-on sees an untouched patch. :meth:`start` opens the buses and powers the nodes on. :meth:`stop` sets
+    the nodes to pre-operational and closes the buses. A ``with`` block does both.
 
     Args:
         hand: Buses, patches and scene.
@@ -156,7 +156,7 @@ class Fleet:
     def bus_off(self, bus: str, *, off: bool) -> None:
         """Set the controller of the nodes on a bus to bus-off, or reconnect it.
 
-        The nodes end if bus-off lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
+        The nodes exit if bus-off lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
         """
         self._ports[bus].off = off
 

@@ -23,13 +23,13 @@ from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
 
 LEAD_S: Final = 0.8
-"""Rest before the first press, s; gives time for the baseline and for a viewer."""
+"""Rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Fractions of a cycle; the remainder is rest. In a 4 s cycle a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
-"""Fraction of a slide in which the sphere accelerates, and of its end in which the sphere decelerates."""
+"""Fraction of a slide in which the sphere accelerates; it decelerates in an equal fraction at the end."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 

@@ -24,7 +24,7 @@ WIRE_NOISE: Final = 3e-3
 
 Fault = Callable[[Float, int], Float]
 """Function from resistances (U, K) in ohm and the time in ns to the resistances that the converter sees
-instead; inf means an open pair of wires, 0 a short."""
+instead; inf means an open pair of wires, 0 a shorted pair."""
 
 
 class SimulatedPatch:
@@ -84,8 +84,8 @@ class SimulatedPatch:
         """Return the time of a reading, ns.
 
         Args:
-            device_time_us: The node's time of the reading, µs: its lower 32 bits, of which a checked summary
-                carries all but the lowest 6.
+            device_time_us: Lower 32 bits of the node's time of the reading, µs; the lowest 6 bits are
+                ignored, because a checked summary does not carry them.
 
         Raises:
             LookupError: There was no such reading, or it is too old.

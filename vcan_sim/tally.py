@@ -94,16 +94,16 @@ class Tally:
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line per sum that does not agree; empty if all agree. Call when the node is idle."""
+        """Return one line per sum that does not agree. Call when the node is idle."""
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [
-            f"{kind} frames: {self.handed[kind]} handed over, {out[kind]} accounted for"
+            f"{kind} frames: {self.handed[kind]} to send, {out[kind]} accounted for"
             for kind in Kind
             if self.handed[kind] != out[kind]
         ]
         return found + [
-            f"{kind} frames: {self.heard[kind]} heard, {into[kind]} accounted for"
+            f"{kind} frames: {self.heard[kind]} received, {into[kind]} accounted for"
             for kind in Kind
             if self.heard[kind] != into[kind]
         ]

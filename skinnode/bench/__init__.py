@@ -5,6 +5,6 @@
     cases, truth -> methods (solvers set up for a case) -> verdict, score -> rows -> plots
 
 Each subcommand of ``skinnode bench`` has a module with a function ``run``, which returns the figures as plain
-values; ``skinnode.cli.bench`` prints and writes them. ``truth`` simulates presses in closed form, without any
-assumption made by the solvers. ``load`` and ``soak`` take their frames from the simulator.
+values; ``skinnode.cli.bench`` prints and writes them. ``truth`` simulates presses in closed form and shares
+no assumption with the solvers. ``load`` and ``soak`` take their frames from the simulator.
 """

@@ -15,9 +15,10 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum error of the posterior by layout, at a relative noise of 1e-5, h = 0.5, a press of 0.1 heights."""
+"""Maximum error of the posterior by layout, for a press of 0.1 heights at h = 0.5 and a relative noise of
+1e-5."""
 SCENES_A_CELL: Final = 25
-"""Number of random scenes for each scene of a table cell over noise and codes; a cell has at least 3 scenes.
+"""Number of random scenes per scene in a cell of the tables of noise and codes; a cell has at least 3 scenes.
 The RMS of each scene already covers 300 coordinates."""
 
 
@@ -49,7 +50,7 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each requirement: its name, the figure, the limit as text, and whether it is met.
 
-    A requirement on time is ``absolute``: it depends on the machine, so missing it is not a failure.
+    A time requirement is ``absolute``: it depends on the machine, so missing it is not a failure.
     """
     found = []
     for row in figures["noise"]:
@@ -98,7 +99,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """Return a fraction as a percentage, whatever its size, so that a column has one unit."""
+    """Return a fraction as a percentage, whatever its size, to use the same unit throughout a column."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
@@ -117,7 +118,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row that reaches the accuracy, else its most accurate; fastest first."""
+    """Return each solver's fastest row that reaches the accuracy, or its most accurate row; fastest first."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]
@@ -131,7 +132,7 @@ def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _print_noise(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("\nerror (reported standard deviation) of a 10% press / displacement; conv.: wires CONVERGED")
+    echo("\n10% press: error (reported standard deviation) / displacement; conv.: wires CONVERGED")
     echo(
         f"  {'layout':16}{'noise':>7}{'exact':>20}{'conv.':>7}{'posterior':>20}{'conv.':>7}"
         f"{'bound, no prior':>17}{'prototype: exact, posterior':>30}"
@@ -179,7 +180,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
             f"{row['scenes']:7}{row['converged']:7.0%}{_text(row['error']):>10}{_text(row['reported']):>10}"
             f"{ratio:>7}{covered:>9}"
         )
-    echo("  forces and contacts of the posterior where it found any: RMS error (reported), fraction in 95 %")
+    echo("  forces and contacts, if the posterior found any: RMS error (reported), fraction in 95 %")
     for row in rows:
         if row["method"] == "posterior":
             where = f"{row['layout']} h={row['height']:g}"
@@ -199,7 +200,7 @@ def _print_coverage(rows: list[dict[str, Any]], echo: Callable[[str], object]) -
 
 
 def _print_parts(rows: list[dict[str, Any]], echo: Callable[[str], object]) -> None:
-    echo("  errors of the posterior there, in units of √(n + b): n due to noise, b left open by the prior")
+    echo("  the posterior's errors in units of √(n + b): variance n due to noise, b due to the prior")
     echo(
         f"  {'b / (n + b)':16}{'coordinates':>12}{'RMS':>7}{'by noise':>10}{'b in it':>9}{'95 %':>7}"
         f"{'99.9 %':>8}{'kurtosis':>10}"

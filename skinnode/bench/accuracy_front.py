@@ -1,9 +1,10 @@
 """Error against time for a few wires: our solvers next to their peers on the same compiled F and J.
 
 The wires are the most deeply pressed wires of the patch; the samples of the press have no noise. Every solver
-starts from rest. It solves either the last sample alone or sample by sample, each from the solution of the
-previous sample, as in the paper. It runs at several tolerances, one point each. The time of ``solve_path``
-includes steps that the bare operators omit: setting up the patch, following the branch, estimating the error.
+starts from rest. It solves either the last sample alone or all samples in turn, each from the solution of the
+previous sample, as in the paper. Each solver runs at several tolerances and gives one point per tolerance.
+The time of ``solve_path`` includes steps that the bare operators omit: setting up the patch, following the
+branch, estimating the error.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from skinnode.solve.wires.problem import PatchProblem
 
 SCENES: Final = (("staggered", 0.5, 0.3), ("staggered", 1.0, 0.3), ("aligned", 0.5, 0.1))
 """Preset, height in pitches, depth in heights: a press that all solvers solve from rest, a press that needs
-the samples, and the paper's own layout."""
+intermediate samples, and the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
 """Maximum error, relative to the displacement, at which a result counts as solved and is drawn."""
 ROUNDING: Final = 1e-11
-"""Error below which results count as equal: rounding errors of F, amplified by the condition number of J."""
+"""Error below which results count as equal: rounding error of F, amplified by the condition number of J."""
 LOOSE: Final = 1e-6
 """Tolerance at all samples before the last, as in the paper."""
 REPEATS: Final = 7
@@ -48,12 +49,12 @@ class Scene:
     name: str
     layout: PatchLayout
     samples_ohm: Float
-    """(T, U, K), ohm; the first sample is the first after rest."""
+    """(T, U, K), ohm, without the sample at rest."""
     truth_m: Float
     """(U, N, 3), true displacement at the last sample, metres."""
 
     def thinned(self, samples: int) -> Float:
-        """Return ``samples`` of the samples, evenly spaced and including the last."""
+        """Return ``samples`` evenly spaced samples, including the last."""
         step = len(self.samples_ohm) // samples
         return self.samples_ohm[step - 1 :: step]
 
@@ -75,7 +76,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the fastest of a few calls, fewer if they are slow; other programs can only add time."""
+    """Return the shortest time of a few calls, fewer if they are slow; other programs can only add time."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -126,7 +127,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Return one scatter plot per scene: rows with time, error, and whether they are on the front."""
+    """Return the rows of one scatter plot per scene, with time, error, and whether they are on the front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)
@@ -141,7 +142,7 @@ def run() -> list[dict[str, Any]]:
 def _rows(scene: Scene) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     solvers = peers(PatchProblem.of(scene.layout))
-    del solvers["skinnode solve_system, Python callables"]  # same operator, called from Python
+    del solvers["skinnode solve_system, Python callables"]  # the same operators, called from Python
     for tolerance in TOLERANCES:
         for name, solve in solvers.items():
             for samples in (1, 10):

@@ -62,7 +62,7 @@ class Pool:
     _size: float = 0.0
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene by its last frame and its true displacement ``truth_m`` (U, N, 3)."""
+        """Add a scene's last frame and its true displacement ``truth_m`` (U, N, 3)."""
         used = np.array([status is Status.CONVERGED for status in frame.status])
         error, std = (frame.displacement_m - truth_m)[used], frame.displacement_std_m[used]
         self.scenes += 1
@@ -89,14 +89,14 @@ class Pool:
 
 @dataclass
 class Parts:
-    """Compares the posterior's errors with its variance n + b: n due to noise, b left open by the prior."""
+    """Compares the posterior's errors with its variance n + b: n due to noise, b due to the prior."""
 
     _error: list[Float] = field(default_factory=list)
     _noise: list[Float] = field(default_factory=list)
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene and its truth (U, N, 3). Skips held frames, whose variance has more parts."""
+        """Add a scene and its truth (U, N, 3). Skips held frames, whose variance has additional parts."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -109,8 +109,8 @@ class Parts:
     def rows(self) -> list[dict[str, Any]]:
         """Return one row for each interval of the prior's fraction b / (n + b).
 
-        It contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS that n alone would give, and
-        the fraction of b that appears in the errors.
+        Each row contains the RMS, quantiles and kurtosis of error / √(n + b), the RMS that n alone would
+        give, and the fraction of b that appears in the errors.
         """
         if not self._error:
             return []
@@ -155,7 +155,8 @@ class Bound:
 class Forces:
     """Compares contacts, forces and centroids with the truth.
 
-    Forces, in scenes with a contact, are relative to the true normal force; centroids are in metres.
+    Force errors, in scenes with a contact, are relative to the true normal force; centroid errors are in
+    metres.
     """
 
     found_right: int = 0
@@ -208,7 +209,7 @@ class Forces:
 
 def _case(kind: str, height: float) -> Case:
     def never(rng: np.random.Generator) -> Stream:
-        raise RuntimeError("this case has a skin, but no stream")
+        raise RuntimeError("this case has a skin but no stream")
 
     return Case(0, f"{kind} h={height:g}", Skin(preset(kind, height)), never)
 
@@ -238,8 +239,8 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
     """Return a press by a fingertip-sized body, with a contact radius of 1.5 to 2.5 pitches at full depth.
 
-    It displaces the skin as much as the prototype's indenter does; their Cramér-Rao bounds agree, see
-    PROTOTYPE.
+    The press displaces the skin as much as the prototype's indenter does: their Cramér-Rao bounds agree (see
+    PROTOTYPE).
     """
     press = random_press(rng, layout, depth)
     contact = rng.uniform(1.5, 2.5) * layout.pitch_m

@@ -29,12 +29,12 @@ PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
 """Noise of roughly a 16-bit converter."""
 STRIDE: Final = 4
-"""Number of path samples per frame of a tracker."""
+"""Number of path samples per tracker frame."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error of the change in R in the wrong models of case 13. Measured on a 30 % press, staggered,
-h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; the change of one pair is off by 1 to 5 % in the median and 7 % at
-worst."""
+"""Relative error in the change of R in the wrong models of case 13. Measured on a 30 % press, staggered,
+h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in the median
+and by 7 % at worst."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class Case:
     """Converter of the streams; the user knows its noise."""
     drift: str = "none"
     stride: int = 1
-    """Number of stream frames per frame of a tracker; a path gets all frames."""
+    """Number of stream frames per tracker frame; a path gets all frames."""
     model_error: float = 0.0
-    """Relative error of the change in R that the user expects from the model."""
+    """Relative error in the change of R that the user expects from the model."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
@@ -61,12 +61,12 @@ def preset(name: str, height: float) -> PatchLayout:
 
 
 def narrowed(layout: PatchLayout) -> PatchLayout:
-    """Return the two outer upper wires and three between them, enough because paths solve wire by wire."""
+    """Return five upper wires, which are enough because paths are solved wire by wire."""
     return PatchLayout(layout.upper_m[[0, 2, 5, 8, 9]], layout.lower_m, layout.resistivity_ohm_per_m)
 
 
 def press_and_release(steps: int) -> Float:
-    """Return fractions of the depth: at rest, down in equal steps, at rest."""
+    """Return fractions of the depth: zero, then equal steps up to one, then zero."""
     return np.array([*np.linspace(0.0, 1.0, steps + 1), 0.0])
 
 
@@ -117,7 +117,7 @@ def all_cases() -> list[Case]:
 
 
 def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: int) -> Case:
-    """Return a press without noise, for every operator along the samples and for the trackers."""
+    """Return a case with a press without noise, for all path methods and the exact tracker."""
     skin = Skin(narrowed(layout))
     shares = np.linspace(0.0, 1.0, samples + 1)
     make = pressing(skin, depth, Converter(), shares)
@@ -335,10 +335,10 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a stream of a motion impossible for skin that ends at the rest resistances, then a real press.
+    """Return a stream of a motion impossible for skin, which ends at the rest resistances, and a real press.
 
-    The detour has no truth: F does not distinguish a wire from the same wire with two electrodes relabelled
-    or mirrored.
+    The impossible motion has no truth, because F does not distinguish a wire from the same wire with two
+    electrodes swapped or one mirrored.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -423,7 +423,7 @@ def _many_times(skin: Skin) -> Callable[[np.random.Generator], Stream]:
 
 
 def fingertip(radius_m: float = 20e-3) -> Skin:
-    """Return the staggered patch of h = 0.5 around a cylinder with its axis across the upper wires."""
+    """Return the staggered patch with h = 0.5 on a cylinder whose axis is across the upper wires."""
     flat = preset("staggered", 0.5)
     middle = float(flat.upper_m[..., 0].mean())
     turned = []

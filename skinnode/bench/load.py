@@ -1,7 +1,7 @@
 """Load of ``skinnode bench pipeline``: frames of real nodes, replayed in real time by another process.
 
-The nodes are those of ``skinnode node``, measuring the simulator's patches. Their frames cross, in simulated
-time, a bus with CAN arbitration: whenever the bus is free, the waiting frame with the lowest identifier is
+The nodes are those of ``skinnode node``, measuring the simulator's patches. In simulated time their frames
+cross a bus with CAN arbitration: whenever the bus is free, the waiting frame with the lowest identifier is
 sent and occupies the bus for the duration of its bits, stuff bits included. This file may import the
 simulator, as the demo may, because frames made with the solver's own assumptions would prove nothing.
 """
@@ -55,7 +55,7 @@ class Sent:
     bus_load: dict[str, float]
     """Fraction of time that the simulated bus was occupied by the frames."""
     late_p99_ms: float
-    """Delay of the frames behind their times on the simulated bus, caused by the generator itself."""
+    """Delay of the frames relative to their times on the simulated bus, caused by the generator itself."""
     late_max_ms: float
     cpu_s: float
 
@@ -232,8 +232,8 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
     """Arbitrate the frames, which are sent one after the other.
 
-    Frames of a node keep their order, as in the queue of its controller; among the first frames of all nodes
-    the one with the lowest identifier is sent.
+    Frames of a node keep their order, as in the queue of its controller; of the first frames of all nodes,
+    the frame with the lowest identifier is sent.
     """
     order = sorted(range(len(frames)), key=lambda i: frames[i][0])
     waiting: dict[int, list[int]] = {}  # by node, in reverse order

@@ -37,7 +37,7 @@ def last_only(name: str) -> bool:
 
 
 def _path(case: Case, how: str, stream: Stream) -> Solved:
-    """Solve a path. ``how`` is an operator, applied along all samples, or ``adaptive``."""
+    """Solve a path. ``how`` is ``adaptive`` or the name of an operator, which is applied to all samples."""
     adaptive = how == "adaptive"
     path = solve_path(
         case.skin.layout,
@@ -46,7 +46,7 @@ def _path(case: Case, how: str, stream: Stream) -> Solved:
         schedule=Adaptive() if adaptive else Uniform(),
         baseline_ohm=case.skin.rest_ohm,
     )
-    # an error may reach LIMIT standard deviations, and the estimate is an upper bound
+    # the estimate is an upper bound, and an error may reach LIMIT standard deviations
     std = np.broadcast_to(path.error_estimate_m[:, None, None] / LIMIT, path.displacement_m.shape)
     return Solved(path.displacement_m[None], std[None], _converged(path.status)[None])
 
@@ -78,7 +78,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """Return drift and model errors as noise of single resistances, all that the exact inverse models."""
+    """Return drift and model errors as independent noise, the only error that the exact inverse models."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))

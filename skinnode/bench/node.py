@@ -1,9 +1,9 @@
 """Timing and cost of a node: chunk pacing, SYNC to first chunk, heartbeat on a full bus, µs per frame.
 
 A frame's time is when the node passes it to its interface, on the monotonic clock that also stamps SYNC. SYNC
-and load come from another endpoint in another thread of the same process, so the interpreter's lock affects
-the result. So does other work on the machine, which dominates if there is any; ``chrt -f 20 skinnode bench
-node`` gives the figures of an idle machine.
+and load come from another endpoint in another thread of the same process, so the interpreter lock affects the
+result. Other work on the machine affects it even more; ``chrt -f 20 skinnode bench node`` gives the figures
+of an idle machine.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame that makes a node without a bus handle such a frame.
+    """Return one function per kind of frame, which makes a node without a bus handle such a frame.
 
     Each also queries the next deadline, as the thread that drives a node does.
     """

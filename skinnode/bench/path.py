@@ -1,22 +1,22 @@
-"""The paper's path experiments, repeated by its protocol next to its printed values (``paper.toml``).
+"""The paper's path experiments, repeated with its protocol and compared with its values (``paper.toml``).
 
-Each uses one upper wire of 10 electrodes, 30 unknowns; the other wires of the patch are left out. An
-experiment is a smooth random press by a sphere of 6 to 12 mm on rubber, in Hertz's closed form with friction,
-somewhere in the middle of the patch; its wire is the one nearest to the press. Of 1000 samples on the way
-down, n evenly spaced samples are used.
+Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. It
+is a smooth random press by a sphere of 6 to 12 mm on rubber, in Hertz's closed form with friction, somewhere
+in the middle of the patch; its wire is the wire nearest the press. Of 1000 samples on the way down, n
+evenly spaced samples are used.
 
-Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls more
-than F alone. Here F and J together cost about as much as two F; ×31 is the cost with differences. Calls per
-step are means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS),
-averaged over the experiments that converged. The first-order optimality is that of r = a F − 1,
-dimensionless with lengths in pitches; MATLAB's would be that of F, larger by F² in the unit of length, which
-the paper does not state.
+Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 more calls
+than F alone. Here F and J together cost about as much as two evaluations of F; ×31 gives the cost with finite
+differences. Calls per step are means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖
+/ ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order optimality is that of r =
+a F − 1, dimensionless with lengths in pitches; MATLAB's would be that of F, which is larger by F² in the unit
+of length; the paper does not state its unit.
 
 Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves
-10 of 10 at any number of steps. The hardest ``aligned`` setting of that depth is therefore h = 1.
-Gauss-Newton fails as it did for the authors, at 5 and 10 steps but not from 20 on, at h = 0.7 and 30 %
-(h 0.3 … 1 and 15 … 30 % were searched: 6 and 2 of 10 fail; at h = 1 and 25 %, 5 and 3 fail, but there
-levenberg_marquardt also fails at more steps).
+10 of 10 at any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1.
+At h = 0.7 and 30 %, Gauss-Newton fails as it did for the authors: at 5 and 10 steps, in 6 and 2 of 10
+experiments, but not from 20 steps on. This setting was found by searching h = 0.3 … 1 and presses of
+15 … 30 %; at h = 1 and 25 %, 5 and 3 fail, but there levenberg_marquardt also fails at more steps.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ UNKNOWNS: Final = 30
 DIFFERENCES: Final = UNKNOWNS + 1
 """Number of calls of F that give F and J by forward differences."""
 WRONG: Final = 1e-4
-"""Minimum relative error at which a CONVERGED wire is wrong; exact data leave 1e-8 at worst."""
+"""Relative error above which a CONVERGED wire counts as wrong; exact data give at most 1e-8."""
 
 
 def printed() -> dict[str, Any]:
@@ -230,7 +230,7 @@ def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median cycle over the experiments that have one."""
+    """Return the median cycle over the experiments that have a cycle, or None if there are none."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -374,21 +374,19 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second try.")
-    say("Tol_X: the largest remaining correction, pitches. Times: medians of the call for the one wire.")
+    say("Tol_X: the largest remaining correction, pitches. Times: medians per call for the single wire.")
     say("Ten-step path of one wire (paper: 2.03 s)")
     for row in figures["ten_steps"]:
         say(f"  {row['what']:32}{row['ms']:6.2f} ms, error {100 * row['error']:.0e} %")
     for setting in figures["settings"]:
-        say(
-            f"\n== {setting['layout']}, h = {setting['height']:g} pitches, press {setting['depth']:.0%} of it"
-        )
+        say(f"\n== {setting['layout']}, h = {setting['height']:g} pitches, press {setting['depth']:.0%} of h")
         _print_operators(setting, paper, count, say)
         _print_dogleg(setting, paper, count, say)
         _print_figures(setting, paper, say)
     wrong = sum(row["wrong"] for setting in figures["settings"] for row in _rows(setting))
     say(f"\nConverged and wrong, all settings and schedules: {wrong}")
     surface = figures["surface"]
-    say("figure 13, the surface of the last setting: largest error of a coordinate, and wires not converged")
+    say("figure 13, surface at the last setting: largest error of a coordinate, and wires not converged")
     for path in surface["paths"]:
         say(f"  {path['title']:44}{path['error_um']:10.2e} µm  {path['converged'].count(False)} of 10")
 
@@ -404,7 +402,7 @@ def _rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _accuracy(row: dict[str, Any], count: int) -> str:
-    """Return the mean over the converged experiments, and how many did not converge."""
+    """Return the mean over the converged experiments and the number that did not converge."""
     if row["failed"] == count:
         return f"failed {count}/{count}"
     text = f"{row['accuracy_percent']:.0e} %"

@@ -1,7 +1,7 @@
 """Throughput and latency of a host, and CPU per thread group, by number of buses and patches.
 
-The host is that of ``skinnode host``, a guest of a robot whose master and nodes are replayed by another
-process (:mod:`skinnode.bench.load`). Frames arrive over UDP, through SocketCAN's reader (see
+The host is that of ``skinnode host``, a guest on the bus of a robot whose master and nodes are replayed by
+another process (:mod:`skinnode.bench.load`). Frames arrive over UDP, through SocketCAN's reader (see
 :mod:`skinnode.transport.datagram`), or on a real CAN interface.
 """
 
@@ -46,7 +46,7 @@ SCENES: Final = (
     (True, True, STAGGER_MS),
     (True, False, 0.0),
 )
-"""CAN FD, touched, and the offset between SYNCs in ms."""
+"""Whether CAN FD is used, whether the patches are touched, and the offset between SYNCs in ms."""
 DEADLINE_US: Final = 1000
 """Deadline of a field. An exact inverse takes 200 µs, or 13 ms if the posterior has to check it."""
 RECEIVE_US: Final = 5.0
@@ -310,10 +310,10 @@ HEAD: Final = (
     f"\n{'':94}{'p50   p99   max':>20}{'p50   p99':>14}{'frame':>6}{'fraction of a core':>24}"
 )
 LEGEND: Final = (
-    "lost: frames, chunks and scans, wherever. published, read: time from the last frame of a scan (kernel\n"
-    "timestamp) to its field, and to the delivery of that field. µs: of threads receive and mainline,\n"
-    "including wake-ups. load: of the bus; of the process that replays. The scans of a SYNC end at the same\n"
-    "time on all patches, except where the SYNCs of the buses are some ms apart."
+    "lost: frames, chunks and scans, lost anywhere. published, read: time from the last frame of a scan\n"
+    "(kernel timestamp) to its field, and to the delivery of that field. µs: time in threads receive and\n"
+    "mainline, including wake-ups. load: of the bus; of the replaying process. The scans of a SYNC end at\n"
+    "the same time on all patches, except where the SYNCs of the buses are some ms apart."
 )
 
 

@@ -17,12 +17,12 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
-"""Error in reported standard deviations beyond which there is a fault. A run scores about 1e5 coordinates; a
-normal distribution puts 2e-4 of a coordinate beyond six standard deviations: one false alarm in 5,000
-runs."""
+"""Error, in reported standard deviations, that counts as a fault if exceeded. A run scores about 1e5
+coordinates; by chance alone, 2e-4 of a coordinate is expected beyond six standard deviations: one false
+alarm in 5,000 runs."""
 
 EXCESS_LIMIT = 1.15
-"""Maximum RMS error over RMS reported standard deviation of a run, as required by this project."""
+"""Maximum ratio of a run's RMS error to its RMS reported standard deviation, as required by this project."""
 
 
 def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Float:
@@ -53,7 +53,7 @@ class Score:
 
     scans: int
     untrusted: int
-    """Scans in which a wire did not converge; the other figures leave them out."""
+    """Scans in which a wire did not converge; the other figures exclude these scans."""
     deepest_m: float
     """Largest true displacement of an electrode."""
     error_rms_m: float
@@ -64,13 +64,13 @@ class Score:
     relative_error: float
     """‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
     coverage95: float
-    """Share of coordinates whose error is within 1.96 reported deviations."""
+    """Fraction of coordinates whose error is within the reported 95 % interval."""
     worst_deviations: float
-    """Largest error of a coordinate in reported deviations."""
+    """Largest error of a coordinate in reported standard deviations."""
 
     @property
     def within_uncertainty(self) -> bool:
-        """Whether the RMS error, and each single error, agree with the reported deviations."""
+        """Whether the RMS error and each single error agree with the reported standard deviations."""
         return (
             self.scans > 0
             and self.untrusted == 0
@@ -86,7 +86,7 @@ class Scorer:
     layout: PatchLayout
     code_std: float
     bound_every: int = 10
-    """Scans for each scan whose bound is computed, which :meth:`score` does; the bound changes slowly."""
+    """Interval, in scans, at which :meth:`score` computes the bound, which changes slowly."""
     _scans: int = 0
     _untrusted: int = 0
     _squares: float = 0.0
@@ -125,7 +125,7 @@ class Scorer:
         count = self._scans or float("nan")
         at_rest = potential_per_m(self.layout, self.layout.upper_m)
         bounds = [
-            # of R, relative: R0 / R = F / F0
+            # relative standard deviation of R: code_std R0 / R = code_std F / F0
             bound_std_m(self.layout, upper_m, self.code_std * potential_per_m(self.layout, upper_m) / at_rest)
             for upper_m in self._bound_at
         ]

@@ -1,12 +1,12 @@
-"""Soak of a hand under random faults: does the host survive, do all patches recover, are all sums exact?
+"""Soak of a hand under random faults: does the host survive, do all patches recover, do all counts agree?
 
 Simulated nodes with faults and the host share this process and two virtual buses. A round injects one to
-three faults, including drops of frames of every kind, into one patch or into all. It then clears them and
-waits until every patch is operational and streaming again; subscribers come and go meanwhile. In some rounds
-other processes occupy the processor. Memory is compared between two idle instants, one after a warm-up and
-one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a leak of one
-object per scan) and resident memory. This file may import the simulator, as the demo may, because it needs a
-source of faults.
+three faults, including drops of frames of every kind, into one patch or into all. It then clears the faults
+and waits until every patch is operational and streaming again; meanwhile, subscribers come and go. In some
+rounds other processes occupy the processor. Memory is compared between two idle instants, one after a warm-up
+and one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a leak of
+one object per scan) and resident memory. This file may import the simulator, as the demo may, because it
+needs a source of faults.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from vcan_sim.sensor import REMEMBERED_READINGS
 WARM_UP: Final = 0.25
 """Fraction of the run after which memory is measured for the first time."""
 BLOCKS: Final = 2000
-"""Maximum growth in blocks. A few hundred come and go; a leak of one block per scan adds 10,000 in three
-minutes."""
+"""Maximum growth in blocks. The number varies by a few hundred; a leak of one block per scan adds 10,000 in
+three minutes."""
 RESIDENT_MB: Final = 8.0
 """Maximum growth of resident memory in MB; C's allocator returns memory at its own pace."""
 BACK_S: Final = 15.0
-"""Seconds after which a stream that has not resumed counts as lost. It should take one second; a loaded
+"""Seconds after which a stream that has not resumed counts as lost. Recovery should take one second; a loaded
 machine may need more."""
 SLOW_S: Final = 1.0
 """Seconds after which a round is reported as slow."""
@@ -62,7 +62,7 @@ TARED: Final = 0.2
 CALM_S: Final = 1.5
 _PATCHES: Final = 4
 _MANY: Final = 8
-"""Number of simultaneous faults from which a line gives their count instead of their names."""
+"""Minimum number of simultaneous faults for which a line gives their count instead of their names."""
 
 _KINDS: Final[tuple[dict[str, Any], ...]] = (
     {"lost": 0.05},
@@ -157,7 +157,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # fill it, so that it does not grow during the soak
+            for k in range(REMEMBERED_READINGS):  # fill its memory of readings, which must not grow
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}

@@ -134,10 +134,10 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
             sent, heard = counter.sent_on[bus.name][kind], passed.heard[kind] + passed.missed[kind]
             if sent != heard:
                 found.append(
-                    f"{bus.name}: {kind} frames: the host sent {sent}, the nodes' interface heard {heard}"
+                    f"{bus.name}: {kind} frames: the host sent {sent}, the nodes' interface received {heard}"
                 )
             found += [
-                f"{patch.name}: {kind} frames: its interface heard {passed.heard[kind]}, the node {of_node}"
+                f"{patch.name}: {kind} frames: interface received {passed.heard[kind]}, node {of_node}"
                 for patch in fleet.hand.patches_on(bus.name)
                 if (of_node := fleet.tally(patch.name).heard[kind]) != passed.heard[kind]
             ]

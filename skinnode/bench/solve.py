@@ -32,7 +32,7 @@ Solve = Callable[["Case", float], Float]
 
 
 class Case:
-    """One wire: r = a F − 1 and its Jacobian for any solver, with its start and its truth."""
+    """One wire: r = a F − 1 and its Jacobian for any solver, with a start and the truth."""
 
     def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
         self.wire, self.a, self.start, self.truth = wire, a, start, truth
@@ -53,7 +53,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return r at the point of the last Jacobian, with which it was computed."""
+        """Return r at the point of the last Jacobian; both were computed together."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:

@@ -1,4 +1,4 @@
-"""Every hard case solved with many seeds: error, reported deviation, status and verdict of each method."""
+"""Every hard case, solved for many seeds: error, reported uncertainty, status and verdict of each method."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Number of streams on which ``auto`` must equal another method bit for bit before it is no longer run."""
+"""Number of streams for which ``auto`` must equal another method bit for bit before it is skipped."""
 
 
 @contextlib.contextmanager

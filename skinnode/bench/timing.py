@@ -22,7 +22,7 @@ TURN_S: Final = 4e-3
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time of one call, and the median of its ratio to the first candidate's in the same round."""
+    """Median time of one call, and the median ratio to the first candidate's time in the same round."""
 
     call_us: float
     ratio: float

@@ -1,4 +1,4 @@
-"""Truth for scoring the solvers in benchmarks, made without any assumption of the solvers.
+"""Truth for scoring the solvers in benchmarks, made without any of the solvers' assumptions.
 
 Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
 they have no grid and do not depend on a prior. Resistances come from :class:`Skin`, which can differ from the
@@ -22,7 +22,7 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise passed to a tracker for noiseless data; sets the tolerance to which it solves."""
+"""Relative noise passed to a tracker for noiseless data; it sets the tolerance of the solve."""
 RING: Final = 4
 """Number of points on the rim of a finite electrode, giving 16 distances per pair of electrodes."""
 
@@ -36,7 +36,7 @@ class Press:
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the traction along the surface acts: the contact with friction minus the one without."""
+    """Whether only the traction along the surface acts: contact with friction minus contact without."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
         """Return the closed forms, each with its sign."""
@@ -63,7 +63,7 @@ class Press:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A real patch, of which the solver knows only ``layout``.
+    """A real patch; the solver knows only its ``layout``.
 
     Args:
         layout: Layout passed to the solver.
@@ -121,7 +121,7 @@ class Skin:
         return self._points(self.body.upper_m)
 
     def _points(self, upper: Float) -> Float:
-        """Return the result of :func:`skinnode.model.forward.resistance_ohm` in a fifth of its time."""
+        """Compute the same as :func:`skinnode.model.forward.resistance_ohm`, in a fifth of the time."""
         lower = self.body.lower_m.reshape(-1, 3)
         square = np.zeros((upper.shape[0] * upper.shape[1], len(lower)))
         for axis in range(3):
@@ -284,8 +284,8 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
         radius: Range of the sphere's radius, pitches.
         shear: Maximum friction.
         margin: Distance from the centre to the border of the patch, pitches.
-        where: ``inside``; or the centre on the border in x (``edge``), or half a contact radius outside it
-            (``half off``).
+        where: ``inside``; ``edge``, with the centre on the border in x; or ``half off``, half a contact
+            radius outside it.
     """
     pitch = layout.pitch_m
     points = layout.upper_m[..., :2].reshape(-1, 2)

@@ -4,7 +4,7 @@ A wire in a frame is
 
 flagged    if its status is not CONVERGED, so that nothing was claimed
 accurate   if it is CONVERGED and every coordinate is within the reported uncertainty
-wrong      if it is CONVERGED and a coordinate has too large an error, or not finite, whatever its status
+wrong      if it is CONVERGED and an error is too large, or if it is not finite, whatever its status
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
 beyond that. Chance must neither condemn a long run nor excuse a fault, so two conditions must hold in each
@@ -16,8 +16,8 @@ row. For errors that are Gaussian with the reported standard deviation, each fai
 - the number of seeds with a coordinate beyond 5 is within a binomial limit whose probability is the expected
   number of such coordinates per seed (again a bound); seeds are independent even though coordinates are not
 
-If the second condition fails, every wire beyond 5 is wrong. With exact data nothing is left to chance: the
-limit is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is larger.
+If the second condition fails, every wire beyond 5 is wrong. With exact data chance plays no part: the limit
+is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is larger.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from skinnode.model.layout import Float
 LIMIT: Final = 5.0
 """Maximum error, in reported standard deviations."""
 CHANCE: Final = 1e-4
-"""Probability that a correct row is called wrong: with 350 rows per run, one false alarm in 30 runs."""
+"""Probability that a correct row is judged wrong: with 350 rows per run, one false alarm in 30 runs."""
 EXACT_SHARE: Final = 1e-6
 """Tolerance with exact data, relative to the wire's largest displacement."""
 
@@ -52,7 +52,7 @@ class Solved:
     """(F, U)"""
 
     def equals(self, other: Solved) -> bool:
-        """Return whether both are equal, bit for bit."""
+        """Return whether both results are equal, bit for bit."""
         return (
             np.array_equal(self.displacement_m, other.displacement_m, equal_nan=True)
             and np.array_equal(self.std_m, other.std_m, equal_nan=True)
@@ -97,7 +97,7 @@ class Tally:
     _reported: list[float] = field(default_factory=list)
     _worst_error: float = math.nan
     _deviations: list[tuple[float, int, int, int]] = field(default_factory=list)
-    """(deviations, seed, frame, wire) of every wire beyond 5; inf for a wire that is not finite."""
+    """(standard deviations, seed, frame, wire) of every wire beyond 5; inf if the wire is not finite."""
 
     def add(self, seed: int, solved: Solved, truth_m: Float) -> None:
         """Add a seed. ``truth_m`` (F, U, N, 3) is the truth of the frames; NaN frames are left out."""
@@ -168,7 +168,7 @@ class Tally:
 
 
 def named(row: Mapping[str, Any]) -> str:
-    """Return one line about a wrong row: what is wrong, by how much, and how to reproduce it."""
+    """Describe a wrong row in one line: the case, the size of the error, and how to reproduce it."""
     worst = row["worst"]
     far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} standard deviations"
     return (

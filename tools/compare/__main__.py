@@ -48,7 +48,7 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 
 
 def relative_difference(old: Any, new: Any) -> float:
-    """Return the largest difference of two arrays, relative to the largest finite value of the old array.
+    """Return the largest difference between arrays, relative to the largest finite value of the old array.
 
     Returns inf if shape, type or the positions of NaN and infinity differ, and for arrays of other types than
     float.
@@ -64,7 +64,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield the lines of the report, each with whether the result that it reports is allowed."""
+    """Yield the lines of the report, each with True if the result that it reports is allowed."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]

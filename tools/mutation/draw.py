@@ -1,12 +1,12 @@
 """Draw mutants of the source: ``python -m tools.mutation.draw`` writes ``mutants.json``.
 
 The operators are those of cosmic-ray. A draw picks places in the source, each equally likely, and then one
-mutation at each place; if mutations were drawn instead, a ``+`` would weigh eleven times as much as a
+mutation at each place; if mutations were drawn directly, a ``+`` would be drawn eleven times as often as a
 ``not``.
 
 A mutant is identified by its change (file, function, operator, text before and after), never by a line
-number, and is drawn by a digest of its place and the seed. A list of mutants therefore stays valid when code
-moves, and an edit elsewhere does not change which mutants are drawn.
+number, and the draw depends only on a digest of its place and the seed. A list of mutants therefore stays
+valid when code moves, and an edit elsewhere does not change which mutants are drawn.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GROUPS: Final = {
     "solve": ("solve",),
     "host": ("host",),
 }
-"""Packages of ``skinnode`` in each group that mutants are drawn from."""
+"""Packages of ``skinnode`` from which each group of mutants is drawn."""
 SEED: Final = 20260
 PER_PACKAGE: Final = 50
 

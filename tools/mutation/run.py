@@ -49,7 +49,7 @@ _FILE_BYTES: Final = 1 << 30
 _TEST_S: Final = 120
 """Time limit of one test, s."""
 _GRACE_S: Final = 60.0
-"""Time limit of a stage beyond six times its unmutated duration, s."""
+"""Time allowed for a stage in addition to six times its unmutated duration, s."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _PASSED, _FAILED = 0, 1
 
@@ -59,7 +59,7 @@ class Outcome:
     """Outcome of one pytest run."""
 
     status: int | None
-    """Exit status, or None for a run that was stopped at its time limit."""
+    """Exit status, or None if the run was stopped at its time limit."""
     failed: tuple[str, ...]
     """Names of the tests that failed."""
     took_s: float

@@ -1,10 +1,10 @@
 """Traffic plan of a hand's buses: all frames, their load, and their worst-case delay.
 
 Each bus carries the SYNC, the host's heartbeat if enabled, the frames of other devices listed in the hand
-file, and consecutive SDO transfers that use :data:`SDO_SHARE` of the bus. For each patch it carries all
-chunks of a scan and the summary every SYNC period, a heartbeat, and one EMCY every heartbeat period. The
-configuration of a returning node by SDO is not counted, because SDO has a lower priority than all PDOs and
-therefore uses free bandwidth.
+file, and consecutive SDO transfers that use :data:`SDO_SHARE` of the bus. For each patch, it also carries all
+chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every heartbeat period.
+Configuring a returning node by SDO is not counted, because SDO has a lower priority than any PDO and
+therefore uses only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ NODE_LATENCY_S: Final = 2e-3
 """Maximum time from a SYNC to the first chunk, s, as specified for a patch on an idle machine."""
 
 PACE_JITTER_S: Final = 0.2e-3
-"""Maximum deviation of a chunk from its pace, s, as specified for a patch on an idle machine."""
+"""Maximum deviation of a chunk from its scheduled time, s, as specified for a patch on an idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of random-data frames averaged for a typical length; the standard error is 0.1 bits."""
+"""Number of random-data frames averaged to estimate a typical length, with a standard error of 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class BusPlan:
 
     @property
     def shortest_period_ms(self) -> int | None:
-        """Shortest SYNC period at which the plan fits the bus, ms; None if no period does."""
+        """Shortest SYNC period at which the plan fits the bus, ms; None if no period is long enough."""
         free = self.bus.max_load - sum(frame.load for frame in self.frames if not frame.scans)
         scan_s = sum(frame.count * frame.worst_s for frame in self.frames if frame.scans)
         return int(-(-scan_s * 1e3 // free)) if free > 0 else None
@@ -139,7 +139,7 @@ def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
         hand: the hand.
 
     Raises:
-        BusLoadError: if a plan needs more of its bus than ``max_load``.
+        BusLoadError: if the load of a bus exceeds its ``max_load``.
         ConfigError: as in :func:`plan_of`.
     """
     plans = plan_of(hand)
@@ -149,14 +149,14 @@ def check_plan(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def require_room(hand: HandConfig, plan: BusPlan) -> None:
-    """Check the load of a plan.
+    """Check the bus load of a plan.
 
     Args:
         hand: the hand.
         plan: the plan of one of its buses.
 
     Raises:
-        BusLoadError: if the plan needs more of its bus than ``max_load``.
+        BusLoadError: if the load exceeds the ``max_load`` of the bus.
     """
     bus, needed = plan.bus, plan.load
     if needed <= bus.max_load:
@@ -172,7 +172,7 @@ def require_room(hand: HandConfig, plan: BusPlan) -> None:
     raise BusLoadError(
         f"{key} ({bus.name})",
         Shown(f"a plan that needs {needed:.1%} of {_rate(bus)}"),
-        f"at most {bus.max_load:.1%} (max_load); {cure} would do",
+        f"at most {bus.max_load:.1%} (max_load); {cure} would suffice",
         needed=needed,
         available=bus.max_load,
         where=hand.where(key),
@@ -180,7 +180,8 @@ def require_room(hand: HandConfig, plan: BusPlan) -> None:
 
 
 def _rate(bus: BusConfig) -> str:
-    return f"{bus.bitrate_bps} bit/s" + (f", {bus.data_bitrate_bps} bit/s of data" if bus.fd else "")
+    data = f", {bus.data_bitrate_bps} bit/s in the data phase" if bus.fd else ""
+    return f"{bus.bitrate_bps} bit/s{data}"
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
@@ -200,7 +201,7 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
 
 
 def inhibit_time_100us(period_ms: int, frames: int) -> int:
-    """Return the inhibit time (0x1800:3) at which the frames take SCAN_SHARE of a period, 100 µs.
+    """Return the inhibit time (0x1800:3) that spreads frames over SCAN_SHARE of a period, in units of 100 µs.
 
     Args:
         period_ms: SYNC period, ms.
@@ -224,7 +225,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # commands and SDO of every node, although the plan counts SDO only once per bus
+    for patch in patches:  # for every node, although the plan counts SDO only once per bus
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -233,7 +234,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for number, other in enumerate(bus.others):
         key = f"buses[{i}].others[{number}].can_id"
         if other.can_id in ours:
-            allowed = f"an identifier that is not that of our {ours[other.can_id]}, nor of another of these"
+            allowed = f"an identifier that is unique on the bus; this one is used for {ours[other.can_id]}"
             raise ConfigError(key, Shown(f"0x{other.can_id:03X}"), allowed, where=hand.where(key))
         frame = _classic(
             bus, f"other 0x{other.can_id:03X}", other.can_id, other.length, other.period_ms * 1e-3
@@ -333,7 +334,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Return the worst case, the sum of SYNC, node latency, chunk pacing, last chunk and summary."""
+    """Return the scan time; its worst case adds SYNC, node latency, chunk pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

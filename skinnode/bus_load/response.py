@@ -1,9 +1,9 @@
 """Worst-case response times on a CAN bus, from queueing a frame to its last bit.
 
 The analysis follows Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
-Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The lowest identifier wins, a frame on
-the bus is not interrupted, and every instance in the longest busy period of a priority is examined, because
-the first instance is not always the slowest.
+Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The lowest identifier wins
+arbitration, and a frame being sent is not interrupted. Every instance in the longest busy period of a
+priority level is examined, because the first instance is not always the slowest.
 
 Extension: frames may come in bursts of ``count`` frames ``spacing_ns`` apart in each period, as the chunks of
 a scan do. A window that starts with a burst contains the maximum number of frames, so the analysis holds with
@@ -38,7 +38,7 @@ class Message:
     spacing_ns: int = 0
     """Minimum time between two frames of a burst, ns."""
     jitter_ns: int = 0
-    """Maximum delay in queueing a frame, ns; frames of the same message keep their order."""
+    """Maximum queueing jitter of a frame, ns; frames of the same message keep their order."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -60,7 +60,7 @@ class Message:
         return burst * self.period_ns + number * self.spacing_ns
 
     def most_in(self, window_ns: int) -> int:
-        """Return the maximum number of instances queued in a window that excludes its end."""
+        """Return the maximum number of instances queued in a half-open window of this length."""
         bursts, rest_ns = divmod(window_ns + self.jitter_ns, self.period_ns)
         begun = (
             self.count
@@ -71,12 +71,12 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the maximum time from when a message is due to its last bit, ns.
+    """Return the maximum time from the due time of a message to its last bit, ns.
 
     Args:
         message: the message.
         others: the other messages on the bus.
-        bit_ns: bit time, ns, during which frames can still join an arbitration.
+        bit_ns: bit time, ns; a frame queued up to this late can still join an arbitration.
 
     Returns:
         The time, or None if it is unbounded because the message and all higher-priority messages together
@@ -94,7 +94,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # the previous instance waited less
+        wait_ns = max(wait_ns, own_ns)  # start from the shorter wait of the previous instance
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

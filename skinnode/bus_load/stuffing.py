@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from skinnode.compiled.jit import njit_brief
 
-HEAD_BITS: Final = 19  # SOF, 11 bits identifier, RTR, IDE, r0, 4 bits DLC
+HEAD_BITS: Final = 19  # SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Bits of CRC delimiter, ACK slot and delimiter, 7-bit end of frame and 3-bit inter-frame space."""
-FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11 bits identifier, RRS, IDE, FDF, res, BRS; and the tail
+"""Length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3), bits."""
+FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS; then the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
 ALTERNATING: Final = 0x5555_5555_5555  # ends in 1
@@ -28,10 +28,10 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return the CRC of each byte, and for run << 8 | byte the next run and the number of stuff bits.
+    """Return the CRC by byte, and the next run and the number of stuff bits by ``run << 8 | byte``.
 
-    A run is 0 before the first bit, otherwise value << 2 | (length − 1) + 1 with a length of 1 … 4. A fifth
-    equal bit causes a stuff bit, which begins a new run.
+    A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
+    to 4. A fifth equal bit causes a stuff bit, which begins a new run.
     """
     crc_table = []
     for byte in range(256):
@@ -58,7 +58,7 @@ def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
 
 @functools.cache
 def _arrays() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Return the tables as arrays, the second one with next run << 8 | number of stuff bits."""
+    """Return the CRC table and a table of ``next run << 8 | number of stuff bits`` as arrays."""
     crc, next_run, stuffed = (np.array(table, np.uint16) for table in tables())
     return crc, np.asarray(next_run << 8 | stuffed, np.uint16)
 
@@ -74,7 +74,8 @@ def are_loaded() -> bool:
 def load_kernels() -> None:
     """Compile the kernels, or read them from the cache.
 
-    This takes half a second, in which a receiving thread could not answer requests, so it is done in advance.
+    This takes half a second, during which a receiving thread could not answer requests, so call it in
+    advance.
     """
     global _loaded
     _loaded = True
@@ -161,8 +162,8 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
             code = 6 + length // 4  # 12, 16, 20, 24
         else:
             code = 11 + length // 16  # 32, 48, 64
-        # The 22 bits up to the length code are two fewer than three bytes, and the data bytes follow. FDF,
-        # res and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
+        # Two filler bits extend the 22 bits up to the length code to three bytes, and the data bytes follow.
+        # FDF, res and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0
         stuff: Any = 0

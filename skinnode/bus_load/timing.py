@@ -2,18 +2,18 @@
 
 Classic frames. From start of frame to the end of the CRC sequence, a stuff bit of the opposite value follows
 every five equal bits, and stuff bits count towards the five. The 13-bit tail is not stuffed: CRC delimiter,
-ACK slot and delimiter, 7 bits end of frame, 3 bits inter-frame space. CRC: polynomial 0x4599, 15 bits,
+ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. CRC: polynomial 0x4599, 15 bits,
 initial value 0.
 
 CRC and stuffing are computed bytewise with tables. The head of a frame is padded on the left to whole bytes.
-The CRC uses zeros, which leave it at 0. Stuffing uses alternating bits that end in a 1, so the dominant start
-of frame begins a new run.
+For the CRC, the padding is zeros, which leave the CRC at 0. For stuffing, it is alternating bits that end in
+a 1, so the dominant start of frame begins a new run.
 
-CAN FD frames, with an 11-bit identifier and bit-rate switch. Stuffing as above ends with the data. The CRC
-field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and fixed stuff bits: one
-before the field and one after every 4 bits. The bits from ESI to the CRC delimiter are sent at the data bit
-rate. The 17 bits before them and the 12 bits after them (ACK slot and delimiter, 7 bits end of frame, 3 bits
-inter-frame space) are sent at the nominal bit rate.
+CAN FD frames have an 11-bit identifier and switch the bit rate. They are stuffed by the same rule up to the
+end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and
+fixed stuff bits: one before the field and one after every 4 bits. The bits from ESI to the CRC delimiter are
+sent at the data bit rate. The 17 bits before them and the 12 bits after them (ACK slot, ACK delimiter, 7-bit
+end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from skinnode.canopen.data_length import FD_LENGTHS
 from skinnode.errors import ConfigError
 from skinnode.text.words import counted
 
-_EXTENDED_HEAD_BITS: Final = 39  # SOF, 11 bits, SRR, IDE, 18 bits, RTR, r1, r0, 4 bits DLC
+_EXTENDED_HEAD_BITS: Final = 39  # SOF, 11-bit base ID, SRR, IDE, 18-bit extension, RTR, r1, r0, 4-bit DLC
 _RUN: Final = 5
 _NO_RUN: Final = 0
 _Int = NDArray[np.int64]
 
 
 def nominal_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the number of bits in a frame without stuff bits.
+    """Return the number of bits in a frame, excluding stuff bits.
 
     Args:
         dlc: number of data bytes.
@@ -56,7 +56,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the bits in the longest frame, with stuff bits after the first 5 and every 4 further bits.
+    """Return the bits in the longest frame, with a stuff bit after the first 5 and every 4 further bits.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -67,7 +67,7 @@ def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
 def exact_bits(
     can_id: int, data: bytes, *, extended: bool = False, remote: bool = False, dlc: int | None = None
 ) -> int:
-    """Return the number of bits of a classic frame on the bus, including the inter-frame space.
+    """Return the number of bits that a classic frame takes on the bus, including the inter-frame space.
 
     Args:
         can_id: identifier.
@@ -113,7 +113,7 @@ def exact_bits(
 
 
 def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
-    """Return the number of bits of CAN FD frames that have the same length.
+    """Return the number of bits in each of several CAN FD frames of the same length.
 
     Args:
         can_id: (n,) identifiers.
@@ -131,7 +131,7 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
     length = payload.shape[1]
     if length not in FD_LENGTHS or np.any((ids < 0) | (ids > 0x7FF)):
         raise ValueError(
-            f"can_id, data: got {counted(length, 'byte')}, must be one of {FD_LENGTHS}, and 11-bit numbers"
+            f"can_id, data: got {counted(length, 'byte')}, must be one of {FD_LENGTHS}, with 11-bit IDs"
         )
     nominal, fast = np.empty((2, len(ids)), np.int64)
     lengths = np.full(len(ids), length, np.uint8)
@@ -141,7 +141,7 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
 
 @functools.cache
 def fd_worst_case_bits(length: int) -> tuple[int, int]:
-    """Return the maximum number of bits of a CAN FD frame, found over all possible data run by run.
+    """Return the maximum number of bits in a CAN FD frame over all possible data.
 
     Args:
         length: number of data bytes.
@@ -155,7 +155,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
     # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 and every 4 further bits. FDF, res and
-    # BRS alternate, ESI is 0 and the length code is known. The data are the worst possible.
+    # BRS alternate, ESI is 0 and the length code is known. The data are the worst case.
     stuff = {(1 << 2) + 1: 0}  # a run of one recessive bit, BRS
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -178,7 +178,7 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
 
 
 def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int:
-    """Return the bits of many classic data frames, as :func:`exact_bits` does.
+    """Return the number of bits in each of many classic data frames, as :func:`exact_bits` does.
 
     Args:
         can_id: (n,) identifiers of 11 bits.
@@ -208,9 +208,9 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counter of frames and their exact bits. Adding a frame is cheap, because bits are computed in batches.
+    """Counter of frames and their exact number of bits.
 
-    The counter is not thread-safe.
+    Adding a frame is cheap, because bits are computed in batches. The counter is not thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.
@@ -243,9 +243,9 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Count a frame with the bits of :func:`exact_bits` or, if ``fd``, of :func:`fd_bits`.
+        """Count a frame, whose bits :func:`exact_bits` or, if ``fd``, :func:`fd_bits` determines.
 
-        ``data`` is not copied, and is kept until the next batch.
+        ``data`` is kept until the next batch, without being copied.
         """
         if extended or remote:
             self._bits += exact_bits(can_id, data, extended=extended, remote=remote, dlc=dlc)
@@ -278,7 +278,7 @@ class BusLoad:
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the fraction of a time interval taken by the counted frames; above 1 they do not fit.
+        """Return the fraction of a time interval that the counted frames take; above 1, they do not fit.
 
         Args:
             time_s: length of the interval, s.
@@ -288,7 +288,7 @@ class BusLoad:
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if not stuffing.are_loaded():  # a command that listens only 1 or 2 s is faster without
+        if not stuffing.are_loaded():  # faster for a command that listens for only 1 or 2 s
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))

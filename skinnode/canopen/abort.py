@@ -42,7 +42,7 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """Error for a refused object access; it stays in the node, whose SDO server sends the abort code.
+    """Error for a refused object access, which the node's SDO server answers with the abort code.
 
     Args:
         code: reason of the refusal.

@@ -21,13 +21,13 @@ class PdoDefault:
     purpose: str
     """Purpose, shown in the names of the PDO's records."""
     cob_id: int
-    """COB-ID with the bits of 0x1800:1; the node-ID is added if ``plus_node_id``."""
+    """COB-ID including the flag bits of 0x1800:1; the node-ID is added if ``plus_node_id``."""
     kind: int = 254
     """Transmission type."""
     mapped: tuple[Entry, ...] = ()
     """Mapped objects, in order."""
     inhibit_100us: int = 0
-    """Inhibit time, 100 µs."""
+    """Inhibit time, in units of 100 µs."""
     plus_node_id: bool = True
     """Whether the node-ID is added to the COB-ID."""
 
@@ -53,7 +53,7 @@ def communication_objects(
     Args:
         rpdos: the RPDOs.
         tpdos: the TPDOs.
-        slots: maximum mapped objects of a PDO.
+        slots: maximum number of objects mapped into a PDO.
         revision: value of 0x1018:3.
     """
     return (

@@ -63,7 +63,7 @@ class Entry:
     default: Value | None = None
     """Default value; None for a device-specific value such as a serial number, which is zero at start."""
     plus_node_id: bool = False
-    """Whether the node-ID is added to the default at start, as in a COB-ID."""
+    """Whether the node-ID is added to the default at start, as for a COB-ID."""
     mappable: bool = False
     """Whether the entry can be mapped into a PDO."""
     low: int | None = None
@@ -73,7 +73,7 @@ class Entry:
 
     @property
     def mapping(self) -> int:
-        """PDO mapping value of the entry, made up of index, sub-index and length in bits."""
+        """PDO mapping value of the entry, composed of index, sub-index and length in bits."""
         return self.index << 16 | self.subindex << 8 | self.data_type.bits
 
     def value_at_start(self, node_id: int) -> Value | None:
@@ -157,7 +157,7 @@ def array(  # noqa: PLR0913 - one argument for each column of the standard's tab
 ) -> Object:
     """Declare an array with one entry for each of ``labels``.
 
-    ``first`` is as in :func:`record`; the other arguments are the fields of :class:`Entry`.
+    ``first`` has the same meaning as in :func:`record`; the other arguments are the fields of :class:`Entry`.
     """
     entries = tuple(
         Entry(index, sub, label, data_type, access, default, mappable=mappable, high=high)

@@ -1,8 +1,9 @@
 """Writer of an object dictionary as an EDS or DCF file (CiA 306).
 
-An EDS is an electronic data sheet; a DCF is the configuration of one device. REAL32 defaults are written as
-hexadecimal IEEE 754 bit patterns, as conforming tools expect. The canopen library expects decimals and drops
-such a default; 0 is the same in both notations.
+An EDS (electronic data sheet) describes a type of device; a DCF (device configuration file) describes the
+configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as conforming
+tools expect. The canopen library expects decimal numbers and discards such a default; 0 is the same in both
+notations.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def _head(info: DeviceInfo, device: Commissioning | None) -> Iterator[str]:
     )
     if device is not None:
         yield from _section(
-            "DeviceComissioning",  # this spelling is from CiA 306
+            "DeviceComissioning",  # spelt as in CiA 306
             [
                 ("NodeID", str(device.node_id)),
                 ("NodeName", device.node_name),
@@ -170,7 +171,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether a DCF configures the entry, which excludes commands and histories."""
+    """Return whether a DCF configures the entry; commands and histories are excluded."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

@@ -1,6 +1,6 @@
 """Reader of the text of an EDS or DCF file in any encoding.
 
-CiA 306 requires ASCII, but tools also write other encodings. A file is read without loss: each non-ASCII byte
+CiA 306 requires ASCII, but tools also write other encodings. Reading loses nothing: each non-ASCII byte
 becomes a lone surrogate (PEP 383), from which the bytes of a value can be recovered. :func:`for_people`
 decodes text for display.
 """
@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 ASCII: Final = "ASCII"
 
 MOST_EDS_BYTES: Final = 2 << 20
-"""Maximum file size, bytes; twenty times the EDS of a patch, and more than any known device needs."""
+"""Maximum file size, bytes; twenty times the size of a patch's EDS, and more than any known device needs."""
 
 _UTF_16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _CODECS: Final = {
@@ -24,7 +24,7 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codec name of the bytes that :class:`EdsText` holds, for each encoding."""
+"""Python codec of the bytes behind an :class:`EdsText`, by encoding."""
 
 
 class EdsText(NamedTuple):
@@ -61,7 +61,7 @@ def read_eds_text(data: bytes) -> EdsText:
         data: the bytes of the file.
 
     Raises:
-        UnicodeDecodeError: if UTF-16 is malformed.
+        UnicodeDecodeError: if the text is malformed UTF-16.
     """
     bom = data[:2]
     if bom in _UTF_16:
@@ -79,7 +79,7 @@ def read_eds_text(data: bytes) -> EdsText:
 
 
 def octets_text(data: bytes) -> str:
-    """Return bytes as text, from which :func:`octets` recovers them."""
+    """Return bytes as text from which :func:`octets` can recover them."""
     return data.decode("ascii", "surrogateescape")
 
 

@@ -13,7 +13,7 @@ _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z]\w*", re.IGNORECASE)
 """Pattern of section titles such as 1003Value and 1003ObjectLinks."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Pattern of section titles that are meant for an object."""
+"""Pattern of section titles that are apparently meant for an object."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")
@@ -46,12 +46,12 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Return a ProfileError for a parser error on ``text``, with the line or section if it is known."""
+    """Return a ProfileError for a parser error on ``text``, with the line or section if known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:
         shown = [*text.split("\n"), ""][min(line, text.count("\n") + 1) - 1]
-        allowed = "a file as in CiA 306: [section] once each, key=value once each, ;comment"
+        allowed = "a file as in CiA 306: each [section] once, each key=value once, ;comment"
         return _mistake("EDS", shown, allowed, source, line)
     for line, section, key, value in _lines(text):
         if _OBJECT.fullmatch(section) and key.lower() in _NUMBERS and not _NUMBER.fullmatch(value):
@@ -80,7 +80,7 @@ def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = N
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, str, str]]:
-    """Yield number, section, key and value of each line; key and value are empty for a section header.
+    """Yield the number, section, key and value of each line; key and value are empty for a section header.
 
     Skips comments and continuation lines.
     """

@@ -42,13 +42,13 @@ class EmcyCode(IntEnum):
 
 
 TOO_SLOW: Final = 1
-"""Third detail byte of 0x8110 if a slow computer or bus delayed chunks beyond the inhibit time.
+"""Third detail byte of EMCY 0x8110 if a slow computer or bus delayed chunks beyond the inhibit time.
 
 It follows the u16 count of skipped scans. The value 0 means that a scan takes longer than the scan period.
 """
 
 _CODES: Final = {
-    0x0000: "no error, or an error is over",
+    0x0000: "no error, or an error has ended",
     0x8110: "CAN overrun: messages lost",
     0x8120: "CAN error passive",
     0x8130: "heartbeat or guarding lost",
@@ -100,11 +100,11 @@ _WIRE_FAULTS: Final = ("upper wire open", "upper wire shorted", "lower wire open
 _DATA_FAULTS: Final = {
     1: "the memory is unreadable",
     2: "the memory is damaged",
-    3: "the memory is of another patch",
-    4: "an object refuses what was stored",
+    3: "the memory belongs to another patch",
+    4: "an object refuses its stored value",
     5: "could not be saved",
 }
-_SOURCE_FAULTS: Final = {1: "it failed", 2: "it gave an array of another shape"}
+_SOURCE_FAULTS: Final = {1: "it failed", 2: "it returned an array of the wrong shape"}
 _REGISTER: Final = (
     "generic",
     "current",
@@ -123,7 +123,7 @@ def error_text(code: int, detail: bytes = b"", *, ours: bool) -> str:
     Args:
         code: the error code.
         detail: the manufacturer-specific bytes; the first two are also in the error history.
-        ours: whether vendor and product identify a skinnode patch; if not, the text follows CiA 301.
+        ours: whether vendor-ID and product code identify a skinnode patch; if not, the text follows CiA 301.
     """
     own = _OWN_CODES.get(code) if ours else None
     text = own or _CODES.get(code) or _CLASSES.get(code >> 8) or f"error of class 0x{code >> 12:X}000"
@@ -136,7 +136,7 @@ def history_text(entry: int, *, ours: bool) -> str:
 
     Args:
         entry: error code in the lower 16 bits, two manufacturer-specific bytes in the upper 16 bits.
-        ours: whether vendor and product identify a skinnode patch; the two bytes are then decoded.
+        ours: whether vendor-ID and product code identify a skinnode patch; the two bytes are then decoded.
     """
     code, more = entry & 0xFFFF, entry >> 16
     text = f"0x{code:04X} {error_text(code, more.to_bytes(2, 'little'), ours=ours)}"
@@ -174,7 +174,7 @@ def _wires(detail: bytes) -> str:
     if kind >= len(_WIRE_FAULTS):
         return ""
     count = int.from_bytes(detail[2:4], "little") if len(detail) >= 4 else 1
-    return f"{_WIRE_FAULTS[kind]} {wire}" + (f", {count} wires in all" if count > 1 else "")
+    return f"{_WIRE_FAULTS[kind]} {wire}" + (f", {count} wires in total" if count > 1 else "")
 
 
 def _skipped(detail: bytes) -> str:
@@ -187,13 +187,13 @@ def _skipped(detail: bytes) -> str:
 
 def _silent(detail: bytes) -> str:
     if not detail[0]:
-        return "of the master"
-    return f"node {detail[0]} restarted" if detail[1] else f"of node {detail[0]}"
+        return "master"
+    return f"node {detail[0]} restarted" if detail[1] else f"node {detail[0]}"
 
 
 def _wrong_length(detail: bytes) -> str:
     got = f"RPDO{detail[0]}, {counted(detail[1], 'byte')}"
-    return f"{got} in place of {detail[2]}" if len(detail) >= 3 else got
+    return f"{got} instead of {detail[2]}" if len(detail) >= 3 else got
 
 
 _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
@@ -203,10 +203,10 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.HEARTBEAT: _silent,
     EmcyCode.PDO_NOT_PROCESSED: _wrong_length,
     EmcyCode.PDO_LENGTH_EXCEEDED: _wrong_length,
-    EmcyCode.SYNC_LENGTH: lambda detail: f"{counted(detail[0], 'byte')} in place of {detail[1]}",
+    EmcyCode.SYNC_LENGTH: lambda detail: f"{counted(detail[0], 'byte')} instead of {detail[1]}",
     EmcyCode.SYNC_WINDOW: lambda detail: f"TPDO{_word(detail)}" if _word(detail) else "",
     EmcyCode.RPDO_TIMEOUT: lambda detail: f"RPDO{_word(detail)}",
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that return the text for at least two manufacturer-specific bytes of a skinnode patch."""
+"""Functions that return the text for the manufacturer-specific bytes of a skinnode patch, at least two."""

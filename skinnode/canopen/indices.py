@@ -52,17 +52,17 @@ def rpdo_cob_id(number: int, node_id: int) -> int:
 
 
 def chunk_cob_id(node_id: int) -> int:
-    """Return the COB-ID of TPDO1, a chunk of a scan."""
+    """Return the COB-ID of TPDO1, which carries a chunk of a scan."""
     return tpdo_cob_id(0, node_id)
 
 
 def command_cob_id(node_id: int) -> int:
-    """Return the COB-ID of RPDO1, a command."""
+    """Return the COB-ID of RPDO1, which carries a command."""
     return rpdo_cob_id(0, node_id)
 
 
 def summary_cob_id(node_id: int) -> int:
-    """Return the COB-ID of TPDO2, the summary of a scan."""
+    """Return the COB-ID of TPDO2, which carries the summary of a scan."""
     return tpdo_cob_id(1, node_id)
 
 
@@ -77,7 +77,7 @@ def sdo_request_cob_id(node_id: int) -> int:
 
 
 def heartbeat_cob_id(node_id: int) -> int:
-    """Return the COB-ID of boot-up, heartbeat and node guarding of a node."""
+    """Return the COB-ID for boot-up, heartbeat and node guarding of a node."""
     return 0x700 + node_id
 
 
@@ -124,9 +124,9 @@ TPDO1_PARAMETER: Final = 0x1800
 TPDO2_PARAMETER: Final = 0x1801
 TPDO1_MAPPING: Final = 0x1A00
 TPDO2_MAPPING: Final = 0x1A01
-"""Indices of the first PDOs; for the n-th PDO, counted from 0, add n."""
+"""Indices of the first PDOs; add n for PDO n, counted from 0."""
 MAX_PDOS: Final = 512
-"""Maximum number of RPDOs, and of TPDOs, since each range such as 0x1400 to 0x15FF has this many indices."""
+"""Maximum number of RPDOs, and also of TPDOs; each index range, such as 0x1400 to 0x15FF, has this length."""
 PDO_MAPPING_OFFSET: Final = 0x200
 """Offset from the index of a PDO's communication parameter to the index of its mapping."""
 PDO_INVALID: Final = 1 << 31
@@ -134,7 +134,7 @@ PDO_INVALID: Final = 1 << 31
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication parameter."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
-"""Lengths in bits of the data types that an RPDO can map at sub-index 0 for bytes that this node ignores.
+"""Lengths in bits of the data types that an RPDO can map as dummy objects, whose bytes this node ignores.
 
 BOOLEAN is missing because PDOs consist of whole bytes.
 """
@@ -149,11 +149,11 @@ PDO_BYTES: Final = 12
 """Sub-index of the maximum PDO length, which is 8 bytes, or 64 over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""Sub-indices before the codes; over CAN FD the index is the upper wire's, and the first column follows."""
+"""Sub-indices before the codes; over CAN FD, the first is the upper wire, and the first column follows."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
-"""Sub-indices that TPDO2 carries since revision 1.1 instead of the device time in µs."""
+"""Sub-indices that TPDO2 carries from revision 1.1 on, instead of the device time in µs."""
 SEND_POLICY: Final = 0x2020
 SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
@@ -167,13 +167,13 @@ TEST_STATUS, TEST_FAULTS, TEST_READINGS, TEST_NOISE = 1, 2, 3, 4
 TEST_OPEN_WIRES, TEST_SHORTED_WIRES, TEST_OUT_OF_RANGE, TEST_UNTARED = 5, 6, 7, 8
 UPPER_WIRE_FAULTS: Final = 0x2030
 LOWER_WIRE_FAULTS: Final = 0x2031
-"""Masks of the 32 wires that start at wire 32 i: sub-index 2i+1 open, 2i+2 shorted."""
+"""Masks of 32 wires, from wire 32 i: open wires at sub-index 2 i + 1, shorted wires at 2 i + 2."""
 REJECTED_FRAMES: Final = 0x2040
 """Counters; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Index, plus r, of the last codes of upper wire r, with one sub-index per column."""
+"""Index for upper wire 0 (add r for wire r) of the last codes, with one sub-index per column."""
 BASELINE: Final = 0x2200
-"""Index, plus r, of R0 of upper wire r, ohm, with one sub-index per column; 0 where R0 is unknown."""
+"""Index for upper wire 0 (add r for wire r) of R0, ohm, one sub-index per column; 0 if R0 is unknown."""
 COORDINATES: Final = 0x2300
 """DOMAIN; see :func:`skinnode.protocol.coordinates.pack_coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301

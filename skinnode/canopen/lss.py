@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Node-ID value meaning that a node has no node-ID."""
+"""Node-ID value of a node that has no node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,
@@ -60,7 +60,7 @@ class LssState(IntEnum):
 
 
 class LssAddress(NamedTuple):
-    """LSS address, the fields of the identity object (0x1018) in order; unique worldwide to a device."""
+    """LSS address: the fields of the identity object (0x1018) in order; unique to each device worldwide."""
 
     vendor_id: int
     product_code: int

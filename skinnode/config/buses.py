@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default load limit of a bus. Above it, response times of low priorities grow steeply (Davis, Burns, Bril,
-Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35, 2007), and no capacity
-is left to repeat frames after errors."""
+"""Default load limit of a bus. Above it, the response times of low-priority frames grow steeply (Davis,
+Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35, 2007), and
+no capacity is left to repeat frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]
@@ -25,7 +25,7 @@ _KEYS_OF_TABLE: Final = ("interface", "channel", "bitrate", "data_bitrate", "fd"
 class OtherFrame(Table):
     """Frame that another device, such as a drive, sends on the bus.
 
-    It adds to the bus load and delays frames of the hand.
+    It adds to the bus load and delays the frames of the hand.
     """
 
     can_id: Annotated[int, Field(ge=0, le=0x7FF), Allowed("an integer from 0 to 0x7FF")]
@@ -42,7 +42,7 @@ class BusConfig(Table):
     """CAN bus, identified by the names of its interface and channel in python-can."""
 
     name: Name = "can0"
-    """Name of the bus, used by patches in their key ``bus``."""
+    """Name of the bus, to which the patches refer in their key ``bus``."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
     """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
@@ -60,12 +60,12 @@ class BusConfig(Table):
     ] = 5_000_000
     """Bits per second in the data phase of CAN FD frames, from ESI to the CRC delimiter."""
     options: dict[str, bool | int | float | str] = Field(default={})
-    """Additional arguments of the python-can interface, by their names in python-can."""
+    """Additional arguments for the python-can interface, by name."""
     role: Annotated[Role, one_of(Role)] = "master"
     """``guest`` if the robot's own master sends NMT and SYNC on this bus; the host then sends neither."""
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
     """Frames that a guest may send: ``sdo`` to identify and configure the patches and to read their data."""
-    heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node has")] = None
+    heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
     """Node-ID with which the host, as master, sends a heartbeat. The patches monitor it and go
     pre-operational when it stops. None: no heartbeat."""
     max_load: Annotated[
@@ -99,10 +99,10 @@ class SyncConfig(Table):
     """Maximum value of the SYNC counter (0x1019), which starts at 1 and numbers the scans. 0: the SYNC of
     another master has no counter, and each patch numbers its own scans."""
     stagger_ms: Annotated[
-        float, Field(ge=0, allow_inf_nan=False), Allowed("a number of milliseconds of at least 0")
+        float, Field(ge=0, allow_inf_nan=False), Allowed("a number of milliseconds, at least 0")
     ] = 0.0
-    """Delay from the SYNC of one bus to the SYNC of the next if the host is the master, milliseconds. At 0
-    all patches scan at the same instant, their scans end together, and the last field is solved after all
+    """Delay from the SYNC of one bus to the SYNC of the next if the host is the master, milliseconds. At 0,
+    all patches scan at the same instant and their scans end together, so the last field is solved after all
     others."""
 
     @property
@@ -123,9 +123,9 @@ class BringUpConfig(Table):
     """Action if a patch does not answer at the start: ``refuse`` to start, or start with the other patches
     and ``wait`` for it."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host configures this period; a guest that sends
-    nothing expects it. At 250 ms, a lost node is detected within a second, and four nodes take 0.1 % of the
-    bus."""
+    """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; as a guest that
+    sends nothing, it only expects it. At 250 ms, a lost node is detected within a second, and the heartbeats
+    of four nodes take 0.1 % of the bus."""
 
     @property
     def heartbeat_s(self) -> float:

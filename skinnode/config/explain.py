@@ -24,7 +24,7 @@ _LONGEST_SHOWN: Final = 60
 def first_error(
     error: ValidationError, table: type[BaseModel], where: Callable[[KeyPath], str]
 ) -> ConfigError:
-    """Return the error to report from pydantic's errors about a table.
+    """Return the error to report, selected from pydantic's errors about a table.
 
     Args:
         error: The errors.
@@ -36,7 +36,7 @@ def first_error(
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, ConfigError):  # from a check of this package, with the rest of the key
+    if isinstance(cause, ConfigError):  # raised by a check of this package, whose key continues the location
         path = (*location, *key_path(cause.key))
         return ConfigError(dotted(path), cause.got, cause.allowed, where=where(path))
     keys, allowed = _place(location, table)
@@ -73,7 +73,7 @@ def key_path(key: str) -> KeyPath:
 
 
 def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | None]:
-    """Return the keys of the table that holds ``location``, and the values allowed at ``location``."""
+    """Return the keys of the table that contains ``location``, and the values allowed at ``location``."""
     allowed: str | None = None
     for depth, part in enumerate(location):
         if isinstance(part, int):
@@ -90,7 +90,7 @@ def _place(location: KeyPath, table: type[BaseModel]) -> tuple[list[str], str | 
 
 
 def allowed_in(field: FieldInfo) -> str | None:
-    """Return a description of the values allowed at a key; None if its type is sufficient."""
+    """Return a description of the values allowed for a key; None if the type describes them sufficiently."""
     marks = [mark.text for mark in field.metadata if isinstance(mark, Allowed)]
     return next(iter([*marks, *_marks_in(field.annotation)]), None)
 
@@ -103,6 +103,6 @@ def tables_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Return the marks inside a union such as ``Stiffness | None``."""
+    """Return the texts of all :class:`Allowed` marks, also inside a union such as ``Stiffness | None``."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]

@@ -21,7 +21,7 @@ from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
 MOST_BUSES: Final = 64
-"""Maximum number of buses of a hand, far above the number of interfaces of a machine."""
+"""Maximum number of buses per hand, far more than any machine has interfaces."""
 
 
 class HandConfig(Table):
@@ -77,8 +77,8 @@ class HandConfig(Table):
         """Return a copy of the hand that uses another interface or channel.
 
         Args:
-            interface: python-can interface that replaces that of the file, for all buses.
-            channel: Channel that replaces that of the file.
+            interface: python-can interface for all buses, instead of the file's.
+            channel: Channel, instead of the file's.
 
         Raises:
             ConfigError: A channel is given for a hand with several buses, or a name is empty.
@@ -130,7 +130,7 @@ class HandConfig(Table):
         return self
 
     def _check_roles(self) -> None:
-        """Check settings that conflict with the role of a bus."""
+        """Check for settings that conflict with the role of a bus."""
         overflow, guest = self.sync.counter_overflow, all(bus.role == "guest" for bus in self.buses)
         if overflow == 1 or (overflow == 0 and not guest):
             allowed = "an integer from 2 to 240; or 0 if the host is a guest on all buses"
@@ -147,7 +147,7 @@ class HandConfig(Table):
                     f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, 'only with role = "master"'
                 )
             if bus.heartbeat_node_id in node_ids:
-                allowed = "an integer from 1 to 127 that no node has"
+                allowed = "an integer from 1 to 127 that no node uses"
                 raise ConfigError(f"buses[{i}].heartbeat_node_id", bus.heartbeat_node_id, allowed)
         self._check_guests()
 
@@ -176,9 +176,9 @@ def load_hand(path: Path | str) -> HandConfig:
         path: The file.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, a wrong type,
-            a value out of range, or fails a check of :class:`HandConfig`. The message is one line with line
-            and column.
+        ConfigError: The file cannot be read, is not TOML, has an unknown or missing key, has a value of the
+            wrong type or out of range, or fails a check of :class:`HandConfig`. The message is one line with
+            line and column.
     """
     path = Path(path)
     return _parse(read_toml(path, "hand file"), path.parent)
@@ -189,7 +189,7 @@ def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: s
 
     Args:
         table: The table, as tomllib reads it.
-        folder: Base folder of relative paths; default the working directory.
+        folder: Base folder for relative paths; by default the working directory.
         where: File name for errors.
 
     Raises:
@@ -208,7 +208,7 @@ def _parse(document: Document, folder: Path) -> HandConfig:
 
 
 def _check_geometry(key: str, patch: PatchConfig) -> None:
-    """Raise ConfigError if the geometry is impossible or the number of gains differs from that of wires."""
+    """Raise ConfigError if the geometry is impossible or the numbers of gains and wires differ."""
     try:
         layout = patch.layout.build()
     except ValueError as error:

@@ -54,7 +54,7 @@ class LayoutConfig(Table):
     pitch_m: Length = 4e-3
     """Distance between neighbouring electrodes of an upper wire, metres."""
     height_m: Length = 2e-3
-    """Height of the upper electrodes above the lower ones, metres."""
+    """Height of the upper electrodes above the lower electrodes, metres."""
     upper_wires: Count = 10
     """Number of upper wires, U, which are the rows of a frame."""
     upper_electrodes: Count = 10
@@ -104,9 +104,10 @@ class LayoutConfig(Table):
 
 @functools.lru_cache(maxsize=256)
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
-    """Return a layout from a cache.
+    """Return a preset layout from a cache.
 
-    The patches of a hand are mostly alike and are built in every check; layouts are immutable.
+    The patches of a hand are mostly alike, and every check builds them. Layouts are immutable and can be
+    shared.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
@@ -152,7 +153,7 @@ class PoseConfig(Table):
 class CalibrationConfig(Table):
     """Measured properties of this patch.
 
-    Resistances at rest are in ``baseline``, the resistivity is in the layout.
+    The resistances at rest are in ``baseline``, and the resistivity is in the layout.
     """
 
     stiffness_n_per_m: Stiffness | None = None
@@ -182,12 +183,13 @@ class PatchConfig(Table):
     node_id: NodeId
     """CANopen node-ID, 1 to 127, unique on its bus."""
     bus: Name = "can0"
-    """Name of the bus of the patch."""
+    """Name of the bus to which the patch is connected."""
     link: Name | None = None
     """Name of the robot link that carries the patch, for programs with a robot model."""
     pose: PoseConfig = PoseConfig()
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
-    """Electronic data sheet to compare with the wire format of this file; path relative to the hand file."""
+    """Electronic data sheet (EDS) to compare with the wire format of this patch; the path is relative to the
+    hand file."""
     layout: LayoutConfig = LayoutConfig()
     code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
     """Width of a resistance code on the bus."""
@@ -220,7 +222,7 @@ def load_layout(path: Path | str) -> PatchLayout:
             ``[patches.layout]``.
 
     Raises:
-        ConfigError: The file cannot be read or does not contain a possible layout. The message is one line.
+        ConfigError: The file cannot be read or does not contain a valid layout. The message is one line.
     """
     path = Path(path)
     if path.suffix == ".npz":

@@ -18,8 +18,8 @@ class SolverConfig(Table):
     """Settings for computing displacements from resistances."""
 
     method: Annotated[Method, one_of(Method)] = "auto"
-    """``exact`` inverse of each wire, ``posterior`` of the patch, or ``auto`` for the method that suits
-    layout and noise."""
+    """``exact`` inverse of each wire, ``posterior`` of the patch, or ``auto`` for the method that suits the
+    layout and the noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
     """Operator of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None
@@ -47,5 +47,5 @@ class StreamConfig(Table):
     """Handling of incomplete scans, which lack chunks or the summary with the scan check: ``pass`` them on
     unchecked with a mask of the valid resistances, or ``withhold`` them. Both are counted."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
-    """Maximum number of fields that a subscriber may lag behind before the oldest are lost. 64 fields are
-    more than a second of four patches at 12.5 scans per second."""
+    """Maximum number of fields that a subscriber may lag behind before the oldest are lost. 64 fields cover
+    more than a second for four patches at 12.5 scans per second."""

@@ -34,4 +34,4 @@ class SimulationConfig(Table):
     cycle_s: _Cycle = 4.0
     """Duration of one press, slide and lift."""
     converter_noise: Ratio = 3e-6
-    """Standard deviation of the noise of the simulated converter, relative to the resistance."""
+    """Standard deviation of the simulated converter's noise, relative to the resistance."""

@@ -13,7 +13,7 @@ from skinnode.canopen.indices import MAX_NODE_ID
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Annotation that describes the values allowed in a field, for messages."""
+    """Annotation that describes, for error messages, the values allowed in a field."""
 
     text: str
 
@@ -25,12 +25,12 @@ class Table(BaseModel):
 
 
 def one_of(names: Any) -> Allowed:
-    """Return the annotation for the values of a Literal."""
+    """Return the annotation that lists the values of a Literal."""
     return Allowed(" or ".join(map(str, get_args(names))))
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """Return ``value`` relative to the folder of the hand file.
+    """Return the path of ``value``, which is relative to the folder of the hand file.
 
     Raises:
         ValueError: There is no such file.
@@ -47,7 +47,7 @@ _NAME: Final = "a string of 1 to 64 printable characters, not all blank"
 
 
 def _printable(value: str) -> str:
-    """Check a name, which is printed unescaped and must not control a terminal or end a line."""
+    """Check that a name, which is printed unescaped, contains no terminal controls or line ends."""
     if not value.isprintable() or not value.strip():
         raise ValueError(_NAME)
     return value
@@ -59,7 +59,9 @@ NodeId = Annotated[int, Field(ge=1, le=MAX_NODE_ID), Allowed(f"an integer from 1
 Length = Annotated[
     float, Field(ge=1e-6, le=1.0, allow_inf_nan=False), Allowed("a number of metres from 1e-6 to 1")
 ]
-Ratio = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False), Allowed("a number from 0 to below 1")]
+Ratio = Annotated[
+    float, Field(ge=0, lt=1, allow_inf_nan=False), Allowed("a number of at least 0 and below 1")
+]
 Stiffness = Annotated[
     float, Field(ge=1e-3, le=1e12, allow_inf_nan=False), Allowed("a number of N/m from 1e-3 to 1e12")
 ]

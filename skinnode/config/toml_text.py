@@ -1,4 +1,4 @@
-"""TOML with positions: reads the value of each key with its line and column.
+"""TOML reader that returns the value of each key with its line and column.
 
 tomllib parses the file and checks its syntax, but records no positions. Files that tomllib accepts are
 therefore scanned again for the positions of keys. The scanner is hand-written because no maintained TOML
@@ -32,14 +32,15 @@ _VALUE: Final = re.compile(rf"{_STRING}|[^,\[\]{{}}#\n]+", re.DOTALL)
 _KEY: Final = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|[A-Za-z0-9_-]+')
 _LONGEST_LINE: Final = 60
 _DEEPEST: Final = 32
-"""Maximum number of parts of a key; a hand file needs six."""
+"""Maximum number of parts in a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Key with many more parts; also matches long runs of numbers joined by dots, which no hand file has."""
+"""Pattern of a key with many more parts; also matches long runs of numbers joined by dots, which no hand file
+has."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # an integer of TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
-_TOO_DEEP: Final = f"tables and arrays nested up to {_DEEPEST} deep"
+_TOO_DEEP: Final = f"tables and arrays nested at most {_DEEPEST} deep"
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +115,7 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 
 
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
-    """Convert a message of tomllib to an error.
+    """Convert a tomllib message to a ConfigError.
 
     The message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
     """
@@ -128,7 +129,7 @@ def _syntax_error(where: str, text: str, message: str) -> ConfigError:
 
 
 def places(text: str) -> dict[KeyPath, tuple[int, int]]:
-    """Return line and column of every key, array item and table of a document that tomllib accepts."""
+    """Return the line and column of every key, array item and table of a document that tomllib accepts."""
     offsets = _Scanner(text.replace("\r\n", " \n")).offsets
     found, line, start = {}, 1, 0
     for path, offset in sorted(offsets.items(), key=lambda item: item[1]):
@@ -159,7 +160,7 @@ class _Scanner:
 
     def _skip(self, pattern: re.Pattern[str]) -> str:
         match = pattern.match(self._text, self._at)
-        assert match is not None, f"tomllib accepted what this scanner does not, at {self._at}"
+        assert match is not None, f"tomllib accepted text that this scanner rejects, at {self._at}"
         self._at = match.end()
         return match[0]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum attempts to lock; each failed attempt means that another owner released the lock in between."""
+"""Maximum number of attempts to lock; an attempt fails only if another owner releases the lock in between."""
 
 
 class FileInUse(BlockingIOError):

@@ -1,4 +1,4 @@
-"""Reads files named by the user, without blocking forever and up to a size limit."""
+"""Reads files named by the user, up to a size limit and without blocking indefinitely."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ about a hundred times the memory of the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Read all of a file that the user named; also reads pipes that have a writer, as in ``<(command)``.
+    """Read a whole file that the user named, or a pipe that has a writer, as in ``<(command)``.
 
     Args:
         key: Option or key that named the file, for errors.

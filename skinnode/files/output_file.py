@@ -11,7 +11,7 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written, before the work that produces it.
+    """Check that a file can be written, before doing the work that produces its content.
 
     Args:
         option: Option that named the file, for errors.
@@ -42,14 +42,14 @@ def write_text(option: str, file: Path, text: str) -> None:
 def write_bytes(option: str, file: Path, data: bytes) -> None:
     """Write ``data`` to ``file``, the value of ``option``.
 
-    A regular file is replaced once all data is written and keeps its permissions; any other target, such as a
-    pipe, is written in place.
+    A regular file is replaced only when all data has been written, and keeps its permissions. Any other
+    target, such as a pipe, is written in place.
 
     Raises:
         ConfigError: The data could not be written completely; a regular file then keeps its old content.
     """
     try:
-        target = Path(os.path.realpath(file))  # for /dev/stdout, a name that does not exist
+        target = Path(os.path.realpath(file))  # /dev/stdout resolves to a name that does not exist
         if file.exists() and not (file.is_file() and os.access(target.parent, os.W_OK)):
             file.write_bytes(data)
         else:

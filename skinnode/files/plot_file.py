@@ -12,7 +12,7 @@ from skinnode.files.output_file import write_bytes
 
 
 def require_matplotlib(file: Path) -> None:
-    """Check that matplotlib is installed and can write the format that the suffix of ``file`` names.
+    """Check that matplotlib is installed and can write the format given by the suffix of ``file``.
 
     Raises:
         ConfigError: matplotlib is missing, or does not write such files.
@@ -27,7 +27,7 @@ def require_matplotlib(file: Path) -> None:
 
 
 def save_figure(option: str, file: Path, figure: Any, dpi: int) -> None:
-    """Write a matplotlib figure atomically to a file, in the format of the file's suffix.
+    """Write a matplotlib figure atomically to a file, in the format given by the file's suffix.
 
     Args:
         option: Option that named the file, for errors.

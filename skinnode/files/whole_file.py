@@ -1,8 +1,8 @@
 """Writes files atomically.
 
-The new content is written to a file with a random name in the same folder, created exclusively and never
-through a symbolic link, and renamed once complete. Readers always see either the old or the new
-content; after an error the old content remains.
+The new content is written to a file with a random name in the same folder, which is created exclusively and
+never through a symbolic link, and is renamed once it is complete. Readers always see either the old or the
+new content; after an error the old content remains.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
 
 
 def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> Path:
-    """Write ``data`` to a new file in the folder of ``path``, to be renamed or discarded.
+    """Write ``data`` to a new file in the folder of ``path``, which the caller must rename or discard.
 
     Args:
         path: The file to be replaced by the new file.
@@ -49,7 +49,7 @@ def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool =
         durable: Whether to return only once the data is on the storage medium.
 
     Returns:
-        Path of the new file.
+        The path of the new file.
 
     Raises:
         OSError: The new file cannot be written; no file is left behind.
@@ -76,7 +76,7 @@ def discard(path: Path) -> None:
 
 
 def discard_leftovers(path: Path) -> None:
-    """Remove incomplete files of processes that were killed while writing ``path``.
+    """Remove incomplete files left by processes that were killed while writing ``path``.
 
     Only the sole writer of ``path`` may call this.
     """

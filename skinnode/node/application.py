@@ -13,7 +13,7 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """Application of a device. Its objects are in the dictionary from the start."""
+    """Application of a device. The object dictionary contains its objects from the start."""
 
     @property
     def deadline_ns(self) -> int:
@@ -21,11 +21,11 @@ class Application(Protocol):
         ...
 
     def power_on(self, t_ns: int) -> None:
-        """Start the application, before the boot-up message. A reset does not call this method."""
+        """Start the application before the boot-up message is sent. A reset does not call this method."""
         ...
 
     def reset(self) -> None:
-        """Reset the application, after its objects have been set to their defaults."""
+        """Reset the application; its objects have already been set to their defaults."""
         ...
 
     def enter(self, *, operational: bool) -> None:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Final
 
 NO_DEADLINE_NS: Final = 1 << 63
-"""Deadline later than any other, ns, which means that nothing is scheduled."""
+"""Deadline later than any other, ns, meaning that nothing is scheduled."""
 
 Clock = Callable[[], int]
-"""Returns the time of the event being handled, ns."""
+"""Callback that returns the time of the event being handled, ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,14 +24,14 @@ class Pacing:
 
 
 EXACT: Final = Pacing(slack_ns=0, catch_up_ns=100_000)
-"""Pacing of a board, whose thread wakes for every chunk.
+"""Pacing for a board, whose thread wakes for every chunk.
 
-The interval between two chunks is at most one unit (100 µs) shorter than the inhibit time, so only wake-ups
-later than that lengthen a scan.
+The interval between two chunks is at most one unit (100 µs) shorter than the inhibit time, so a scan takes
+longer only if a wake-up is later than that.
 """
 
 THRIFTY: Final = Pacing(slack_ns=2_000_000, catch_up_ns=50_000_000)
-"""Pacing of many nodes on one machine.
+"""Pacing for many nodes on one machine.
 
 Four nodes at 0.6 ms per chunk and 12.5 scans/s use 13 % of one core of a small machine if the thread wakes
 for every chunk, and 7 % with 2 ms of slack. Each node then sends bursts of three frames.

@@ -39,7 +39,7 @@ HARDWARE_VERSION: Final = "none"
 """Value of 0x1009 for a software node, which has no board."""
 
 Handler = Callable[[bytes, int], None]
-"""Takes the payload of a frame and the time in ns at which it was received."""
+"""Callback that takes the payload of a frame and the time at which it was received, ns."""
 
 
 class CanopenDevice:
@@ -53,7 +53,7 @@ class CanopenDevice:
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
         memory: keeps values across a power cycle; None if nothing is kept, which 0x1010 then indicates.
-        kind: sizes and layout of the patch, which the memory must match; see
+        kind: sizes and layout of the patch, which must match those in the memory; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
@@ -76,7 +76,7 @@ class CanopenDevice:
         if not (1 <= node_id <= od.MAX_NODE_ID or node_id == NOT_CONFIGURED):
             raise ValueError(f"node_id: got {node_id}, must be 1 to 127, or {NOT_CONFIGURED} for none")
         if not 0 <= serial < 1 << 32:
-            raise ValueError(f"serial: got {serial}, must be an unsigned number of 32 bits")
+            raise ValueError(f"serial: got {serial}, must be an unsigned 32-bit integer")
         self._default_node_id = node_id
         self.node_id = node_id
         """Active node-ID; 255 while there is none."""
@@ -199,7 +199,7 @@ class CanopenDevice:
         return self._error_control.silent_from_ns
 
     def on_timer(self, t_ns: int) -> None:
-        """Perform all actions that are due. Calls that are too early or too frequent do no harm.
+        """Perform all actions that are due. Early or repeated calls are harmless.
 
         Args:
             t_ns: current time, ns.
@@ -268,7 +268,7 @@ class CanopenDevice:
         self._nmt.enter(state, t_ns)
 
     def _entered(self, state: NmtState, before: NmtState, t_ns: int) -> None:
-        self._emcy.allow(state.communicates, t_ns)  # first, because errors cleared below may have to wait
+        self._emcy.allow(state.communicates, t_ns)  # first, because clearing errors below may queue messages
         if not state.communicates:
             self._sdo.reset()
         if state is NmtState.OPERATIONAL:
@@ -372,5 +372,5 @@ class CanopenDevice:
 
 
 def _count(objects: Sequence[Object], first: int) -> int:
-    """Return the number of PDOs whose parameters are at ``first`` and above."""
+    """Return the number of PDOs in the index range that starts at ``first``."""
     return sum(first <= item.index < first + od.MAX_PDOS for item in objects)

@@ -20,7 +20,7 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum messages queued while the inhibit time, a stopped node or the bus delays them; drops the oldest."""
+"""Maximum messages held back by the inhibit time, a stopped node or the bus; the oldest are dropped."""
 _RESERVED_BIT: Final = 1 << 30
 
 
@@ -67,7 +67,7 @@ class EmcyProducer:
         self._send_end(code, t_ns)
 
     def report(self, code: EmcyCode, detail: bytes, t_ns: int, who: int = 0) -> None:
-        """Report an error that lasts until :meth:`clear`; repeat calls send only if ``detail`` has changed.
+        """Report an error that lasts until :meth:`clear`; repeated calls send only a changed ``detail``.
 
         Args:
             code: error code.
@@ -136,9 +136,9 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send immediately if the bus accepts the message; otherwise leave it to the next timer event.
+        """Send the queued messages if the bus accepts them; otherwise leave them to the next timer event.
 
-        A refusal by the bus is not raised, because the caller still has to handle the error it reports.
+        A BusError is suppressed, because the caller still has to handle the error that it is reporting.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
@@ -170,7 +170,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return the count for sub-index 0, otherwise an error; sub-index 1 is the newest error."""
+        """Return the number of errors at sub-index 0, otherwise an error; sub-index 1 is the newest."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):

@@ -24,8 +24,8 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Number of own heartbeat periods without a frame after which another node with this node-ID counts as gone.
-The same master usually configured both nodes, and one heartbeat may be lost."""
+"""Number of own heartbeat periods after which another node with this node-ID counts as gone if silent. Both
+nodes usually have the same period, set by the same master, and one heartbeat may be lost."""
 _RIVAL_NS: Final = 750_000_000
 """Time after which the other node counts as gone if this node sends no heartbeats, ns; three default periods.
 """
@@ -121,9 +121,9 @@ class ErrorControl:
             self._booted_ns = None
 
     def _on_own(self, _: bytes, t_ns: int) -> None:
-        """Report another node with this node-ID once, and clear the error after three silent periods.
+        """Report another node with this node-ID once, and clear the error after three periods of silence.
 
-        Every such frame is counted. Further action is up to the operator.
+        Every frame from the other node is counted. Further action is up to the operator.
         """
         self._rival_until_ns = t_ns + (_RIVAL_BEATS * self._producer.period_ns or _RIVAL_NS)
         self._rejected.count(Rejected.OWN_ERROR_CONTROL)

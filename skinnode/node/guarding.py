@@ -24,7 +24,7 @@ class Guarding:
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:
         self._store, self._emcy, self._failed = store, emcy, failed
         self._toggle = 0
-        self._guarded = False  # from the first request on
+        self._guarded = False  # true from the first request on
         self.deadline_ns = NO_DEADLINE_NS
         """Time at which the life time expires, ns."""
 
@@ -56,13 +56,13 @@ class Guarding:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """End guarding, because heartbeats replace it; the next request starts it again."""
+        """End guarding, because heartbeats replace it; the next request restarts it."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)
 
     def on_timer(self, t_ns: int) -> None:
-        """Report a life guarding event if the life time has expired, only once until the next request."""
+        """Report a life guarding event if the life time has expired, but only once until the next request."""
         if t_ns >= self.deadline_ns:
             self._guarded = False
             self.deadline_ns = NO_DEADLINE_NS

@@ -19,7 +19,7 @@ _BOOTED: Final = 1
 
 
 class HeartbeatProducer:
-    """Schedule of the heartbeats, without drift unless a heartbeat is late by a period or more."""
+    """Schedule of the heartbeats, which drifts only if a heartbeat is late by a period or more."""
 
     def __init__(self) -> None:
         self.period_ns = 0
@@ -38,7 +38,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Change the period and make a heartbeat due immediately, so that no consumer waits any longer.
+        """Change the period; a heartbeat is due immediately, so that no consumer waits for the old period.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -87,7 +87,7 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Apply 0x1016 after a reset, when no heartbeat has been received yet."""
+        """Apply 0x1016 after a reset, with no heartbeat received yet."""
         self._monitored = {}
         self.on_written(0)
 
@@ -127,7 +127,7 @@ class HeartbeatConsumer:
         self._plan()
 
     def on_timer(self, t_ns: int) -> None:
-        """Report each node whose heartbeat is missing at ``t_ns``, once until its next heartbeat."""
+        """Report each node whose heartbeat is overdue at ``t_ns``, but only once until its next heartbeat."""
         if t_ns < self.deadline_ns:
             return
         for item in self._monitored.values():
@@ -150,4 +150,4 @@ class HeartbeatConsumer:
         others = (i for i in range(1, od.HEARTBEAT_CONSUMERS + 1) if i != subindex)
         taken = {self._store.integer(od.HEARTBEAT_CONSUMER, i) for i in others}
         if node_id and time_ms and any(word >> 16 == node_id and word & 0xFFFF for word in taken):
-            raise Refused(AbortCode.INCOMPATIBLE)  # one node with two times
+            raise Refused(AbortCode.INCOMPATIBLE)  # two entries for one node

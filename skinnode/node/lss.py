@@ -26,10 +26,10 @@ from skinnode.node.clock import NO_DEADLINE_NS
 _CIA_301_TABLE: Final = 0
 
 _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
-"""Error codes in responses of the configuration services; the meaning of 1 depends on the service."""
+"""Error codes in responses to the configuration services; the meaning of 1 depends on the service."""
 
 
-# Address part that each frame of *switch selective* and *identify* refers to, and the comparison.
+# Part of the address that each frame of *switch selective* and *identify* tests, and the comparison.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -55,8 +55,8 @@ class LssSlave:
         bit_rate_bps: previously configured bit rate, bit/s; None if there is none.
         store: saves the pending node-ID and bit rate across a power cycle and raises OSError on failure;
             None if nothing can be saved.
-        activate: starts the change to the pending bit rate, given that bit rate and the delay in ms; see
-            :meth:`on_request`.
+        activate: called with the pending bit rate and the delay in ms to start the change of the bit rate;
+            see :meth:`on_request`.
     """
 
     def __init__(  # noqa: PLR0913 - keywords with defaults, one for each ability of a slave
@@ -91,7 +91,7 @@ class LssSlave:
 
     @property
     def may_boot(self) -> bool:
-        """Whether the node must boot: it has received its first node-ID and left LSS configuration."""
+        """Whether the node must boot: it has received its first node-ID and left the configuration state."""
         return (
             not self.configured and self.pending_node_id != NOT_CONFIGURED and self.state is LssState.WAITING
         )
@@ -168,7 +168,7 @@ class LssSlave:
         return agreed
 
     def _fastscan(self, value: int, bit: int, part: int, next_part: int) -> bytes | None:
-        """Return the response if the address matches ``value`` in bits ``bit`` and above.
+        """Return the response if the address equals ``value`` in bits ``bit`` and above.
 
         A slave that does not match stays silent, so one request can address many slaves.
         """
@@ -222,7 +222,7 @@ class LssSlave:
 
 
 class BitRateChange:
-    """Bit rate change of *activate bit timing*, with a delay before it and a delay after it.
+    """Bit rate change requested by *activate bit timing*, with a delay before and after the change.
 
     Args:
         set_bit_rate: changes the bit rate (bit/s); None if the node cannot change it.

@@ -1,7 +1,7 @@
 """Values that a node keeps across a power cycle.
 
-A memory holds one :class:`Kept` as a whole. Reading returns the content saved last or the content saved
-before that, never a mixture. :mod:`skinnode.node.memory_file` stores it in a file.
+A memory holds one :class:`Kept` as a whole. Reading returns either the last or the previous saved content,
+never a mixture. :mod:`skinnode.node.memory_file` stores it in a file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Kept:
     """All values that survive a power cycle."""
 
     patch: str = ""
-    """Sizes and layout of the patch that saved the values. A patch that differs cannot use the values."""
+    """Sizes and layout of the patch that saved the values. A different patch cannot use the values."""
     node_id: int | None = None
     """Node-ID stored by LSS, 1 to 127, or 255 for no node-ID; None if LSS has not stored anything."""
     bit_rate_bps: int | None = None
@@ -56,7 +56,7 @@ class Fault(IntEnum):
 
 
 class MemoryFault(SkinError):
-    """Error raised if a memory has no usable content."""
+    """Error raised if the content of a memory is not usable."""
 
     def __init__(self, fault: Fault, message: str) -> None:
         self.fault = fault
@@ -74,7 +74,7 @@ class Memory(Protocol):
         """
 
     def save(self, kept: Kept) -> None:
-        """Replace the content; it is safely stored on return.
+        """Replace the content; return once it is safely stored.
 
         Raises:
             OSError: if saving fails; the memory then still has its old content.

@@ -27,8 +27,8 @@ _MOST_BYTES: Final = 1 << 24
 class FileMemory:
     """Memory in a human-readable JSON file with a checksum.
 
-    Saving waits some milliseconds for the storage medium. In that time the node, and every other node on its
-    thread, does nothing else.
+    Saving waits some milliseconds for the storage medium. During this time, the node and all other nodes on
+    its thread are blocked.
 
     A memory owns the file exclusively from :meth:`claim` or the first :meth:`save` until :meth:`close`, the
     end of a ``with`` block or the deletion of the object. The claim is a kernel lock on a lock file beside
@@ -90,7 +90,7 @@ class FileMemory:
             raise MemoryFault(error.fault, f"{self.path}: {error}") from None
 
     def save(self, kept: Kept) -> None:
-        """Replace the content of the file; it is on the storage medium on return.
+        """Replace the content of the file; return once it is on the storage medium.
 
         Args:
             kept: the new content.
@@ -157,7 +157,7 @@ def unpack(data: bytes) -> Kept:
         data: the bytes of the file.
 
     Raises:
-        MemoryFault: if :func:`pack` could not have written the file.
+        MemoryFault: if the file is not one that :func:`pack` could have written.
     """
     try:
         document = json.loads(data)
@@ -175,7 +175,7 @@ def unpack(data: bytes) -> Kept:
             tuple(tuple(float(value) for value in row.split()) for row in content["baseline_ohm"]),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise MemoryFault(Fault.DAMAGED, "no memory of a node, or a part of one") from error
+        raise MemoryFault(Fault.DAMAGED, "not a node's memory, or incomplete") from error
 
 
 def _checksum(content: Any) -> str:

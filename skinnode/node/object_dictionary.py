@@ -32,7 +32,7 @@ DomainWriter = Callable[[bytes], None]
 
 
 class Lengths(NamedTuple):
-    """Range of lengths of a value that a client may write to an object, bytes."""
+    """Range of lengths that a client may write to an object, bytes."""
 
     least: int
     """Minimum length, bytes."""
@@ -50,10 +50,10 @@ class Lengths(NamedTuple):
             raise Refused(AbortCode.TOO_SHORT)
 
     def check_not_above(self, length: int) -> None:
-        """Check the length of a value's first part.
+        """Check the length of the part of a value received so far.
 
         Raises:
-            Refused: if that part alone is too long.
+            Refused: if this part alone is already too long.
         """
         if length > self.most:
             raise Refused(AbortCode.TOO_LONG if self.most == self.least else AbortCode.OUT_OF_MEMORY)
@@ -83,7 +83,7 @@ class ObjectStore:
     """Values of all objects of one node.
 
     ``read`` and ``write`` are client accesses and may raise :class:`~skinnode.canopen.abort.Refused`.
-    ``raw``, ``integer`` and ``put`` are accesses by the node itself, to objects that must exist.
+    ``raw``, ``integer`` and ``put`` are accesses by the node itself; the objects must exist.
 
     Args:
         objects: the declarations.
@@ -217,7 +217,7 @@ class ObjectStore:
         return self._values[index, subindex] if reader is None else reader(subindex)
 
     def written(self, index: int, subindex: int) -> bytes:
-        """Return the bytes that a client has written, even if a read of the object computes others."""
+        """Return the bytes that a client has written, even if the object is computed when it is read."""
         return self._values[index, subindex]
 
     def integer(self, index: int, subindex: int = 0) -> int:

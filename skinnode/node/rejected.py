@@ -15,19 +15,19 @@ class Rejected(IntEnum):
     """Reason for rejecting a frame; the value is the sub-index of object 0x2040."""
 
     NMT = 1
-    """Not two bytes, or an unknown command for this node."""
+    """NMT frame that is not two bytes long, or an unknown command for this node."""
     SYNC = 2
-    """Longer or shorter than 0x1019 requires."""
+    """SYNC message that is longer or shorter than 0x1019 requires."""
     TIME = 3
-    """Not six bytes, or not a time of day."""
+    """TIME message that is not six bytes long, or not a time of day."""
     HEARTBEAT = 4
-    """From a monitored node, but not one byte."""
+    """Heartbeat from a monitored node that is not one byte long."""
     SDO = 5
-    """A request that is not eight bytes."""
+    """SDO request that is not eight bytes long."""
     RPDO = 6
-    """Shorter than the mapped objects."""
+    """RPDO that is shorter than its mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """A boot-up message or heartbeat with this node's own node-ID, so another node has the same node-ID."""
+    """Boot-up message or heartbeat with this node's own node-ID, which another node therefore uses too."""
 
 
 class RejectedFrames:

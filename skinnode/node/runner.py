@@ -27,10 +27,10 @@ _CATCH_UP_FRAMES: Final = 4096
 """Maximum frames served before a node is reported silent; half a second of a full bus at 1 Mbit/s."""
 
 OFF_AFTER_S: Final = 0.1
-"""Time without any success after which the nodes treat the bus as off, s; a full queue drains sooner."""
+"""Duration of unbroken bus errors after which nodes treat the bus as off, s; a full queue drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""Time without any success after which the interface is reopened, s, in case it was replugged."""
+"""Duration of unbroken bus errors after which the interface is reopened, s, in case it was replugged."""
 
 
 class NodeRunner:
@@ -38,14 +38,14 @@ class NodeRunner:
 
     A runner can be started once. Bus errors do not end it. Its thread owns the nodes from :meth:`start` to
     :meth:`stop`; other threads may only read the nodes' counters. The port stays open afterwards. Timers are
-    as precise as the most precise of the nodes requires.
+    as precise as the most demanding node requires.
 
     Args:
         port: the port that all nodes share.
-        nodes: the nodes, any number of which may still lack a node-ID.
+        nodes: the nodes, any of which may still lack a node-ID.
 
     Raises:
-        ValueError: if there are no nodes, or two have the same node-ID.
+        ValueError: if there are no nodes, or two nodes have the same node-ID.
     """
 
     def __init__(self, port: CanPort, nodes: Iterable[PatchNode]) -> None:
@@ -64,7 +64,7 @@ class NodeRunner:
         """First error of the latest run of errors, in one line."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        self._sent_before = 0  # frames sent when the bus went off; one more shows that it has recovered
+        self._sent_before = 0  # frames sent before the bus went off; one more shows that it has recovered
         self._powered, self._stopping = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)
@@ -77,7 +77,7 @@ class NodeRunner:
     def start(self) -> None:
         """Power the nodes on in order, and return once each has its node-ID.
 
-        :meth:`stop` raises an error of the thread.
+        If an error ends the thread, :meth:`stop` raises it.
         """
         self._thread.start()
         self._powered.wait()
@@ -204,7 +204,7 @@ class NodeRunner:
         return failure
 
     def _serve(self, frame: Frame) -> BusError | None:
-        """Give a frame to all nodes, and return a bus error of a node once all have been served."""
+        """Pass a frame to all nodes, then return a bus error if a node raised one."""
         failure: BusError | None = None
         if frame.error:
             self._on_error_frame(frame)

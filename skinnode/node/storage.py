@@ -1,7 +1,7 @@
 """Store parameters (0x1010), restore defaults (0x1011) and verify configuration (0x1020) of CiA 301 v4.2.
 
 The module also saves the baseline and the LSS configuration. A *parameter* is an object that a client can
-write and read back, so neither a command nor a computed object.
+write and read back; commands and computed objects are not parameters.
 """
 
 from __future__ import annotations
@@ -83,12 +83,12 @@ class Storage:
             self.note(error.fault, why=str(error))
             return
         if kept is not None and kept.patch != patch:
-            self.note(Fault.FOREIGN, why=f"it is of another patch, {kept.patch!r}; this one is {patch!r}")
+            self.note(Fault.FOREIGN, why=f"it belongs to another patch, {kept.patch!r}; this is {patch!r}")
         elif kept is not None:
             self._kept = kept
 
     def note(self, fault: Fault, index: int = 0, subindex: int = 0, why: str = "") -> None:
-        """Record a fault for :meth:`report`.
+        """Record a fault, to be reported by :meth:`report`.
 
         Args:
             fault: kind of the fault.
@@ -96,7 +96,7 @@ class Storage:
             subindex: sub-index of a refused parameter.
             why: the reason, in one line; if empty, the reason is that the parameter is not allowed.
         """
-        self.problem = why or f"0x{index:04X}:{subindex} as stored is not allowed"
+        self.problem = why or f"the stored value of 0x{index:04X}:{subindex} is not allowed"
         detail = struct.pack("<BHB", fault, index, subindex)
         if fault is Fault.REFUSED:
             self._unreported.append(detail)
@@ -118,7 +118,7 @@ class Storage:
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index ``first`` to ``last`` to their power-on values.
 
-        A saved value passes the same checks as a client's write. An object without a saved value, or whose
+        A saved value undergoes the same checks as a client's write. An object without a saved value, or whose
         saved value is no longer allowed, is set to its default.
         """
         self._store.restore(first, last)
@@ -162,7 +162,7 @@ class Storage:
         self._settle(Fault.NOT_SAVED)
 
     def _settle(self, *faults: Fault) -> None:
-        """Clear faults, because the memory is reliable again."""
+        """Clear faults that have ended, because the memory is reliable again."""
         for fault in faults:
             if self._lasting.pop(fault, None) is not None:
                 self._emcy.clear(EmcyCode.DATA_SET, self._now(), fault)
@@ -191,7 +191,8 @@ class Storage:
         if subindex in (_ALL, _APPLICATION_ONLY):
             application_kept = Parameters(node_id, application)
             kept = replace(kept, application=application_kept, baseline_ohm=self.baseline_ohm())
-        # 0x1020 verifies the configuration as a whole, so it is saved only if all of that is saved.
+        # 0x1020 verifies the configuration as a whole, so it is saved only if the whole configuration is
+        # saved.
         whole = kept.communication.values == communication and kept.application.values == application
         return kept if whole else _unverified(kept)
 

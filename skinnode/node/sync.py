@@ -28,7 +28,7 @@ _DO_NOT_CARE_BIT: Final = 1 << 31
 
 
 class SyncWindow:
-    """Time window after a SYNC within which synchronous PDOs are valid (0x1007, µs; 0 for no limit)."""
+    """Time window after a SYNC in which synchronous PDOs are valid (0x1007, µs; 0 for no limit)."""
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer) -> None:
         self._store, self._emcy = store, emcy
@@ -53,7 +53,7 @@ class SyncWindow:
     def lets_out(self, number: int, t_ns: int) -> bool:
         """Return whether a synchronous TPDO may be sent; if not, the caller must discard it.
 
-        An emergency reports a discarded TPDO once, and again only after a TPDO sent in time.
+        An emergency reports a discarded TPDO once, and again only after the TPDO has been sent in time.
 
         Args:
             number: number of the TPDO, counted from 0.
@@ -90,8 +90,8 @@ class Sync:
         """The synchronous window."""
         self._communicates = False
         self._period_ns = 0
-        self._counter = 0  # of the last SYNC produced
-        self._wrong_length: int | None = None  # of the last SYNC consumed
+        self._counter = 0  # counter of the last SYNC produced
+        self._wrong_length: int | None = None  # length of the last SYNC consumed, if wrong
         self.cob_id = od.SYNC_COB_ID
         """COB-ID of SYNC messages."""
         self.deadline_ns = NO_DEADLINE_NS
@@ -120,7 +120,7 @@ class Sync:
         """Handle a change of the NMT state.
 
         SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The counter restarts at 1 when the
-        node enters these from another state.
+        node enters either of them from any other state.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -148,7 +148,7 @@ class Sync:
     def accept(self, message: bytes, t_ns: int) -> bool:
         """Return whether a SYNC has the length that 0x1019 requires.
 
-        A wrong length is reported once, and again if the length changes.
+        A wrong length is reported once, and again only if the length changes.
 
         Args:
             message: the payload.

@@ -1,7 +1,8 @@
 """TIME consumer: the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
-A device has no real-time clock. It keeps the last time received and its own clock's time of reception. From
-these, object 0x2022 gives the current time of day, and the device time of a scan can be converted to a date.
+A device has no real-time clock. It keeps the last time received, and the time of reception by its own clock.
+From these, object 0x2022 gives the current time of day, and the device time of a scan can be converted to a
+date.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _CONSUMES: Final = 1 << 31
 _PRODUCES: Final = 1 << 30
 _DAY_MS: Final = 86_400_000
 _FORMAT: Final = struct.Struct("<IH")
-"""TIME_OF_DAY (CiA 301 v4.2, 7.1.6.5): u28 ms after midnight, 4 bits reserved, u16 days since 1984-01-01."""
+"""TIME_OF_DAY (CiA 301 v4.2, 7.1.6.5): u28 ms after midnight, 4 reserved bits, u16 days since 1984-01-01."""
 _MS_MASK: Final = (1 << 28) - 1
 
 
@@ -33,7 +34,7 @@ class TimeConsumer:
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        self._received_ms = 0  # since 1984-01-01, at _received_ns of the node's clock
+        self._received_ms = 0  # time since 1984-01-01 at _received_ns of the node's clock
         self._received_ns = 0
         self._messages = 0
         store.guard(od.COB_ID_TIME, self._guard)

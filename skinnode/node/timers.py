@@ -1,4 +1,4 @@
-"""Timers by key, served in order of time without a search of all timers."""
+"""Timers by key, served in order of time without searching all timers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """Heap with one time per key. Setting, moving and taking a time cost O(log n), amortised."""
+    """Heap with one time per key. Setting, moving or taking a time costs O(log n), amortised."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""Write order of a stored configuration that satisfies the rules of CiA 301."""
+"""Order of writing a stored configuration that satisfies the rules of CiA 301."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
     refused = [key for key in values if key not in known]
     pdos = {index & ~od.PDO_MAPPING_OFFSET for index, _ in known if od.RPDO1_PARAMETER <= index < _PDO_END}
     defaults = {pdo: store.raw(pdo, od.PDO_COB_ID) for pdo in sorted(pdos)}
-    for pdo, default in defaults.items():  # all PDOs first, because a value may use another's default
+    for pdo, default in defaults.items():  # all PDOs first, because a value may be another PDO's default
         _accepted(store, [((pdo, od.PDO_COB_ID), _switched_off(default))])
     for pdo, default in defaults.items():
         refused += _write_pdo(store, known, pdo, default)
@@ -52,9 +52,9 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
 
 
 def _write_pdo(store: ObjectStore, values: Mapping[Key, bytes], pdo: int, default: bytes) -> Iterator[Key]:
-    """Write the two records of the PDO with parameters at ``pdo``; yield the refused values.
+    """Write the two records of the PDO whose parameters are at ``pdo``, and yield the refused values.
 
-    ``default``: its COB-ID if ``values`` has none.
+    ``default``: the PDO's COB-ID if ``values`` contains none.
     """
     cob_id, count = (pdo, od.PDO_COB_ID), (pdo + od.PDO_MAPPING_OFFSET, 0)
     own = sorted(item for item in values.items() if item[0][0] == pdo and item[0] != cob_id)

@@ -1,4 +1,4 @@
-"""Starts child processes that survive signals from the terminal of the command.
+"""Starts child processes that survive signals from the command's terminal.
 
 A terminal also sends Ctrl-C (SIGINT) and SIGHUP to the children of a command. Python would print a
 traceback in a child that is still importing, and SIGHUP would end the resource tracker of ``multiprocessing``
@@ -23,8 +23,8 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 def starting_children() -> Iterator[None]:
     """Block the terminal's signals for child processes started in this ``with`` block.
 
-    A signal that arrives in the block is handled at the end of the block, because a half-started child prints
-    a traceback.
+    A signal that arrives in the block is handled at the end of the block, because a child interrupted during
+    its start would print a traceback.
     """
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
@@ -38,10 +38,10 @@ def starting_children() -> Iterator[None]:
 
 @contextmanager
 def _signals_deferred() -> Iterator[None]:
-    """Handle signals at the end of the ``with`` block.
+    """Defer the handling of signals to the end of the ``with`` block.
 
-    A signal mask is not enough: another thread can take the signal, and Python still calls the handler on the
-    main thread. Threads other than the main thread are never interrupted.
+    A signal mask is not enough: another thread can receive the signal, and Python still calls the handler on
+    the main thread. Other threads are never interrupted, so they need no deferral.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

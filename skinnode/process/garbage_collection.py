@@ -12,8 +12,8 @@ from contextlib import contextmanager
 def without_long_collections() -> Iterator[None]:
     """Exclude objects that exist on entry from garbage collection for the duration of the block.
 
-    With the objects of numba and canopen, a full collection stops every thread for 30 ms on a small computer,
-    long enough for a node to skip a scan or a host to delay a SYNC. Enter the block after all setup is done.
+    With numba and canopen loaded, a full collection stops every thread for 30 ms on a small computer, long
+    enough for a node to skip a scan or a host to delay a SYNC. Enter the block after all setup is done.
     Objects that exist on entry and become cyclic garbage are freed after the block.
     """
     gc.collect()

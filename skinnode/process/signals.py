@@ -11,7 +11,7 @@ from types import FrameType
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Yield an event that stop signals set, and restore the previous handlers after the block.
+    """Yield an event that is set by a stop signal, and restore the previous handlers after the block.
 
     The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (terminal closed). SIGHUP stays ignored if it was
     ignored before, as under nohup.

@@ -1,18 +1,18 @@
 """Assembler of one patch's received chunks and summaries into scans; not thread-safe, and without a clock.
 
-**A scan never mixes two scans.** A scan holds only frames with its own counter that arrived within the
-*timeout* of its first frame, and it is closed for good when a frame of a newer scan arrives. Frames of two
-scans can therefore share a scan only if they carry the same counter and arrive within the timeout of each
-other. That cannot happen while counter range × period is longer than the timeout plus the age of the oldest
-frame, measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter
-range is shorter), so with the usual range of 240 scans a frame may be 237 periods old.
+**Scans are never mixed.** A scan holds only frames with its own counter that arrived within the *timeout* of
+its first frame, and it is closed for good when a frame of a newer scan arrives. Frames of two scans can
+therefore share a scan only if they carry the same counter and arrive within the timeout of each other. That
+cannot happen while counter range × period is longer than the timeout plus the age of the oldest frame,
+measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter range is
+shorter), so with the usual range of 240 scans a frame may be 237 periods old.
 
 **Two scans with the same counter**, from a node that did not increment it or from two nodes with the same
-node-ID, show up as a frame received twice with different content. The other frames then cannot be assigned to
-either scan, so the whole scan is discarded. The same applies to a scan with missing frames whose chunks are
-more than two periods apart: it began with a chunk that had the counter of a later scan, and that scan's own
-chunk arrives after the timeout. Two halves without overlapping frames can be told from one scan only by the
-check.
+node-ID, are detected when a frame is received twice with different content. The other frames then cannot be
+assigned to either scan, so the whole scan is discarded. The same applies to a scan with missing frames whose
+chunks are more than two periods apart: it began with a chunk that carried the counter of a later scan, and
+the later scan's own chunk arrives after the timeout. If the frames of the two scans do not overlap, only the
+check reveals that they are not one scan.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes that the receiver must hold (:mod:`skinnode.protocol.scan_check`). If the check fails, the wrong chunk
@@ -24,8 +24,8 @@ without a check is rejected. Patches of revision 1.0 send no checks; their scans
 have been received.
 
 **Order of counters.** A counter up to half the counter range ahead is newer; any other counter is late, and
-its frame is dropped. After a timeout without an accepted frame any counter starts a new stream, because a
-node or the SYNC producer was restarted.
+its frame is dropped. After a timeout without an accepted frame any counter starts a new stream, because the
+node or the SYNC producer may have been restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the others keep
 their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan in between was lost, torn or overrun, or a
@@ -52,7 +52,7 @@ from skinnode.text.words import counted
 
 _CHUNK_INDICES: Final = 256
 _NOT_EXPECTED: Final = b""
-"""Filler for chunk numbers that a patch does not have, so that the hot path needs no bounds check."""
+"""Placeholder for chunk numbers that a patch does not have, so that the hot path needs no bounds check."""
 _NONE_OPEN: Final = -1  # no scan counter is negative
 _NEVER: Final = -1
 # Testing an enum flag takes as long as processing a whole chunk; testing an int takes a tenth of that.
@@ -71,7 +71,7 @@ class ScanAssembler:
         counter_overflow: value of 0x1019; scan counters run from 1 to this number with the SYNC, or freely
             from 0 to 255 if it is 0.
         period_ns: time between two scans, ns; sets the timeout.
-        grace_ns: how long to wait for late frames after the summary or all chunks have arrived, ns.
+        grace_ns: time to wait for late frames after the summary or all chunks have arrived, ns.
         node_id: node-ID shown in the errors passed to ``on_reject``.
         on_reject: called with a CodecError for each frame of the wrong length or form.
         under_way: whether the node may already be sending; see :meth:`reset`.
@@ -120,11 +120,11 @@ class ScanAssembler:
         self._received = 0
         self._sent = _NEVER
         self._summary: Summary | None = None
-        self._head = b""  # bytes of that summary that its check covers
+        self._head = b""  # bytes of the summary that its check covers
         self._checked = False
         self._device_time = DeviceTimeTracker()
         self._expires_ns = self._t_first_ns = self._t_last_ns = 0
-        self._t_chunk_ns = self._t_summary_ns = 0  # of the frame before the summary, and of the summary
+        self._t_chunk_ns = self._t_summary_ns = 0  # time of the frame before the summary, and of the summary
 
         self._held = HeldChunks(profile)
         self._follows = False  # whether the open scan follows the last one directly
@@ -212,7 +212,7 @@ class ScanAssembler:
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`poll` will return a scan if no frame arrives, ns; None with no open scan."""
+        """Return when :meth:`poll` will return a scan if no frame arrives, ns; None if no scan is open."""
         if self._counter == _NONE_OPEN:
             return None
         if self._received >= self._sent != _NEVER:
@@ -227,8 +227,8 @@ class ScanAssembler:
         Args:
             under_way: whether the node may already be sending; chunks missing at the start of the first scan
                 then count as not received instead of lost.
-            checked: whether the node is known to send a check with every summary; if not, the first check
-                that passes shows this.
+            checked: whether the node is known to send a check with every summary; if false, checks are
+                required after the first check that passes.
         """
         if self._counter != _NONE_OPEN:
             self._discarded += 1
@@ -329,7 +329,7 @@ class ScanAssembler:
             self._late += 1
         return False
 
-    # --- the life of a scan
+    # --- opening and closing a scan
 
     def _no_frames(self) -> list[bytes | None]:
         return [None] * self._n + [_NOT_EXPECTED] * max(1, _CHUNK_INDICES - self._n)
@@ -423,7 +423,7 @@ class ScanAssembler:
         )
 
     def _discard(self, *, doubt: bool = True) -> None:
-        """Discard a scan, and keep later scans from inheriting its codes.
+        """Discard a scan, and prevent later scans from inheriting its codes.
 
         ``doubt``: whether the scan may have been the first scan of a new baseline.
         """

@@ -1,4 +1,4 @@
-"""Chunks, the parts in which TPDO1 carries the codes of a scan."""
+"""Chunks: the parts in which TPDO1 carries the codes of a scan."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Chunk(NamedTuple):
     """Chunk of a scan as sent."""
 
     chunk: int
-    """Chunk index: its first code is the ``chunk · codes_per_chunk``-th of the scan."""
+    """Chunk index; the chunk's first code is code number ``chunk · codes_per_chunk`` of the scan."""
     scan: int
     """Scan counter, u8."""
     codes: tuple[int, ...]
@@ -143,8 +143,8 @@ def unpack_scan_with_check(frames: bytes, profile: PatchProfile) -> tuple[Codes,
 def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
     """Return the position of each code in the payloads of a scan.
 
-    The shape is (U, K) for codes as 16-bit words, or (U, K, 4) for 24-bit codes as bytes, the fourth of which
-    is a zero after the payloads.
+    The shape is (U, K) for codes as 16-bit words, or (U, K, 4) for 24-bit codes as bytes; the fourth byte is
+    a zero appended to the payloads.
     """
     width, per, head = profile.code_bits // 8, profile.codes_per_chunk, profile.chunk_head_bytes
     lines, shape = profile.lines, (profile.rows, profile.columns)
@@ -158,7 +158,7 @@ def _places_of_codes(profile: PatchProfile) -> NDArray[np.intp]:
 
 @functools.lru_cache(maxsize=64)
 def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
-    """Return the (U, K) numbers of the chunks that carry each code, counted from 0 in the order sent."""
+    """Return the (U, K) numbers of the chunks that carry the codes, counted from 0 in the order sent."""
     lines, per_line = profile.lines, profile.n_codes // profile.lines
     within = np.arange(per_line) // profile.codes_per_chunk
     chunks = np.arange(lines)[:, None] * profile.chunks_per_line + within
@@ -168,7 +168,7 @@ def chunk_of_code(profile: PatchProfile) -> NDArray[np.intp]:
 
 
 def chunk_indexer(profile: PatchProfile) -> Callable[[bytes], int]:
-    """Return a function from the payload of a chunk to its number, counted as in :func:`chunk_of_code`.
+    """Return a function that maps a chunk's payload to its number, counted as in :func:`chunk_of_code`.
 
     Numbers of ``n_chunks`` and above belong to chunks that the patch does not have. The function does not
     check the length of the payload.

@@ -83,7 +83,7 @@ class CodeScale:
 
 
 def as_baseline(baseline_ohm: ArrayLike) -> Float:
-    """Round R0 to REAL32, the precision that node and host use.
+    """Round R0 to REAL32, the precision that both node and host use.
 
     Args:
         baseline_ohm: any shape, ohm.
@@ -97,9 +97,9 @@ def as_baseline(baseline_ohm: ArrayLike) -> Float:
 def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> Codes:
     """Encode resistances.
 
-    +inf and NaN become open; zero and negative values become short. R/R0 outside lo … hi becomes over-range,
-    as does a measurement without a baseline (R0 not positive and finite). A value within half a step of the
-    range counts as inside it.
+    +inf and NaN become the code for open; zero and negative values become the code for short. R/R0 outside lo
+    … hi becomes the over-range code, as does a measurement without a baseline (R0 not positive and finite). A
+    value within half a step of the range counts as inside it.
 
     Args:
         resistance_ohm: any shape, ohm.
@@ -136,7 +136,7 @@ def decode(codes: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale) -> tuple
 
 
 class Decoder:
-    """Decoder that works like :func:`decode`, for many scans with the same baseline.
+    """Decoder equivalent to :func:`decode`, for many scans with the same baseline.
 
     Args:
         baseline_ohm: R0 in ohm, with the shape of the codes or broadcastable to it.

@@ -30,16 +30,17 @@ class DeviceTimeTracker:
     """Tracker that restores the upper bits of one stream's device times."""
 
     def __init__(self) -> None:
-        self._time_us = self._t_time_ns = 0  # newest unwrapped device time and its arrival; 0: none
+        self._time_us = self._t_time_ns = 0  # newest unwrapped device time, and when it arrived; 0 if none
 
     def reset(self) -> None:
-        """Discard the newest device time, because the node may have restarted."""
+        """Forget the newest device time, because the node may have restarted."""
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
         """Return the 32-bit device time nearest to the last device time plus the host time elapsed since.
 
-        The upper bits of the first time are taken from the host's clock, up to three seconds after the scan.
+        The upper bits of the first time come from the host's clock, which allows for a summary received up to
+        three seconds after the scan.
 
         Args:
             low_us: low bits of the time from a checked summary, µs.

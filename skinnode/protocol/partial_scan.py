@@ -13,7 +13,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class HeldChunks:
-    """Known payloads of all chunks of a patch after its last scan.
+    """Last known payloads of all chunks of a patch.
 
     Args:
         profile: sizes of the patch.
@@ -26,11 +26,11 @@ class HeldChunks:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all payloads, because a scan that was not received may have changed them."""
+        """Forget all payloads, because a scan that was not received may have changed them."""
         self._payloads = [None] * self._profile.n_chunks
 
     def update(self, received: Sequence[bytes | None], *, carry: bool) -> None:
-        """Store the payloads of the scan that has ended.
+        """Store the payloads of a scan that has ended.
 
         Args:
             received: payload of each chunk; None where none arrived.

@@ -6,8 +6,8 @@ scan and carries a check over all codes of the matrix (:mod:`skinnode.protocol.s
 
 Over CAN FD a chunk is part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30 codes
 of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping padded to
-the next valid CAN FD length. A patch with more columns sends each wire in several chunks of sizes as equal as
-possible.
+the next valid CAN FD length. A patch with more columns splits each wire into several chunks, as equal in size
+as possible.
 
 ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).
@@ -106,7 +106,7 @@ class PatchProfile:
 
     @classmethod
     def from_config(cls, patch: PatchConfig, bus: BusConfig) -> PatchProfile:
-        """Return the profile that follows from the hand file for a patch on ``bus``."""
+        """Return the profile of a patch on ``bus``, both as configured in the hand file."""
         return cls.from_layout(patch.layout.build(), patch.code_bits, "fd" if bus.fd else "classic")
 
     @property
@@ -116,7 +116,7 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum bytes of a PDO, and maximum objects mapped into it, as the smallest object is one byte."""
+        """Maximum bytes per PDO and also maximum mapped objects, because the smallest object is one byte."""
         return 8 if self.bus == "classic" else 64
 
     @property
@@ -130,7 +130,7 @@ class PatchProfile:
 
     @property
     def lines(self) -> int:
-        """Number of code runs that are split into chunks: 1, or over CAN FD one per upper wire."""
+        """Number of runs of codes that are split into chunks: 1 or, over CAN FD, one per upper wire."""
         return 1 if self.bus == "classic" else self.rows
 
     @property
@@ -167,7 +167,7 @@ class PatchProfile:
 
     @property
     def default_inhibit_100us(self) -> int:
-        """Default inhibit time of TPDO1 (0x1800:3), 100 µs.
+        """Default inhibit time of TPDO1 (0x1800:3), in units of 100 µs.
 
         A full scan takes nine tenths of the default period, and the inhibit time is at most 1 ms.
         """

@@ -30,9 +30,9 @@ class Scan:
     chunks_received: int
     """Number of chunks that arrived."""
     device_time_us: int | None
-    """Node clock at the scan, µs, which wraps at 2³²; None if the summary was lost.
+    """Node time of the scan, µs, which wraps at 2³²; None if the summary was lost.
 
-    A checked summary carries this time in steps of 64 µs, and the host derives the upper 10 bits, at first
+    A checked summary carries this time in steps of 64 µs, and the host derives the upper 10 bits, initially
     from its own clock."""
     flags: int
     """Summary flags (:class:`~skinnode.protocol.summary.SummaryFlag`); 0 if the summary was lost."""
@@ -56,10 +56,10 @@ class AssemblerStats:
     scans_torn: int
     """Scans published with chunks missing."""
     scans_unchecked: int
-    """Scans published with all sent chunks but not as complete, because in a checked stream the summary was
-    lost or the codes of chunks that were not sent again are unknown."""
+    """Scans that contain all sent chunks but were not published as complete, because, in a checked stream,
+    the summary was lost or the codes of chunks that were not sent again are unknown."""
     scans_missed: int
-    """Scans of which no frame was received, counted by the gaps between counters."""
+    """Scans of which no frame was received, counted from gaps in the counters."""
     scans_discarded: int
     """Scans that were open at a reset and never published."""
     scans_mixed: int
@@ -67,22 +67,22 @@ class AssemblerStats:
     scans_corrupt: int
     """Scans discarded because their check failed, so the codes differ from the codes that the node packed."""
     scans_joined: int
-    """Scans in progress when reception began, which were only partly received and never published."""
+    """Scans that were in progress when reception began, so were received only in part and never published."""
     chunks_accepted: int
     """* Chunks assigned to a scan."""
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing when their scan was published; excludes chunks of missed scans, and of scans without a
-    summary while only changed chunks are sent."""
+    """Chunks missing when their scan was published. Chunks of missed scans are excluded, and chunks of scans
+    without a summary while only changed chunks are sent."""
     summaries_lost: int
     """Summaries missing when their scan was published."""
     duplicates: int
-    """* Frames with the same scan, index and content as an earlier frame."""
+    """* Frames with the same scan counter, index and content as an earlier frame."""
     conflicts: int
     """* Frames of the open scan that repeat an index with different content; the scan is discarded."""
     late: int
-    """* Frames of a scan that was published without them, or of an older scan."""
+    """* Frames that belong to a scan already published without them, or to an older scan."""
     bad_length: int
     """* Frames whose length is not valid for a chunk or summary."""
     bad_index: int

@@ -40,8 +40,8 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
        of a different scan therefore fails the check.
 
     The check always detects changes within a span of 16 bits, such as a change of one 16-bit code, and any
-    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. Of all
-    other damage it misses one case in 65,536.
+    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. It misses
+    one in 65,536 of all other errors.
 
     Args:
         check_of_codes: result of :func:`check_of_codes`.

@@ -34,7 +34,7 @@ class SelfTest(NamedTuple):
     faults: SelfTestFault
     readings: int
     noise: float
-    """RMS of the crossings' relative standard deviations."""
+    """RMS of the relative standard deviations of all crossings."""
     open_wires: int
     shorted_wires: int
     out_of_range: int

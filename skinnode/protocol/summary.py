@@ -23,7 +23,7 @@ class SummaryFlag(enum.IntFlag):
     """Flags of a scan summary. Bits without a name are sent as 0 and ignored."""
 
     CHANGED_ONLY = 0x01
-    """Only changed chunks were sent; all other chunks are as in the previous scan."""
+    """Only changed chunks were sent; all other chunks are the same as in the previous scan."""
     OVERRUN = 0x02
     """Some chunks were not sent before the next SYNC, and their codes are unknown."""
     WIRE_FAULT = 0x04
@@ -54,7 +54,7 @@ class Summary(NamedTuple):
     :attr:`SummaryFlag.CHECKED`."""
 
 
-_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time for an enum flag
+_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time of testing an enum flag
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
@@ -100,7 +100,7 @@ def pack_checked_summary(
 
 
 def pack_summary_record(payload: bytes, device_time_us: int) -> bytes:
-    """Return the concatenated sub-objects of the record 0x2011 that belongs to a summary.
+    """Return the concatenated sub-objects of the record 0x2011 for a summary.
 
     Args:
         payload: the payload of TPDO2.

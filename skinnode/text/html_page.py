@@ -31,7 +31,7 @@ def page(title: str, style: str, body: Iterable[str]) -> str:
     Args:
         title: Untrusted text.
         style: CSS.
-        body: HTML elements, in which untrusted text is already escaped by :func:`escaped`.
+        body: HTML elements; untrusted text in them must already be escaped by :func:`escaped`.
     """
     return _PAGE.substitute(title=escaped(title), style=style, body="\n".join(body))
 

@@ -1,4 +1,4 @@
-r"""Makes untrusted text printable; decides alone what may reach a terminal, a log or a page.
+r"""Makes untrusted text printable; only this module decides what may reach a terminal, a log or a page.
 
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
@@ -6,12 +6,12 @@ Text from a device, a file, a recording or the command line is untrusted. The ru
   (:func:`printable`). The bytes themselves are preserved in ``od --json``, in a DCF and in comparisons.
 * Names in hand.toml are rejected unless they are printable (``skinnode.config``).
 * The output of every command passes through :class:`PrintableStream`, and rich output through the console of
-  ``skinnode.cli``: a safety net for echoed text such as file names and arguments.
+  ``skinnode.cli``. This is a safety net for echoed text such as file names and arguments.
 * Pages also escape HTML, and untrusted text is never interpreted as markup.
 
 Printable is defined by :meth:`str.isprintable`: no control characters (C0, DEL, C1), no format characters
-(which reverse the direction of text or have no width, for example), no surrogates. Other characters are
-shown as Python escapes: ``\x1b``, ``\u202e``.
+(some of which reverse the direction of text or have no width) and no surrogates. Other characters are shown
+as Python escapes: ``\x1b``, ``\u202e``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum characters shown of an untrusted text; longer than any name, but short enough for one line."""
+"""Maximum number of characters shown from an untrusted text; longer than any name, but short enough for one
+line."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
 _SUSPECT_IN_LINES: Final = re.compile(r"[^\n\t -~]")
@@ -56,7 +57,7 @@ def _escaped(found: re.Match[str]) -> str:
 class PrintableStream:
     """Text stream wrapper, for stdout for example, that escapes control characters.
 
-    Output of rich must bypass the wrapper and does so through the attribute ``rich_proxied_file``.
+    Output from rich must bypass the wrapper, and does so through the attribute ``rich_proxied_file``.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -9,7 +9,7 @@ def counted(number: int, one: str, several: str = "") -> str:
     Args:
         number: The number.
         one: The noun in the singular.
-        several: The noun in the plural; default ``one`` with an s appended.
+        several: The noun in the plural; by default ``one`` with an s appended.
     """
     return f"{number} {one}" if number == 1 else f"{number} {several or one + 's'}"
 

@@ -1,1 +1,1 @@
-"""Old paths of :mod:`skinnode.protocol`, for one version."""
+"""Old import paths of :mod:`skinnode.protocol`, kept for one version."""

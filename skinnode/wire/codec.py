@@ -1,4 +1,4 @@
-"""Old path of :mod:`skinnode.protocol.codec`, for one version."""
+"""Old import path of :mod:`skinnode.protocol.codec`, kept for one version."""
 
 from skinnode.moved import moved
 

@@ -63,7 +63,7 @@ def test_load_of_can_fd_is_the_worst_case_too() -> None:
     table["sync"] = {"period_ms": 6}
     assert only_plan(table).load == pytest.approx(expected_s / 0.006 + RESERVE, rel=1e-12)
     table["buses"][0]["data_bitrate_bps"] = 2_000_000
-    with pytest.raises(BusLoadError, match=r"2000000 bit/s of data.*sync\.period_ms = \d+"):
+    with pytest.raises(BusLoadError, match=r"2000000 bit/s in the data phase.*sync\.period_ms = \d+"):
         check_plan(parse_hand(table))
 
 
@@ -97,7 +97,7 @@ def test_plan_that_does_not_fit_its_bus() -> None:
     # 27335 bits of 20000 in 80 ms are 136.68 %, EMCY and heartbeats 4 × 0.16 %, SDO 1 %
     assert str(caught.value) == (
         "hand.toml: buses[0] (can0): got a plan that needs 138.3% of 250000 bit/s, "
-        "allowed: at most 70.0% (max_load); sync.period_ms = 160 or fewer patches would do"
+        "allowed: at most 70.0% (max_load); sync.period_ms = 160 or fewer patches would suffice"
     )
     assert (caught.value.needed, caught.value.available) == (pytest.approx(1.38315), 0.70)
     with pytest.raises(BusLoadError), Host.from_config(hand):
@@ -113,17 +113,17 @@ def test_plan_that_does_not_fit_its_bus() -> None:
 
 def test_a_bus_that_others_fill() -> None:
     others = [{"can_id": 0x300 + i, "length": 8, "period_ms": 1.0} for i in range(6)]  # 6 × 13.5 %
-    with pytest.raises(BusLoadError, match=r"needs 116\.\d%.*; fewer patches would do"):
+    with pytest.raises(BusLoadError, match=r"needs 116\.\d%.*; fewer patches would suffice"):
         check_plan(parse_hand(minimal(others=others)))
 
 
 def test_what_would_do_is_what_may_be_changed() -> None:
     one = minimal(bitrate_bps=250_000) | {"sync": {"period_ms": 20}}
     one["patches"] = one["patches"][:1]
-    with pytest.raises(BusLoadError, match=r"\(max_load\); sync.period_ms = \d+ would do$"):
+    with pytest.raises(BusLoadError, match=r"\(max_load\); sync.period_ms = \d+ would suffice$"):
         check_plan(parse_hand(one))
     one["buses"][0] |= {"role": "guest", "guest_sends": "sdo"}
-    with pytest.raises(BusLoadError, match=r"\(max_load\); a master's SYNC every \d+ ms would do$"):
+    with pytest.raises(BusLoadError, match=r"\(max_load\); a master's SYNC every \d+ ms would suffice$"):
         check_plan(parse_hand(one))
 
 
@@ -159,7 +159,7 @@ def test_another_frame_with_an_identifier_of_ours(tmp_path: Path) -> None:
         plan_of(load_hand(path))
     assert str(caught.value) == (
         f"{path}:4:5: buses[0].others[0].can_id: got 0x181, "
-        "allowed: an identifier that is not that of our chunks of thumb, nor of another of these"
+        "allowed: an identifier that is unique on the bus; this one is used for chunks of thumb"
     )
 
 
@@ -180,7 +180,7 @@ def test_every_identifier_of_ours_is_ours(can_id: int, whose: str) -> None:
     """Those of the pre-defined connection set (CiA 301 v4.2, 7.3.3) that our nodes send or take."""
     table = minimal(heartbeat_node_id=127, others=[{"can_id": can_id, "period_ms": 50.0}])
     table["patches"] = [{"name": "a", "node_id": 3}, {"name": "b", "node_id": 7}]
-    with pytest.raises(ConfigError, match=f"got 0x{can_id:03X}, allowed: .* not that of our {whose}, "):
+    with pytest.raises(ConfigError, match=f"got 0x{can_id:03X}, allowed: .* this one is used for {whose}$"):
         plan_of(parse_hand(table))
 
 

@@ -15,10 +15,10 @@ def test_every_code_of_the_node_has_words_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("code", "detail", "text"),
     [
-        (0x5000, "02 07 03 00", "wire open or shorted: lower wire open 7, 3 wires in all"),
+        (0x5000, "02 07 03 00", "wire open or shorted: lower wire open 7, 3 wires in total"),
         (0x5000, "01 00", "wire open or shorted: upper wire shorted 0"),
-        (0x8130, "2a 00", "heartbeat or guarding lost: of node 42"),
-        (0x8130, "00 00", "heartbeat or guarding lost: of the master"),
+        (0x8130, "2a 00", "heartbeat or guarding lost: node 42"),
+        (0x8130, "00 00", "heartbeat or guarding lost: master"),
         (0x8110, "05 01 00 00 00", "overrun: messages or scans lost: 261 scans skipped so far"),
         (
             0x8110,

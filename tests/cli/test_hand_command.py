@@ -84,7 +84,7 @@ def test_too_much_for_a_bus_is_shown_and_refused(tmp_path: Path) -> None:
     assert "SYNC to summary" in found.stdout
     assert found.stderr == (
         f"error: {path}:1:1: buses[0] (can0): got a plan that needs 86.7% of 1000000 bit/s, "
-        "allowed: at most 70.0% (max_load); sync.period_ms = 100 or fewer patches would do\n"
+        "allowed: at most 70.0% (max_load); sync.period_ms = 100 or fewer patches would suffice\n"
     )
     as_json = command("check", str(path), "--json")
     assert as_json.exit_code == 1
@@ -123,7 +123,7 @@ def test_files_that_a_hand_names_are_read(key: str, tmp_path: Path) -> None:
         str(found.exception)
         == {
             "eds": f"{other}:1: EDS: got 'root:x:0:0:root:/root:/bin/bash', "
-            "allowed: a file as in CiA 306: [section] once each, key=value once each, ;comment",
+            "allowed: a file as in CiA 306: each [section] once, each key=value once, ;comment",
             "baseline": f"{other}: baseline, line 1: got 'root:x:0:0:root:/root:/bin/bash', "
             "allowed: 10 lines of 30 positive resistances in ohm",
         }[key]

@@ -204,8 +204,8 @@ def test_what_was_stored_is_there_at_the_next_start(
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("{", "/patch.json: no memory of a node"),
-        (None, "memory: it is of another patch, 'skinnode-10x30-u24"),
+        ("{", "/patch.json: not a node's memory, or incomplete"),
+        (None, "memory: it belongs to another patch, 'skinnode-10x30-u24"),
     ],
 )
 def test_a_memory_that_is_of_no_use_is_a_fault(
@@ -348,7 +348,7 @@ BAD = [
     ("my_sources:dead", "(source.read(): OSError: the converter does not answer)"),
     ("my_sources:broken", "(RuntimeError: no board at 0x48)"),
     ("my_sources:needs_more", "(TypeError: needs_more() missing 1 required positional argument: 'port')"),
-    ("my_sources:gives_nothing", "one that gives an object with read(t_ns), not None"),
+    ("my_sources:gives_nothing", "a source with a method read(t_ns), not None"),
     ("my_sources:LIST", "a class or a function that takes the layout"),
     ("my_sources:absent", "(AttributeError: module 'my_sources' has no attribute 'absent')"),
     ("absent:x", "(ModuleNotFoundError: No module named 'absent')"),
@@ -373,7 +373,9 @@ def test_a_bad_source_ends_with_status_2_before_a_frame_is_sent(
         out, err = process.communicate(timeout=30)
     assert (process.returncode, out) == (2, "")
     (line,) = err.splitlines()
-    assert line.startswith("error: --source: got 'my_sources:dead', allowed: one that reads (")
+    assert line.startswith(
+        "error: --source: got 'my_sources:dead', allowed: a source that returns readings ("
+    )
     assert master.port.recv(0.05) is None
 
 

@@ -169,7 +169,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["sync", "stagger_ms"],
             -1,
-            "sync.stagger_ms: got -1, allowed: a number of milliseconds of at least 0",
+            "sync.stagger_ms: got -1, allowed: a number of milliseconds, at least 0",
         ),
         (
             ["sync", "counter_overflow"],
@@ -211,7 +211,7 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
         (
             ["buses", 0, "heartbeat_node_id"],
             2,
-            "buses[0].heartbeat_node_id: got 2, allowed: an integer from 1 to 127 that no node has",
+            "buses[0].heartbeat_node_id: got 2, allowed: an integer from 1 to 127 that no node uses",
         ),
         (["stream", "partial"], "drop", "stream.partial: got 'drop', allowed: pass or withhold"),
         (
@@ -240,7 +240,11 @@ NAME = "a string of 1 to 64 printable characters, not all blank"
             [1.0, 1.01],
             "patches[0].calibration.upper_gain: got [1.0, 1.01], allowed: 10 numbers, one per upper wire",
         ),
-        (["simulation", "depth"], 1.0, "simulation.depth: got 1.0, allowed: a number from 0 to below 1"),
+        (
+            ["simulation", "depth"],
+            1.0,
+            "simulation.depth: got 1.0, allowed: a number of at least 0 and below 1",
+        ),
     ],
 )
 def test_one_line_a_mistake(path: list[str | int], value: Any, line: str) -> None:
@@ -352,7 +356,7 @@ def test_nesting_has_an_end(text: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_hand(path)
     assert str(caught.value) == (
-        f"{path}: hand file: got deeper nesting, allowed: tables and arrays nested up to 32 deep"
+        f"{path}: hand file: got deeper nesting, allowed: tables and arrays nested at most 32 deep"
     )
 
 

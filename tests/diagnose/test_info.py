@@ -43,7 +43,7 @@ def test_tells_what_is_in_the_node(any_bus: BusConfig, powered: Powered, connect
     assert (found.vendor_id, found.product_code, found.serial) == (0, 0x534B494E, 4711)
     assert found.heartbeats_watched == ("node 9 within 1500 ms",)
     assert found.storing == "on command; no verified configuration (0x1020)"
-    assert found.errors == ("0x8240 SYNC of unexpected length: 1 byte in place of 0",)
+    assert found.errors == ("0x8240 SYNC of unexpected length: 1 byte instead of 0",)
     assert found.pdo_texts[0] == (
         "TPDO1 0x185, on event, 1 ms apart at least, sent every 500 ms at least, 8 bytes: "
         "Chunk index; Chunk scan counter; Code 1 to 3"

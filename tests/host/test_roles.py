@@ -331,7 +331,7 @@ def test_a_patch_without_its_node_id_is_found_by_its_serial_number(
         (
             {"heartbeat_node_id": 6},
             {},
-            "buses[0].heartbeat_node_id: got 6, allowed: an integer from 1 to 127 that no node has",
+            "buses[0].heartbeat_node_id: got 6, allowed: an integer from 1 to 127 that no node uses",
         ),
         (
             {},

@@ -102,7 +102,7 @@ class TestFilesOfNoUse:
         document = json.loads(pack(KEPT))
         document["content"][key] = value
         document["checksum"] = memory_file._checksum(document["content"])
-        with pytest.raises(MemoryFault, match="no memory of a node"):
+        with pytest.raises(MemoryFault, match="not a node's memory, or incomplete"):
             unpack(json.dumps(document).encode())
 
     def test_another_format(self, path: Path) -> None:

@@ -280,7 +280,7 @@ def test_value_that_is_not_allowed_any_more(
     frames = cycle(desk)
     assert frames[0] == (0x704, "00")  # the boot-up message comes first
     assert emergencies(frames) == [f"00 63 81 04 {told} 00", OVER]
-    assert desk.node.memory_problem == f"0x{key[0]:04X}:{key[1]} as stored is not allowed"
+    assert desk.node.memory_problem == f"the stored value of 0x{key[0]:04X}:{key[1]} is not allowed"
     assert desk.read(0x1017, 0) == 100
     assert desk.read(0x1019, 0) == 0
     assert desk.read(0x1014, 0) == 0x84

@@ -15,11 +15,11 @@ from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16
-"""Readings averaged into a baseline; its noise is a quarter of a reading's and adds 3 % to that of R/R0."""
+"""Readings averaged for a baseline; its noise is 1/4 of a reading's and adds 3 % to the noise of R/R0."""
 
 
 class Acquisition:
-    """Acquisition, which reads a source and keeps the last codes and the baseline.
+    """Acquisition stage that reads a source and keeps the last codes and the baseline.
 
     Args:
         profile: sizes of the patch.
@@ -28,7 +28,7 @@ class Acquisition:
         baseline_ohm: (U, K) initial R0, ohm; None if there is no baseline yet.
 
     Raises:
-        ValueError: if the baseline has another shape or a negative value.
+        ValueError: if the baseline has the wrong shape or a negative value.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Acquisition:
         """(U, K) codes of the last scan; all open before the first scan."""
         self.faults = WireFaults.none(profile)
         """Wire faults of the last scan."""
-        self._sent: Codes | None = None  # codes that the host holds, chunk by chunk; None if unknown
+        self._sent: Codes | None = None  # codes last sent, which the host holds; None if unknown
         self._since_full = 0
 
     def read(self, t_ns: int) -> Float:
@@ -94,7 +94,7 @@ class Acquisition:
         """
         with np.errstate(
             over="ignore", under="ignore"
-        ):  # values that REAL32 cannot hold do not count as resistances
+        ):  # values that REAL32 cannot hold are not valid resistances
             mean = (self._total(t_ns, readings) / readings).astype(np.float32)
         measured = np.isfinite(mean) & (mean > 0)
         self.baseline_ohm = np.where(measured, mean, self.baseline_ohm)
@@ -115,7 +115,7 @@ class Acquisition:
 
     @property
     def sent(self) -> Codes:
-        """(U, K) codes sent last in each chunk, if :meth:`changed_chunks` selects the chunks."""
+        """(U, K) codes last sent in each chunk, if :meth:`changed_chunks` selects the chunks."""
         return self.codes if self._sent is None else self._sent
 
     def forget_sent(self) -> None:

@@ -73,7 +73,7 @@ class PatchApplication:
         self._baseline_changed = False
         self._test = SELF_TEST_NEVER_RUN
         self.overruns = 0
-        """Number of scans skipped because two earlier scans had not been sent yet."""
+        """Number of scans skipped because two earlier scans were still unsent."""
         self.slow_overruns = 0
         """Number of overruns caused by a slow computer or bus, not by a scan period that is too short."""
         self._scan_ns = NO_DEADLINE_NS  # time of the next scan triggered by the node's own timer
@@ -127,7 +127,7 @@ class PatchApplication:
             t_ns: when the SYNC was received, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # otherwise the summary of this scan comes first
+        if not scans or self.stream.full:  # otherwise this scan's summary is sent first
             self.stream.on_sync(turns, t_ns)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
@@ -162,7 +162,7 @@ class PatchApplication:
         self._storage.report(self._now())
 
     def _mark_baseline(self) -> None:
-        """Have the next summary announce that the baseline has changed."""
+        """Make the next summary announce that the baseline has changed."""
         self._baseline_changed = True
 
     # --- scans
@@ -193,7 +193,7 @@ class PatchApplication:
             self._end_overrun(t_ns)
 
     def _end_overrun(self, t_ns: int) -> None:
-        """Report the end of an overrun, because the next scan has room or no scan is due."""
+        """Report the end of an overrun: the queue has room for the next scan, or no scan is due."""
         self._late = False
         self._emcy.clear(EmcyCode.CAN_OVERRUN, t_ns)
 
@@ -249,7 +249,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If SYNC numbers the scans, a receiver would mistake this scan for the next SYNC's scan.
+                # If SYNC numbers the scans, a receiver would take this scan for that of the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

@@ -44,8 +44,8 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
     """Create a source for a patch, and read it once to detect faults before the node is on the bus.
 
     Args:
-        name: name of an entry point, or ``MODULE:NAME``, of a class or function that takes the layout and
-            returns a :class:`~skinnode.node.patch.source.ResistanceSource`.
+        name: entry point, or ``MODULE:NAME``, of a class or function that takes the layout and returns a
+            :class:`~skinnode.node.patch.source.ResistanceSource`.
         layout: the electrodes of the patch.
         option: option name shown in the error.
 
@@ -65,13 +65,13 @@ def make_source(name: str, layout: PatchLayout, option: str = "source") -> Resis
     try:
         source: ResistanceSource = factory(layout)
     except (Exception, SystemExit) as error:
-        raise ConfigError(option, name, f"one that takes the layout ({_line(error)})") from error
+        raise ConfigError(option, name, f"a source that can be created ({_line(error)})") from error
     if not callable(getattr(source, "read", None)):
-        raise ConfigError(option, name, f"one that gives an object with read(t_ns), not {source!r:.80}")
+        raise ConfigError(option, name, f"a source with a method read(t_ns), not {source!r:.80}")
     try:
         read_source(source, layout.shape, time.monotonic_ns())
     except SourceFailed as failure:
-        raise ConfigError(option, name, f"one that reads ({failure})") from failure
+        raise ConfigError(option, name, f"a source that returns readings ({failure})") from failure
     return source
 
 

@@ -1,4 +1,4 @@
-"""Bindings of a running patch's manufacturer objects (0x2000 to 0x2301) to the values behind them."""
+"""Bindings of a running patch's manufacturer objects (0x2000 to 0x2301) to their values."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _bind_baseline_row(
 
 
 def _fault_word(masks: tuple[Mask, ...], subindex: int) -> bytes:
-    """Return a word of 32 wires: open wires at odd sub-indices, shorted wires at even sub-indices."""
+    """Return a mask of 32 wires: open wires at odd sub-indices, shorted wires at even sub-indices."""
     first = (subindex - 1) // 2 * 32
     bits = masks[(subindex - 1) % 2][first : first + 32]
     return np.packbits(bits, bitorder="little").tobytes().ljust(4, b"\0")

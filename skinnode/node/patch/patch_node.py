@@ -27,7 +27,7 @@ class PatchNode(CanopenDevice):
     """CANopen node of one patch. It sends nothing until :meth:`power_on`.
 
     Args:
-        node_id: 1 to 127, or 255 to receive a node-ID by LSS. A node-ID that LSS stored in the memory takes
+        node_id: 1 to 127, or 255 to obtain a node-ID by LSS. A node-ID that LSS stored in the memory takes
             precedence.
         layout: electrodes of the patch, which determine the sizes of the object dictionary.
         source: analogue port of the patch, read once per scan.
@@ -107,7 +107,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def overruns(self) -> int:
-        """Number of scans skipped because two earlier scans had not been sent yet."""
+        """Number of scans skipped because two earlier scans were still unsent."""
         return self._patch.overruns
 
     @property

@@ -5,10 +5,11 @@ SYNC that started the scan. TPDOs whose first object is 0x2011 carry the summary
 event-driven TPDOs immediately, synchronous TPDOs immediately if they were due at that SYNC, otherwise at the
 next SYNC at which they are due. Event-driven TPDOs of other objects are also sent after the chunks.
 
-Pacing. The standard defines the inhibit time as a minimum interval. A thread of a general-purpose system
-wakes late, and with a strict minimum interval a scan would exceed its SYNC period. Lateness of up to
-``catch_up_ns`` is therefore compensated, if necessary with several frames at once, and the mean rate is never
-exceeded (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum interval is strict.
+Pacing. The standard defines the inhibit time as a minimum interval. On a general-purpose operating system, a
+thread wakes late, so with a strict minimum interval a scan would take longer than its SYNC period. The stream
+therefore compensates for lateness of up to ``catch_up_ns``, if necessary with several frames at once, but
+never exceeds the mean rate (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum
+interval is strict.
 
 The node knows the time of a SYNC, but not how long sampling then takes. It therefore requests a timer event
 right after the first chunk of a scan. This event supplies the current time, from which the interval to the
@@ -18,8 +19,9 @@ Synchronous TPDOs obey the synchronous window (0x1007): chunks and a summary not
 are discarded. The window does not apply to event-driven TPDOs.
 
 A scan offered while another is being sent waits until that scan ends; only one scan can wait. Chunks of two
-scans are never interleaved. A scan that has begun is sent completely unless the node leaves OPERATIONAL,
-which omits its summary, or its chunk TPDO is disabled, which its summary shows.
+scans are never interleaved. A scan that has begun is sent completely, with two exceptions: if the node leaves
+OPERATIONAL, the summary is not sent; if the chunk TPDO is disabled, the summary shows that chunks are
+missing.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Fraction of the sending time lost above which chunks count as delayed; thread jitter stays below this."""
+"""Fraction of the sending time that may be lost before chunks count as delayed; thread jitter loses less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ class ScanStream:
         self._verbatim = False  # whether the carrier maps the whole record unchanged
         self._chunks_sent = 0
         self._just_begun = False
-        self._busy_ns = 0  # start of the current run of scans without a pause
+        self._busy_ns = 0  # start of the current run of back-to-back scans
         self._paced_ns = 0  # sum of the inhibit times since then
         self.chunk = chunk
         """Chunk record sent last."""
@@ -133,7 +135,7 @@ class ScanStream:
         self._scan = self._next_scan = self._carrier = None
 
     def on_sync(self, turns: Collection[int], t_ns: int) -> None:
-        """Send waiting summaries at a SYNC that starts no scan."""
+        """Send waiting summaries at a SYNC that does not start a scan."""
         for tpdo in self._tpdos.owned(od.SUMMARY):
             if tpdo.waiting and tpdo.number in turns:
                 self._tpdos.transmit(tpdo, t_ns)
@@ -179,7 +181,7 @@ class ScanStream:
                 self._carrier, self._verbatim = tpdo, self._carries_record(tpdo)
                 tpdo.waiting = False
                 self._unsent.extend(scan.chunks)
-                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # a pause does not allow a burst
+                tpdo.ready_ns = max(tpdo.ready_ns, t_ns)  # a pause must not be followed by a burst
                 return
 
     def _carries_record(self, tpdo: Tpdo) -> bool:

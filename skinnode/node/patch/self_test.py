@@ -28,7 +28,7 @@ NOISE_LIMIT: Final = 1e-3
 accuracy is specified."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # for values that no converter returns
+@np.errstate(over="ignore", invalid="ignore")  # only for values that no converter returns
 def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) -> SelfTest:
     """Test a patch.
 
@@ -74,7 +74,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the RMS relative standard deviation of (readings, crossings); 0 without crossings."""
+    """Return the RMS over the crossings of the readings' relative standard deviation; 0 without crossings."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

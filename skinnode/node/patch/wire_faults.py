@@ -31,13 +31,13 @@ class WireFaults:
 
     @classmethod
     def none(cls, profile: PatchProfile) -> WireFaults:
-        """Return the value for a patch without faults."""
+        """Return the wire faults of a patch that has none."""
         rows, columns = np.zeros(profile.rows, dtype=np.bool_), np.zeros(profile.columns, dtype=np.bool_)
         return cls(rows, rows, columns, columns)
 
     @property
     def masks(self) -> tuple[Mask, Mask, Mask, Mask]:
-        """The masks in the order upper open, upper shorted, lower open, lower shorted."""
+        """Masks in the order upper open, upper shorted, lower open, lower shorted."""
         return self.upper_open, self.upper_short, self.lower_open, self.lower_short
 
     @property
@@ -58,7 +58,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
 
 class WireFaultReporter:
-    """Reporter of new wire faults and of the end of faults.
+    """Reporter of wire faults when they occur and when they end.
 
     Args:
         profile: sizes of the patch.
@@ -70,7 +70,7 @@ class WireFaultReporter:
         self._reported = WireFaults.none(profile)
 
     def reset(self) -> None:
-        """Discard the reported faults after a reset."""
+        """Forget the reported faults after a reset."""
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:

@@ -1,6 +1,6 @@
-"""PDO parameters: values allowed in writes, and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
+"""PDO parameters: the values that may be written, and their meaning (CiA 301 v4.2, 7.5.2.33 to 7.5.2.38).
 
-Where the standard does not define an abort code, the abort code of CANopenNode is used.
+Where the standard does not define an abort code, the abort code that CANopenNode sends is used.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ INVALID_BIT: Final = od.PDO_INVALID
 NO_RTR_BIT: Final = 1 << 30
 """Bit of a COB-ID that forbids remote frames."""
 EXTENDED_BIT: Final = 1 << 29
-"""Bit of a COB-ID with a 29-bit CAN-ID."""
+"""Bit of a COB-ID that marks a 29-bit CAN-ID."""
 COB_ID_MASK: Final = 0x7FF
 """Bits of a COB-ID that hold an 11-bit CAN-ID."""
 SYNC_CYCLIC_MAX: Final = 240
@@ -27,7 +27,7 @@ SYNC_REMOTE, REMOTE = 252, 253
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 
-_MOST_MAPPED: Final = 64  # entries of a mapping record
+_MOST_MAPPED: Final = 64  # maximum number of entries in a mapping record
 
 _TRANSMITTED: Final = ("const", "ro", "rw", "rwr")
 _RECEIVED: Final = ("wo", "rw", "rww")
@@ -51,7 +51,8 @@ def check_cob_id(value: int, current: int) -> None:
         current: the current COB-ID.
 
     Raises:
-        Refused: if no configurable service may use the new COB-ID, or if it differs while the old is in use.
+        Refused: if no configurable service may use the new COB-ID, or if the CAN-ID changes while it is in
+            use.
     """
     if value & EXTENDED_BIT or value & ~(INVALID_BIT | NO_RTR_BIT) > COB_ID_MASK:
         raise Refused(AbortCode.INVALID_VALUE)
@@ -111,7 +112,7 @@ class PdoRecords:
         parameter: index of the communication record.
         mapping: index of the mapping record.
         transmits: whether the PDO is a TPDO.
-        taken: returns whether another PDO uses a CAN-ID; None if several PDOs may share one.
+        taken: returns whether another PDO uses a CAN-ID; None if several PDOs may share a CAN-ID.
     """
 
     def __init__(
@@ -196,7 +197,7 @@ class PdoRecords:
             raise Refused(AbortCode.PDO_TOO_LONG)
 
     def _mapped_bytes(self, word: int) -> int:
-        """Return the bytes of the object that a mapping entry names."""
+        """Return the length in bytes of the object that a mapping entry names."""
         index, subindex, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
         if not self._transmits and not subindex and index in od.DUMMY_BITS:
             allowed, size = True, od.DUMMY_BITS[index]

@@ -1,9 +1,9 @@
 """RPDO engine, which writes received PDOs to the object dictionary (CiA 301 v4.2, 7.2.2 and 7.5.2.33).
 
-At each SYNC, types 0 to 240 apply the last PDO received within the synchronous window (0x1007); types 254 and
-255 apply a PDO immediately. Bytes beyond the mapping are ignored, and a PDO that is too short is not applied.
-EMCY reports each of these errors once, until the length is right again. In OPERATIONAL, an event timer
-monitors its RPDO from the first PDO received.
+RPDOs of types 0 to 240 apply, at each SYNC, the last PDO received within the synchronous window (0x1007);
+RPDOs of types 254 and 255 apply a PDO immediately. Bytes beyond the mapping are ignored, and a PDO that is
+too short is not applied. Each of these errors is reported by EMCY once, and again only after a PDO of the
+right length. In OPERATIONAL, an event timer monitors its RPDO from the first PDO received.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _Rpdo:
         self.fields = self._fields()
 
     def _fields(self) -> list[tuple[int, int, int, int]]:
-        """Return index, sub-index, first byte and exclusive end of each mapped object except dummies."""
+        """Return the index, sub-index, first byte and exclusive end of each mapped object except dummies."""
         at, fields = 0, []
         for each in self.parameters.mapping:
             if each.index not in od.DUMMY_BITS:
@@ -116,7 +116,8 @@ class RpdoEngine:
     def enter(self, *, operational: bool) -> None:
         """Handle a change of the NMT state by dropping received PDOs and stopping the monitoring.
 
-        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so no RPDO stays late.
+        Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so no RPDO remains marked as
+        late.
         """
         self._operational = operational
         self._pending.clear()
@@ -125,7 +126,7 @@ class RpdoEngine:
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
-        """Handle a frame that may be an RPDO, or several RPDOs that share the COB-ID.
+        """Handle a frame that may be an RPDO, or be several RPDOs that share its COB-ID.
 
         Args:
             cob_id: identifier of the frame.

@@ -11,11 +11,11 @@ type       sent
            never before the inhibit time has passed
 =========  =======================================================================================
 
-If the application has *claimed* the first object of a TPDO, the application sends that TPDO when a SYNC or an
-event would. The engine still counts SYNCs for it and serves its remote frames and event timer.
+If the application has *claimed* the first object of a TPDO, the application sends that TPDO, and SYNCs and
+events do not trigger it. The engine still counts its SYNCs and serves its remote frames and event timer.
 
-The cost of a SYNC grows with the number of enabled TPDOs that respond to SYNC, and the cost of a timer event
-with the number of due TPDOs. Other TPDOs cost nothing.
+The time to handle a SYNC grows with the number of enabled TPDOs that respond to SYNC, and the time to handle
+a timer event with the number of TPDOs that are due. Other TPDOs take no time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Tpdo:
         self.waiting = False
         """Whether values are waiting for a SYNC or for the end of the inhibit time."""
         self.last: bytes | None = None
-        """Payload sent last; for type 252 the payload sampled last."""
+        """Last payload sent or, for type 252, sampled."""
         self.owner: Owner | None = None
         """Part of the application that sends the TPDO; None if the engine sends it."""
         self._in_step = False
@@ -90,7 +90,7 @@ class Tpdo:
         self.timer_ns = t_ns + parameters.event_timer_ns if timed else NO_DEADLINE_NS
 
     def elapse(self, t_ns: int) -> None:
-        """Restart the elapsed event timer, without drift and without bursts if served late."""
+        """Restart the elapsed event timer, without drift, and without a burst if it was served late."""
         self.timer_ns += self.parameters.event_timer_ns
         if self.timer_ns <= t_ns:
             self.start_timer(t_ns)
@@ -121,7 +121,7 @@ class Owner(Protocol):
     """Part of the application that sends the TPDOs of the objects it has claimed."""
 
     def sends(self, tpdo: Tpdo) -> bool:
-        """Return whether the owner is about to send this TPDO anyway."""
+        """Return whether the owner is about to send this TPDO without a request."""
         ...
 
     def on_reload(self, tpdo: Tpdo) -> None:
@@ -146,7 +146,7 @@ class TpdoEngine:
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()
-        # Numbers of enabled TPDOs, ascending: on SYNC, on events, and with an owner.
+        # Numbers of enabled TPDOs, ascending: those sent on SYNC, on events, and by an owner.
         self._listening: list[int] = []
         self._eventful: list[int] = []
         self._owned: list[int] = []

@@ -1,8 +1,9 @@
 """SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
 
 CAN delivers a frame twice if the last bit of its end of frame is disturbed (ISO 11898-1), and a frame does
-not identify its block. A repeated acknowledgement taken for the next block's would therefore skip segments.
-For this reason a frame equal to the previous frame is ignored unless the protocol allows a repetition there.
+not identify its block. If a repeated acknowledgement were taken for that of the next block, segments would be
+skipped. For this reason a frame equal to the previous frame is ignored unless the protocol allows a
+repetition there.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ SEGMENT_NS: Final = 500_000
 """Minimum mean time between two segments, ns.
 
 PDOs may use 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this pace uses 2000, so the
-transmit queue, which PDOs share, does not fill. A block takes 64 ms, or 100 ms if the thread wakes late;
-clients wait at least 300 ms (canopen library) for a frame. Each time the bus refuses a segment, as slower
-buses do, the time is doubled for the rest of the transfer.
+transmit queue, which is shared with PDOs, does not fill up. A block takes 64 ms, or 100 ms if the thread
+wakes late; clients wait at least 300 ms (canopen library) for a frame. Each time the bus refuses a segment,
+as slower buses do, the time is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean time between two segments, ns: a quarter of a 125 kbit/s bus. If the bus refuses segments even
-at this pace, the pace is not the cause."""
+"""Maximum mean time between two segments, ns, which takes a quarter of a 125 kbit/s bus. If the bus refuses
+segments even at this pace, the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
 """Maximum segments sent per timer event, to compensate for a thread that wakes late (2 ms by default).
 
@@ -57,7 +58,7 @@ class _Client(IntEnum):
 
 
 class _Upload(Enum):
-    """Event that a block upload waits for."""
+    """Event for which a block upload waits."""
 
     START = auto()
     TIME = auto()
@@ -95,9 +96,9 @@ class BlockUpload(Transfer):
         super().__init__(channel, target, t_ns)
         data, crc = upload.data, upload.crc
         self._data, self._crc = data, crc
-        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value also takes a segment
+        self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value also takes one segment
         self._block_size = _checked(upload.block_size)
-        self._first = 0  # segments before the current block
+        self._first = 0  # segments sent before the current block
         self._sent = 0  # segments of the current block
         self._pace_ns = SEGMENT_NS
         self._waits_for = _Upload.START
@@ -176,8 +177,8 @@ class BlockUpload(Transfer):
 class BlockDownload(Transfer):
     """Block download, which sends the response to the initiate request itself.
 
-    Each block is acknowledged at its end with the number of the last segment before a gap. A client that does
-    not reach the end of a block runs into the time-out.
+    Each block is acknowledged at its end with the number of the last segment before a gap. If a client does
+    not reach the end of a block, the transfer times out.
 
     Args:
         channel: the server channel.
@@ -198,7 +199,7 @@ class BlockDownload(Transfer):
         self._crc = crc
         self._received = 0  # segments of the current block received without a gap
         self._last: bytes | None = (
-            None  # the last segment of the transfer; the end request says how much of it is data
+            None  # last segment of the transfer; the end request tells how much of it is data
         )
         self._previous = b""  # the last request, if it was acknowledged
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))
@@ -209,7 +210,7 @@ class BlockDownload(Transfer):
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
         """Handle a frame that belongs to the transfer; return whether the transfer is over."""
-        if self._last is not None and _is_end(request):  # first: the previous frame may be equal
+        if self._last is not None and _is_end(request):  # first, because the previous frame may be equal
             self._end(request, self._last)
             return True
         if request == self._previous:

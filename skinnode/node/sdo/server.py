@@ -18,7 +18,7 @@ from skinnode.node.sdo.block import BlockDownload, BlockUpload, Upload
 from skinnode.node.sdo.transfer import MULTIPLEXER, MULTIPLEXER_U32, Channel, Incoming, Target, Transfer
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""Maximum client pause before its transfer is aborted, ns; CiA 301 does not define this time."""
+"""Maximum pause of a client before its transfer is aborted, ns; CiA 301 does not define this time."""
 
 _TOGGLE: Final = 0x10
 
@@ -39,7 +39,7 @@ _NAMELESS: Final = (0, 3, 5, 6)
 
 
 class SdoServer:
-    """SDO server with one channel to the object dictionary, for one transfer at a time.
+    """SDO server with one channel to the object dictionary, which serves one transfer at a time.
 
     A new initiate request ends an unfinished transfer, because its client has given up. An error raised by
     ``send`` propagates to the caller, and the next call continues the transfer.
@@ -150,7 +150,7 @@ class SdoServer:
             self._transfer = _Download(self._channel, target, announced, t_ns)
             return
         store = self._channel.store
-        # Without a size in the request, the length of the object applies; a longer object takes four bytes.
+        # If the request gives no size, the length of the object applies, up to four bytes.
         index, subindex = target.index, target.subindex
         size = 4 - (command >> 2 & 3) if size_given else min(store.lengths(index, subindex).most, 4)
         store.write(index, subindex, request[4 : 4 + size])

@@ -40,7 +40,7 @@ class Target:
 
 
 class Transfer(ABC):
-    """Transfer of more than one request, which raises Refused to abort.
+    """Transfer that takes more than one request, and raises Refused to abort.
 
     Args:
         channel: the server channel.

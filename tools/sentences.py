@@ -29,7 +29,7 @@ class Sentence(NamedTuple):
 
 
 def sentences() -> list[Sentence]:
-    """Find all sentences, in the order of files and lines."""
+    """Find all sentences, ordered by file and line."""
     found: list[Sentence] = []
     for folder in ("skinnode", "vcan_sim", "tools"):
         for path in sorted((ROOT / folder).rglob("*.py")):

@@ -67,7 +67,7 @@ class Faults:
     duplicated: float = 0.0
     """The chunk is sent twice."""
     reordered: float = 0.0
-    """The chunk changes places with the next frame."""
+    """The chunk swaps places with the next frame."""
     late: float = 0.0
     """The chunk arrives after the first frame of the next scan."""
     short: float = 0.0

@@ -32,7 +32,7 @@ up to 270 frames, which fit the default receive buffer of a socket."""
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of events of one rate per turn; events beyond that are dropped."""
+"""Maximum number of events at one rate per turn; further events are dropped."""
 
 
 class Emit(Protocol):

@@ -63,7 +63,7 @@ class FaultyScans:
         self._packed: list[bytes] = []  # chunks of that scan, as the node packed them
         self._struck = -1  # index of the chunk that the scan's fault affects
         self._lost_next = -1  # index of the chunk that the next scan loses
-        self._swapped: bytes | None = None  # chunk that changes places with the next frame
+        self._swapped: bytes | None = None  # chunk that swaps places with the next frame
         self._late: list[tuple[int, bytes]] = []  # late chunks, each with the counter of its scan
 
     @property

@@ -1,4 +1,4 @@
-"""Simulated resistances at a node's analogue port, with faults of the wires and the converter."""
+"""Simulated resistances at a node's analogue port, with faults in the wires and the converter."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class Tally:
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus refused."""
         self.waiting: Counter[Kind] = Counter()
-        """Frames held back to be sent later: late chunks and chunks that change places."""
+        """Frames held back to be sent later: late chunks and chunks that swap places."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()

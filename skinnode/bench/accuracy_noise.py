@@ -229,7 +229,7 @@ class Follower:
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Yield presses of a tenth of the height, the same for all converters and for layouts of equal height."""
+    """Yield presses to a tenth of the height, the same for all converters and for layouts of equal height."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -294,7 +294,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return one body, sharp or blunt, or, in three of ten scenes, two bodies in different halves."""
+    """Return one sharp or blunt body or, in three of ten scenes, two bodies in different halves."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:

@@ -32,9 +32,9 @@ STRIDE: Final = 4
 """Number of path samples per tracker frame."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error in the change of R in the wrong models of case 13. Measured on a 30 % press, staggered,
-h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in the median
-and by 7 % at worst."""
+"""Relative error in the change of R predicted by the wrong models of case 13. Measured on a 30 % press,
+staggered, h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in
+the median and by 7 % at worst."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ SHORT: Final = 1e-3
 class NumpyWire:
     """Computes F and Jᵀ of one wire as fast as NumPy can: a structure of arrays, with preallocated buffers.
 
-    This is the fastest of the axis orders and summation methods that were tried; it takes 0.85 of the time of
+    This is the fastest of the axis orders and summation methods that were tried; it takes 85 % of the time of
     the obvious method.
     """
 

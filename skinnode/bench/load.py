@@ -36,14 +36,14 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Time between turns of the sender: on a full bus two frames go out at once, as from a USB adapter."""
+"""Time between turns of the sender: on a full bus it sends two frames at a time, like a USB adapter."""
 LEAD_S: Final = 0.5
 """Time from :meth:`Generator.begin` to the first frame."""
 _BEAT_S: Final = 0.1
 _FULL_S: Final = 1e-4
 
 _Queued = tuple[int, int, bytes, bool]
-"""Time at which a node had a frame ready, ns; COB-ID, data, and whether it is a CAN FD frame."""
+"""Time at which a node had the frame ready, ns; COB-ID; data; whether it is a CAN FD frame."""
 
 
 @dataclass(frozen=True, slots=True)

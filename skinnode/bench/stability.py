@@ -31,7 +31,7 @@ def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
     with ProcessPoolExecutor(jobs, spawn) as pool:
         try:
             yield pool
-        except BaseException:  # do not cancel: Python 3.11 would print a traceback when a process dies
+        except BaseException:  # cancelling would make Python 3.11 print a traceback
             for process in multiprocessing.active_children():
                 process.kill()
             raise

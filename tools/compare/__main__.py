@@ -50,7 +50,7 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 def relative_difference(old: Any, new: Any) -> float:
     """Return the largest difference between arrays, relative to the largest finite value of the old array.
 
-    Returns inf if shape, type or the positions of NaN and infinity differ, and for arrays of other types than
+    Returns inf if shape, type or the positions of NaN and infinity differ, and for arrays of types other than
     float.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":

@@ -85,7 +85,7 @@ class _Candidate:
 
 
 class _OnlyBehaviour(ast.NodeTransformer):
-    """Removes what tests need not check: annotations, texts, and decorators that only affect speed."""
+    """Removes code that tests need not check: annotations, strings, and decorators that only affect speed."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         node.annotation = ast.Constant(0)
@@ -193,7 +193,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Return a mutation as an identified mutant, after counting the equal mutations before it."""
+    """Return a mutation as an identified mutant, with the number of equal mutations before it."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))

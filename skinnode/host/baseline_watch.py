@@ -1,4 +1,4 @@
-"""Reads the baseline and the error register of running nodes again when they may have changed."""
+"""Read the baseline and the error register of running nodes again when they may have changed."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ _DOUBT_NS: Final = 2_000_000_000
 """Minimum interval between two readings of a baseline that may have changed unnoticed."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum interval between two readings of an error register that is not zero. The emergency that clears an
-error may be lost, and the patch must be operational within a second of it. Costs four SDO frames a second."""
+"""Minimum interval between two readings of an error register that is not zero. The emergency message that
+clears an error may be lost, and the patch must be operational within a second of it. These readings cost four
+SDO frames per second."""
 
 
 class BaselineWatch:
-    """Reads baselines and error registers of running nodes. Owned by the supervisor's thread.
+    """Reader of the baselines and error registers of running nodes. Owned by the supervisor's thread.
 
-    Transfers run on ``pool``, one job a node at a time.
+    Transfers run on ``pool``, one job per node at a time.
     """
 
     def __init__(self, pool: ThreadPoolExecutor) -> None:
@@ -36,7 +37,7 @@ class BaselineWatch:
     def look(self, node: Supervised, now_ns: int) -> None:
         """Read the baseline again if the node announced a new one, or may have done so in a lost summary.
 
-        After an announcement scans are withheld until then.
+        After an announcement, scans are withheld until the baseline has been read.
         """
         remote, stream, job = node.remote, node.remote.stream, node.job
         if job is not None:
@@ -63,13 +64,13 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Read the error register of a node with an error: its end may have been reported in a lost frame."""
+        """Read the error register of a node with an error: the frame that reports its end may be lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return
 
         def read() -> Joined | None:
-            with contextlib.suppress(BusError, ConfigError):  # it is read again later
+            with contextlib.suppress(BusError, ConfigError):  # the register is read again later
                 remote.renew_register()
             return None
 
@@ -83,7 +84,7 @@ class BaselineWatch:
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # if the node is gone, its silence will show
+        except (BusError, ConfigError) as error:  # if the node is gone, its missing heartbeats will show it
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return
@@ -96,14 +97,14 @@ class BaselineWatch:
         solver = read.solver
         if solver is not None:
             remote.link.call(lambda: stream.resume(solver, read.withholdings, anew=False), remote.defects)
-            node.announced = True  # also if it was found after a lost summary
+            node.announced = True  # even if the change was found only after a lost summary
             note_baseline(node)
 
 
 def note_baseline(node: Supervised) -> None:
-    """Note with which baseline the scans are solved now, and count it if it is new.
+    """Record the baseline with which scans are now solved, and count it if it is new.
 
-    A bring-up finds a new one too: after a reading that failed, or if it changed while the node was away.
+    A bring-up may also find a new baseline: after a failed reading, or if it changed while the node was away.
     """
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # the node was brought up

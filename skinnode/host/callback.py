@@ -1,4 +1,4 @@
-"""Call a function of the program with each field, on a thread of its own, so that it delays nothing else."""
+"""Call a user-supplied function with each field, on a separate thread, so that it delays nothing else."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from skinnode.model.frames import FieldFrame
 _log = logging.getLogger(__name__)
 
 LAST_CALL_S: Final = 1.0
-"""Longest wait for a call under way when a callback or the host ends, s."""
+"""Maximum wait for a running call when a callback or the host ends, s."""
 
 
 class FieldCallback:
-    """Calls a function with each field until :meth:`close` or the end of the host.
+    """Callback that receives each field until :meth:`close` or the end of the host.
 
-    Exceptions of the function are counted, and the first is logged with its traceback; the next field
-    follows. Threads: one of its own calls the function; any thread may call the methods.
+    Exceptions raised by the function are counted, and the first is logged with its traceback; the next field
+    is delivered nevertheless. Threads: a thread of its own calls the function; any thread may call the
+    methods.
     """
 
     def __init__(
@@ -45,16 +46,16 @@ class FieldCallback:
 
     @property
     def failed(self) -> int:
-        """Fields at which the function raised."""
+        """Number of fields for which the function raised an exception."""
         return self._failed
 
     def close(self) -> None:
-        """End the calls. Waits for a call under way for a second at most; the function itself may call it."""
+        """End the calls. Waits up to a second for a running call; the function itself may call it."""
         self._fields.end()
         self.join()
 
     def join(self) -> None:
-        """Wait for the last call to return, a second at most, and log a warning if it does not."""
+        """Wait up to a second for the last call to return, and log a warning if it does not."""
         if self._thread is threading.current_thread():
             return
         self._thread.join(LAST_CALL_S)
@@ -63,17 +64,17 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether the function is not called any more."""
+        """Whether the function is no longer called."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         keep_on(self._turn, self._defects, "waiting for a field")
 
     def _turn(self) -> bool:
-        """Wait for the next field and process it. Returns False at the end of the fields."""
+        """Wait for the next field and process it. Returns False when there are no more fields."""
         try:
             field = self._fields.take(None)
-        except SkinError as error:  # it stopped the host; every subscriber gets it
+        except SkinError as error:  # this error stopped the host; every subscriber gets it
             _log.debug("callback %s: %s", _name(self._function), error)
             return False
         if field is None:
@@ -88,7 +89,7 @@ class FieldCallback:
 
 
 class Callbacks:
-    """All callbacks of a host. Exceptions outside their functions are reported to ``defects``."""
+    """All callbacks of a host. Exceptions raised outside their functions are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects
@@ -98,10 +99,10 @@ class Callbacks:
         """Start a callback.
 
         Raises:
-            TypeError: if ``function`` is not a function, or is async.
+            TypeError: if ``function`` is not callable, or is async.
         """
         if not callable(function):
-            raise TypeError(f"function: got {function!r}, must be a function of a field")
+            raise TypeError(f"function: got {function!r}, must be a function that takes a field")
         if inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(type(function).__call__):
             raise TypeError(f"function: got async {_name(function)}, must not be async (use async for)")
         self._all = [callback for callback in self._all if not callback.ended]
@@ -110,7 +111,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all callbacks, whose subscriptions have ended."""
+        """Wait for all callbacks to end; their subscriptions must have ended."""
         for callback in self._all:
             callback.join()
 

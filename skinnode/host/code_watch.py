@@ -1,25 +1,27 @@
 """Detect a frozen converter and faulty wires from the codes of a patch, scan by scan. No thread, one owner.
 
-**Frozen.** A converter whose noise reaches the codes cannot repeat the same codes for long. With a noise of σ
-codes, a reading keeps its code with a probability of at most 2Φ(1/2σ) − 1, which applies if the true value is
-in the middle of a step; so n scans of m codes are all equal with at most that probability to the power of
-n·m. It must be below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file says may
-repeat its codes for hours. So the stream itself must have shown noise, that is ``FLICKERS`` scans in which a
-code returned to its previous value (a touch, or creeping rubber, goes one way), and the run must be
-``LONGER`` times as long as any that ended by itself. A converter that never flickers is never called frozen.
-Scans in which only changed chunks were sent, or chunks are missing, are ignored. What remains: a converter
-with a third of the noise in the hand file flickers while rubber creeps, and is constant afterwards; it may be
-called frozen once.
+**Frozen.** A converter whose noise is visible in the codes cannot repeat the same codes for long. If the
+noise has a standard deviation of σ codes, a reading repeats its code with a probability of at most 2Φ(1/2σ) −
+1 (the value for a true resistance in the middle of a step), and n scans of m codes are all equal with at most
+that probability to the power of n·m. For a run of equal scans to count as frozen, this bound must be below
+``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file states may repeat its codes for
+hours. Therefore the stream itself must also have shown noise, that is, ``FLICKERS`` scans in which a code
+returned to its previous value (a touch or creeping rubber moves codes in one direction only), and the run
+must be ``LONGER`` times as long as any run that ended by itself. A converter that never flickers is never
+reported as frozen. Scans that contain only the changed chunks, or lack chunks, are ignored. One false alarm
+remains possible: a converter with a third of the noise in the hand file flickers while rubber creeps and is
+constant afterwards, so it may be reported once.
 
-**Wires.** A wire is open or shorted if all its crossings are, in a complete scan. Noise and drift are judged
-over windows of ``WINDOW`` scans and must hold in ``WINDOWS`` consecutive windows. The second difference in
-time of a code removes steady movement; a wire is noisy if the mean square of the difference is ``NOISY``
-times that of the median wire of its side, and that of the expected noise. A wire drifts if the resistances of
-all its crossings moved by the same share of R0, by more than ``DRIFT`` from those of the median wire and from
-rest, and its neighbours did not follow: a touch is uneven along a wire, and the rubber moves the next wires
-with it. In 780,000 instants of simulated touches that moved a wire that far, spheres of 2 mm to 0.3 m pressed
-in by 10 to 60 %, none passed for a drift. So two neighbours that drift alike are not reported, nor is a wire
-while it is touched.
+**Wires.** A wire is open or shorted if all its crossings are open or shorted in a complete scan. Noise and
+drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
+consecutive windows. Taking the second difference of a code over time removes steady movement; a wire is noisy
+if the mean square of this difference exceeds ``NOISY`` times both that of the median wire on its side and
+that of the expected noise. A wire drifts if the resistances of all its crossings changed by the same fraction
+of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and its neighbours did not
+follow. A touch, in contrast, is uneven along a wire, and the rubber moves the adjacent wires as well.
+Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) moved a wire that far at 780,000
+instants; none was mistaken for drift. Consequently, two neighbours that drift alike are not reported, nor is
+a wire while it is touched.
 """
 
 from __future__ import annotations
@@ -39,26 +41,27 @@ from skinnode.protocol.summary import SummaryFlag
 _CHANGED_ONLY: Final = int(SummaryFlag.CHANGED_ONLY)
 
 FALSE_ALARM: Final = 1e-12
-"""Probability of a false alarm for each run of equal scans: once in 25 years for a hand of 16 patches at 80
-scans/s."""
+"""Maximum probability of a false alarm per run of equal scans: one alarm in 25 years for a hand of 16 patches
+at 80 scans/s."""
 FLICKERS: Final = 10
-"""Scans with a returning code that show that the noise reaches the codes."""
+"""Number of scans with a code returning to its previous value that proves noise in the codes."""
 LONGER: Final = 4
-"""Ratio of a frozen run to the longest run that ended by itself."""
+"""Minimum ratio of the length of a frozen run to that of the longest run that ended by itself."""
 LEAST_RUN: Final = 5
 """Minimum length of a frozen run, scans."""
 WINDOW: Final = 16
-"""Scans in a window."""
+"""Number of scans in a window."""
 WINDOWS: Final = 3
-"""Consecutive windows in which a wire must be noisy or drift."""
+"""Number of consecutive windows in which a wire must be noisy or drift."""
 NOISY: Final = 25.0
-"""Ratio of noise power: five times the noise."""
+"""Minimum ratio of noise power: five times the noise amplitude."""
 DRIFT: Final = 1e-3
-"""Minimum drift, as a share of R0; a tenth of what a light touch does to the wire pairs below it."""
+"""Minimum drift as a fraction of R0: a tenth of the change that a light touch causes in the wire pairs below
+it."""
 UNEVEN: Final = 0.05
-"""Maximum deviation of a crossing from the median of its wire, as a share of the drift."""
+"""Maximum deviation of a crossing from the median of its wire, as a fraction of the drift."""
 APART: Final = 0.3
-"""Minimum distance of a wire from the nearer of its neighbours, as a share of the drift."""
+"""Minimum distance of a wire from the nearer of its neighbours, as a fraction of the drift."""
 
 
 class WireState(enum.StrEnum):
@@ -81,11 +84,11 @@ class WireFault:
 
 
 class CodeWatch:
-    """Watches the scans of one patch. Owned by the mainline.
+    """Fault detector for the scans of one patch. Owned by the mainline.
 
     Args:
         scale: Scale of the codes.
-        relative_noise: Noise of the converter as in the hand file, as a share of the resistance.
+        relative_noise: Noise of the converter from the hand file, as a fraction of the resistance.
     """
 
     def __init__(self, scale: CodeScale, relative_noise: float) -> None:
@@ -93,15 +96,13 @@ class CodeWatch:
         self.frozen = False
         self.wires: tuple[WireFault, ...] = ()
         self._last: Codes | None = None
-        self._before: Codes | None = None  # for each code, its value before the present one
+        self._before: Codes | None = None  # for each code, the value before its last change
         self._run = self._longest = self._flickers = 0
         self._needed: float = math.inf
         self._broken: tuple[WireFault, ...] = ()
         self._odd: dict[WireFault, int] = {}  # consecutive windows in which a wire was noisy or drifted
         self._window: list[Codes] = []
-        self._measured: NDArray[np.bool_] | None = (
-            None  # codes that all of its scans contain; None: all codes
-        )
+        self._measured: NDArray[np.bool_] | None = None  # codes present in all scans of the window; None: all
 
     def on_scan(self, scan: Scan) -> None:
         """Evaluate the next scan."""
@@ -127,7 +128,7 @@ class CodeWatch:
     def _compare(self, codes: Codes, last: Codes, before: Codes) -> None:
         changed = codes != last
         if changed.any():
-            if self._flickers < FLICKERS:  # enough is known
+            if self._flickers < FLICKERS:  # beyond this, noise is proven
                 self._flickers += bool((changed & (codes == before)).any())
                 self._before = np.where(changed, last, before)
             by_itself = not self.frozen or np.abs(codes.astype(np.int64) - last).max() <= 1
@@ -141,13 +142,13 @@ class CodeWatch:
         self.frozen = self._run >= LEAST_RUN and self._run >= self._needed
 
     def _impossible(self, codes: Codes) -> float:
-        """Return the number of scans for which the expected noise cannot keep all these codes equal."""
+        """Return how many scans in a row cannot have all these codes equal, given the expected noise."""
         measured = codes[codes <= self._scale.steps]
         if not measured.size or not self._relative_noise:
             return math.inf
         least_ratio = self._scale.lo + float(measured.min()) * self._scale.step
         sigma = self._relative_noise * max(least_ratio, self._scale.step) / self._scale.step
-        leaves = math.erfc(0.5 / (sigma * math.sqrt(2.0)))  # probability that one code changes, at least
+        leaves = math.erfc(0.5 / (sigma * math.sqrt(2.0)))  # minimum probability that a code changes
         if leaves >= 1.0:
             return LEAST_RUN
         stays = -math.log1p(-leaves) * measured.size
@@ -189,7 +190,8 @@ class CodeWatch:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # Distance from rest too: if a touch has moved the median wire, the others are away from it.
+            # The distance from rest counts too: if a touch moved the median wire, the untouched wires are
+            # away from it.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])
@@ -207,7 +209,7 @@ class CodeWatch:
 
 
 def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the median of values without NaN, three times as fast as ``np.median`` for a patch."""
+    """Return the median of values that contain no NaN; for a patch, three times as fast as ``np.median``."""
     ordered, count = np.sort(values, axis=axis), values.shape[axis]
     middle: NDArray[np.float64] = ordered.take([(count - 1) // 2, count // 2], axis=axis).sum(axis=axis)
     return 0.5 * middle
@@ -222,9 +224,9 @@ def _median_of_known(values: NDArray[np.float64]) -> float:
 def _of_wires(
     values: NDArray[np.float64], axis: int, whole: NDArray[np.bool_], plain: Any, without_nan: Any
 ) -> NDArray[np.float64]:
-    """Return a number for each wire from its crossings, of which unmeasured ones are NaN; NaN if all are.
+    """Reduce each wire's crossings to one number, ignoring NaN (not measured); NaN if all are NaN.
 
-    The branch for patches without a fault takes a tenth of the time of the other.
+    The branch for patches without a fault takes a tenth of the time of the other branch.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

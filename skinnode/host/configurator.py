@@ -1,9 +1,9 @@
 """Configure a node: wait for it, check its identity and layout, write its parameters, read its baseline.
 
 Nothing is written before identity and layout are known to match the hand file, because the node could be a
-drive. What is written is read back. On a bus of another master the host writes only what belongs to the patch
-alone, and only if it differs: no NMT, no SYNC parameters. If it must send nothing (``guest_sends =
-"nothing"``), all facts come from files.
+drive. Every written value is read back. On a bus that another master runs, the host sends no NMT commands,
+leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If it must send
+nothing (``guest_sends = "nothing"``), all facts come from files.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""Longest time to the first response of a node, s; controllers boot and tare within a second."""
+"""Maximum time to the first response of a node, s; controllers boot and tare within a second."""
 
 HEARTBEATS_WATCHED: Final = 3
-"""Heartbeats of the host that a node may miss before it stops sending, if the host sends any."""
+"""Number of host heartbeats that a node may miss before it stops sending, if the host sends heartbeats."""
 
 _POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configures nodes of one bus, one after the other or side by side.
+    """Configuration of the nodes of one bus, one after the other or in parallel.
 
-    Threads: each node has one thread at a time.
+    Threads: one thread per node at a time.
     """
 
     send: Callable[[int, bytes], None]
@@ -51,14 +51,14 @@ class Configurator:
     bus: BusConfig
     boot_deadline_s: float
     abandoned: Callable[[], bool]
-    """Called repeatedly; once it returns True, configuring ends with Abandoned."""
+    """Called repeatedly; once it returns True, configuration raises Abandoned."""
     on_answer: Callable[[PatchConfig], None]
-    """Called for each node that answered at all."""
+    """Called for each node once it has answered."""
     search: Callable[[PatchConfig], object]
     """Searches for a node that does not answer, by its serial number."""
 
     def configure(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> NodeFacts:
-        """Wait for the node, check its identity, configure it.
+        """Wait for the node, check its identity and configure it.
 
         On a bus where the host is the master, the node is pre-operational afterwards.
 
@@ -69,7 +69,7 @@ class Configurator:
 
         Raises:
             NodeTimeout: if the node does not answer in time.
-            NodeError: if it is not the patch of the hand file, or does not keep its configuration.
+            NodeError: if it is not the patch in the hand file, or does not keep its configuration.
             SdoAbort: if it refuses a transfer.
             ConfigError: if the baseline file does not fit the patch.
             Abandoned: if ``abandoned`` returned True.
@@ -98,7 +98,7 @@ class Configurator:
         )
 
     def _from_files(self, patch: PatchConfig, profile: PatchProfile) -> NodeFacts:
-        assert patch.baseline is not None  # the hand file was checked
+        assert patch.baseline is not None  # ensured by the check of the hand file
         baseline_ohm = load_baseline(patch.baseline, profile)
         scale, heartbeat_s = CodeScale(patch.code_bits), self.hand.bring_up.heartbeat_s
         return NodeFacts(patch, patch.layout.build(), profile, scale, baseline_ohm, None, heartbeat_s)
@@ -128,7 +128,7 @@ class Configurator:
             if got != expected:
                 raise _mismatch(patch, what, f"0x{got:08X}", f"0x{expected:08X} (a skinnode patch)")
         revision = int(remote.read(od.IDENTITY, od.IDENTITY_REVISION, "u32"))
-        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision names the CANopen behaviour
+        if revision >> 16 != od.REVISION_NUMBER >> 16:  # the major revision identifies the CANopen behaviour
             allowed = f"{od.REVISION_NUMBER >> 16}.x"
             raise _mismatch(patch, "revision", f"{revision >> 16}.{revision & 0xFFFF}", allowed)
         serial = int(remote.read(od.IDENTITY, od.IDENTITY_SERIAL, "u32"))
@@ -151,14 +151,14 @@ class Configurator:
         got = remote.read(od.DESCRIPTOR, od.LAYOUT_HASH, "u32")
         layout, source = patch.layout.build(), "as in the hand file"
         if patch.layout.coordinates == "node":
-            layout, source = self._read_layout(patch, profile, remote), "of the node's own coordinates"
+            layout, source = self._read_layout(patch, profile, remote), "from the node's own coordinates"
         if got != layout.layout_hash:
             expected_hash = f"0x{layout.layout_hash:08X} ({layout.name} {source})"
             raise _mismatch(patch, "layout hash", f"0x{got:08X}", expected_hash)
         return layout
 
     def _read_layout(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> PatchLayout:
-        """Return the layout that the node has in its coordinates."""
+        """Return the layout from the electrode coordinates stored in the node."""
         self._go_on()
         data = remote.read_block(od.COORDINATES)
         resistivity = remote.read(od.DESCRIPTOR, od.RESISTIVITY, "f32")
@@ -168,7 +168,7 @@ class Configurator:
             raise _mismatch(patch, "electrode coordinates", counted(len(data), "byte"), str(error)) from None
 
     def _configure_communication(self, remote: RemoteOd) -> None:
-        """Write what only a master may set: SYNC, and which heartbeat the node watches."""
+        """Write the parameters that only a master may set: SYNC, and the heartbeat that the node monitors."""
         self._go_on()
         sync = self.hand.sync
         remote.write_checked(od.COB_ID_SYNC, 0, "u32", od.SYNC_COB_ID)
@@ -184,7 +184,7 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Set the heartbeat period; on a bus of another master only if none is set. Returns the period, s."""
+        """Set the heartbeat period; on another master's bus, only if none is set. Returns the period, s."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
             present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))
@@ -196,7 +196,7 @@ class Configurator:
     def _configure_patch(
         self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd, *, master: bool
     ) -> None:
-        """Write what belongs to the patch alone: when it scans and how it sends."""
+        """Write the patch-specific parameters: when the patch scans and how it sends."""
         sync = self.hand.sync
         if not master:
             overflow = remote.read(od.SYNC_COUNTER_OVERFLOW, 0, "u8")
@@ -226,7 +226,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the PDOs have the mapping of the node's revision, the only one the decoder supports."""
+        """Check that the PDO mapping is that of the node's revision, as the decoder requires."""
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -240,15 +240,15 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the baseline with which the node encodes; write that of a file first if it differs.
+        """Return the baseline with which the node encodes; first write the file's baseline if it differs.
 
-        A node that still tares itself has zeros, which are waited for up to the boot deadline.
+        A node that is still taring itself returns zeros; it has until the boot deadline to finish.
 
         Returns:
             (U, K) resistances at rest, ohm.
 
         Raises:
-            NodeError: if the node does not keep the baseline, or it is not positive.
+            NodeError: if the node does not keep the baseline, or a value is not positive.
             SkinError: as :meth:`configure`.
         """
         expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
@@ -277,8 +277,9 @@ class Configurator:
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         """Read the baseline as one block, or value by value from a node without block transfer.
 
-        For 300 values a block is 176 frames, single reads are 600. At 1 Mbit/s that is 86 ms at the node's
-        own pace, against 75 ms plus 300 response times; single reads never use the whole bus.
+        For 300 values, a block transfer takes 176 frames and single reads take 600. At 1 Mbit/s, this is 86
+        ms at the node's own pace compared with 75 ms plus 300 response times; single reads never occupy the
+        whole bus.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)
@@ -302,13 +303,12 @@ class Configurator:
 
 
 def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> bool:
-    """Read back the values that decide whether the node sends scans.
+    """Read back the values that determine whether the node sends scans.
 
-    A node that was reset unnoticed while it was brought up, or that another master configured, has other
-    values.
+    The values differ if the node was reset unnoticed during bring-up, or if another master configured it.
 
     Returns:
-        Whether they are as a master configures them.
+        Whether the values are those that a master writes.
 
     Raises:
         NodeError: as :class:`RemoteOd` raises it.
@@ -322,7 +322,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 
 
 def _open_window(remote: RemoteOd) -> None:
-    """Disable the synchronous window (0x1007), because a summary follows only after its whole scan.
+    """Disable the synchronous window (0x1007), because a summary is sent only after its whole scan.
 
     A node without the object has no window.
     """
@@ -334,9 +334,10 @@ def _open_window(remote: RemoteOd) -> None:
 
 
 def _watch_master(remote: RemoteOd, watched: int) -> None:
-    """Write entry 1 of 0x1016, which watches the host.
+    """Write entry 1 of 0x1016, with which the node monitors the host's heartbeat.
 
-    Other entries stay unchanged, except one that also watches the host: a node-ID may occur only once.
+    Other entries stay unchanged, but an entry that also monitors the host is cleared, because a node-ID may
+    occur only once.
     """
     try:
         remote.write_checked(od.HEARTBEAT_CONSUMER, 1, "u32", watched)

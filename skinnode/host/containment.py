@@ -1,4 +1,4 @@
-"""Contain exceptions in the host's threads: the rule, and the tools that implement it.
+"""Containment of exceptions in the host's threads.
 
 An exception raised while serving one subject (a patch, a bus, a subscriber) is reported to the
 :class:`Defects` of that subject and affects no other; the operation is then retried. The table in
@@ -27,22 +27,23 @@ LONGEST_PAUSE_S: Final = 1.0
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
 """First and longest pause, in s, in a loop that serves several subjects: a failed turn must not delay the
-others."""
+other subjects."""
 
 _COMPLAINTS: Final = 64
-"""Maximum distinct complaints of a subject remembered as logged; beyond it, complaints are logged again."""
+"""Maximum number of distinct messages per subject remembered as logged; beyond it, messages are logged
+again."""
 
 
 def one_line(error: BaseException | None) -> str:
-    """Return the type and text of an exception in one line."""
+    """Return the type and text of an exception as one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 class Pause:
-    """Pauses of an operation that is retried repeatedly, s.
+    """Sequence of increasing pauses between retries of an operation, s.
 
-    After the operation has worked for as long as the longest pause, they start over with the first.
+    Once the operation has worked for as long as the longest pause, the sequence starts again.
     """
 
     def __init__(self, first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> None:
@@ -51,7 +52,7 @@ class Pause:
         self._end_s = -math.inf
 
     def next_s(self) -> float:
-        """Return the pause before the next attempt, which is due now."""
+        """Return the length of the pause that starts now, before the next attempt."""
         now_s = time.monotonic()
         again = now_s <= self._end_s + self._longest_s
         self._pause_s = min(2 * self._pause_s, self._longest_s) if again else self._first_s
@@ -65,14 +66,14 @@ class DefectStats:
 
     count: int
     newest: str | None
-    """Operation and exception in one line; None before the first exception."""
+    """Newest failed operation and its exception, in one line; None before the first exception."""
 
 
 class Defects:
-    """Collects the exceptions raised while serving ``subject``; thread-safe.
+    """Collector of the exceptions raised while serving ``subject``; thread-safe.
 
-    The first occurrence of each complaint is passed to ``on_new`` and logged: one line at level warning, the
-    traceback at level debug.
+    The first occurrence of each distinct message is passed to ``on_new`` and logged: one line at level
+    warning, and the traceback at level debug.
     """
 
     def __init__(self, subject: str, on_new: Callable[[SkinError], object] = lambda error: None) -> None:
@@ -97,7 +98,7 @@ class Defects:
         return DefectStats(self._count, self._newest)
 
     def report(self, doing: str, error: Exception) -> None:
-        """Count ``error``, raised while ``doing`` something. Never raises."""
+        """Count and log ``error``, which was raised by the operation ``doing``. Never raises."""
         text = f"{doing}: {one_line(error)}"
         with self._lock:
             self._count += 1
@@ -108,7 +109,7 @@ class Defects:
             self._logged.add(text)
         if known:
             return
-        with contextlib.suppress(Exception):  # a log handler of the program may raise
+        with contextlib.suppress(Exception):  # the program's log handlers may raise
             _log.warning("%s: %s; retrying", self.subject, text)
             _log.debug("%s: %s", self.subject, text, exc_info=error)
         failure = SkinError(f"{self.subject}: {text}")
@@ -120,7 +121,7 @@ class Defects:
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
     """Call ``turn`` until it returns False.
 
-    An exception ends that turn only; a pause of 1 to 20 ms follows.
+    An exception ends only that turn; a pause of 1 to 20 ms follows.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

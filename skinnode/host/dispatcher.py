@@ -1,6 +1,6 @@
-"""Counts the frames of a bus and dispatches them to handlers by COB-ID. No thread, no clock.
+"""Count the frames of a bus and dispatch them to handlers by COB-ID. No thread, no clock.
 
-A :class:`~skinnode.host.link.BusLink` feeds it with the frames of a bus; a replay feeds it with a recording.
+A :class:`~skinnode.host.link.BusLink` feeds it the frames of a bus; a replay feeds it a recording.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Handler = Callable[[bytes, int], None]
 _MARK_NS: Final = 100_000_000
 """Interval at which the bits are summed."""
 _MARKS: Final = 10
-"""Intervals over which the load is averaged."""
+"""Number of intervals over which the load is averaged."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval between calls of the pollers: what they wait for takes at least 5 ms, and batches of
-frames come a millisecond apart."""
+"""Minimum interval between calls of the pollers. Their timeouts are at least 5 ms, and batches of frames
+arrive a millisecond apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +39,16 @@ class BusStats:
     """Counters of a bus since the host opened it."""
 
     received: int
-    """Data frames read, without those of the host."""
+    """Data frames read, excluding the host's own."""
     sent: int
     foreign: int
-    """Data frames with a COB-ID that the hand file does not explain."""
+    """Data frames with a COB-ID that no part of the hand file uses."""
     ignored: int
     """Remote and extended frames; on a bus without ``fd`` also CAN FD frames."""
     error_frames: int
-    """Error frames: the interface reports errors on the bus and states of its controller."""
+    """Error frames, with which the interface reports bus errors and controller states."""
     bus_offs: int
-    """Times the interface reported that its controller went bus-off."""
+    """Number of times the interface reported that its controller went bus-off."""
     controller: BusState | None
     """Newest reported state of the controller; None if none was reported."""
     foreign_ids: Mapping[int, int]
@@ -58,17 +58,18 @@ class BusStats:
     waiting: int
     """Frames read but not dispatched yet."""
     kernel_dropped: int
-    """Frames for which the kernel had no room; 0 if the interface does not report it."""
+    """Frames for which the kernel had no room; 0 if the interface does not report them."""
     dropped: int
-    """Frames that found the receive queue full."""
+    """Frames dropped because the receive queue was full."""
     malformed: int
     """Frames of a known COB-ID whose length or form is wrong."""
     outages: int
-    """Times the interface failed and was reopened."""
+    """Number of times the interface failed and was reopened."""
     bits: int
-    """Exact length of all data frames, received and sent, bits; up to a tenth of a second old."""
+    """Exact total length of all data frames received and sent, bits; the value is up to a tenth of a second
+    old."""
     load: float
-    """Share of the bus capacity used over the last second; 1 is full."""
+    """Fraction of the bus capacity used over the last second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +80,13 @@ class PortCounters:
     dropped: int = 0
     outages: int = 0
     read: int | None = None
-    """None: as many as were dispatched."""
+    """None if all frames that were read have been dispatched."""
     waiting: int = 0
     kernel_dropped: int = 0
 
 
 class Dispatcher:
-    """Dispatches the frames of one bus of the hand, and counts them.
+    """Dispatcher and counter of the frames on one bus of the hand.
 
     Threads: owned by the mainline; :meth:`count` and :meth:`count_sent` may be called from any thread.
     """
@@ -116,45 +117,42 @@ class Dispatcher:
         Args:
             cob_id: Identifier of the frames.
             handler: Replaces the previous handler.
-            defects: Gets the exceptions of the handler; by default those of the bus.
+            defects: Collects the handler's exceptions; the bus's collector by default.
         """
         if defects is not None:
             self._owners[cob_id] = defects
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass every batch of frames, of all kinds, to ``listener`` from now on, before the handlers.
-
-        On the mainline.
-        """
+        """Pass every batch, with frames of all kinds, to ``listener`` before the handlers. Mainline only."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """End :meth:`listen` for this listener. On the mainline."""
+        """Undo :meth:`listen` for this listener. Mainline only."""
         self._listeners = tuple(each for each in self._listeners if each is not listener)
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
-        """Call ``poller`` with the monotonic time after batches of frames, and also when none come.
+        """Call ``poller`` with the monotonic time after batches of frames, and also when no frames arrive.
 
         Args:
             poller: Called at most every 2 ms.
-            defects: Gets the exceptions of the poller; by default those of the bus.
+            defects: Collects the poller's exceptions; the bus's collector by default.
         """
         self._pollers = (*self._pollers, (poller, defects))
 
     def contain(self, owner: Defects | None, doing: str, error: Exception) -> None:
-        """Handle ``error``, raised while ``doing`` something with frames.
+        """Handle ``error``, which was raised by the operation ``doing``.
 
         Raises:
-            Exception: ``error`` itself, because a replay has no bus to continue with.
+            Exception: ``error`` itself, because a replay has no live bus that must be kept running.
         """
         raise error
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Ignore a prediction: only a bus can fetch a frame early."""
+        """Ignore a prediction: only a live bus can fetch a frame early."""
 
     def count_sent(self, can_id: int, data: bytes) -> None:
-        """Count a sent frame towards the load. From any thread."""
+        """Count a sent frame towards the bus load. Any thread."""
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
@@ -190,7 +188,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames of a batch; ``others`` are those without a handler."""
+        """Count the frames of a batch; ``others`` are its frames of types that no handler takes."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -207,7 +205,7 @@ class Dispatcher:
         self._meter.add_all(batch)
 
     def poll(self, now_ns: int) -> None:
-        """Call the pollers with the time, after a batch."""
+        """Call the pollers with the monotonic time, unless they were called within the last 2 ms."""
         if not 0 <= now_ns - self._polled_ns < _POLL_NS:
             self._polled_ns = now_ns
             for poll, owner in self._pollers:
@@ -217,9 +215,9 @@ class Dispatcher:
                     self.contain(owner, "polling", defect)
 
     def measure(self, now_ns: int) -> None:
-        """Compute the load if that is due.
+        """Compute the load if an interval has passed.
 
-        It takes as long as forty frames, so with several buses call it for one of them at a time.
+        This takes as long as handling forty frames, so with several buses, call it for one bus at a time.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)
@@ -231,10 +229,10 @@ class Dispatcher:
             self.first_malformed = error
         if error.cob_id not in self._complained:
             self._complained.add(error.cob_id)
-            _log.warning("%s: %s; rejected, as are others like it", self.config.name, error)
+            _log.warning("%s: %s; this and similar frames are rejected", self.config.name, error)
 
     def count(self, port: PortCounters = PortCounters()) -> BusStats:
-        """Return all counters. From any thread.
+        """Return all counters. Any thread.
 
         Args:
             port: Counters of the interface that feeds the dispatcher.
@@ -260,7 +258,7 @@ class Dispatcher:
 
     def _on_error_frame(self, frame: Frame) -> None:
         self._error_frames += 1
-        if self.config.interface == "socketcan":  # other interfaces code them differently
+        if self.config.interface == "socketcan":  # other interfaces encode error frames differently
             state, before = bus_state(frame), self._bus_state
             if state is not None:
                 self._bus_state = state

@@ -1,7 +1,7 @@
 """A bounded queue for a subscriber: a slow reader loses its own oldest items and never delays the host.
 
-``queue.Queue`` blocks or refuses a new item instead; ``collections.deque(maxlen=…)`` drops without counting,
-and a reader cannot wait for it.
+``queue.Queue`` blocks or refuses a new item instead; ``collections.deque(maxlen=…)`` drops items without
+counting them, and its reader cannot wait for an item.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class End:
 class DropOldestQueue(Generic[T]):
     """A queue of up to ``capacity`` items that ends with an :class:`End`. Thread-safe; writing never blocks.
 
-    An end is never dropped, and every reader gets it: :meth:`get` puts it back.
+    An end is never dropped, and every reader gets it, because :meth:`get` puts it back.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -33,7 +33,7 @@ class DropOldestQueue(Generic[T]):
         self._capacity = capacity
 
     def put(self, item: T | End) -> int:
-        """Append an item and drop the oldest ones beyond the capacity.
+        """Append an item and drop the oldest items beyond the capacity.
 
         Returns:
             Number of items dropped.
@@ -49,7 +49,7 @@ class DropOldestQueue(Generic[T]):
                 end = oldest
             else:
                 dropped += 1
-        if end is not None:  # may exceed the capacity by one
+        if end is not None:  # the queue may then exceed its capacity by one
             self._items.put(end)
         return dropped
 
@@ -57,10 +57,10 @@ class DropOldestQueue(Generic[T]):
         """Remove and return the oldest item; an end stays in the queue.
 
         Args:
-            timeout_s: Longest wait, s; None waits without limit, 0 does not wait.
+            timeout_s: Maximum wait, s; None: no limit, 0: no wait.
 
         Raises:
-            queue.Empty: if no item came in time.
+            queue.Empty: if no item arrived in time.
         """
         item = self._items.get(timeout=timeout_s)
         if isinstance(item, End):

@@ -17,7 +17,7 @@ from skinnode.host.publish import check_capacity
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
-"""Events that a subscriber may lag behind before it loses the oldest."""
+"""Default number of events that a subscriber may lag behind before it loses the oldest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,23 +25,23 @@ class HealthEvent:
     """A change of health."""
 
     t_ns: int
-    """Monotonic."""
+    """Monotonic time."""
     subject: str
     """Name of a patch or a bus, or ``host``."""
     what: str
     """The new condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that grew, or ``defects``.
     """
     text: str
-    """Description for people, without the subject."""
+    """Human-readable description, without the subject."""
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}"
 
 
 class EventSubscription:
-    """The events of a running host from now on. Iterate over it until the host closes, or use :meth:`get`.
+    """Subscription to a running host's events. Iterate over it until the host closes, or use :meth:`get`.
 
-    A full queue drops its oldest event; ``dropped`` counts. Any thread may read.
+    A full queue drops its oldest event, counted in ``dropped``. Any thread may read.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -52,10 +52,10 @@ class EventSubscription:
         """Return the next event, or None.
 
         Args:
-            timeout_s: Longest wait, s; None waits without limit.
+            timeout_s: Maximum wait, s; None: no limit.
 
         Returns:
-            None if no event came in time, or at once if the host has closed.
+            The event; None if no event arrived in time, or immediately if the host has closed.
         """
         try:
             event = self._queue.get(timeout_s)
@@ -78,7 +78,7 @@ class Events:
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = Defects("host") if defects is None else defects
         self._subscriptions: weakref.WeakSet[EventSubscription] = weakref.WeakSet()
-        self._lock = threading.Lock()  # a set changes size while it is iterated over
+        self._lock = threading.Lock()  # the set must not change while it is iterated over
         self._ended = False
 
     def subscribe(self, capacity: int) -> EventSubscription:

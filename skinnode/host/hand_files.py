@@ -1,4 +1,4 @@
-"""Check the files that a hand file names, EDS and baselines, against its wire format."""
+"""Check the EDS and baseline files named in a hand file against its wire format."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def load_baseline(path: Path, profile: PatchProfile) -> Float:
         (U, K) resistances at rest, ohm, rounded to REAL32.
 
     Raises:
-        ConfigError: if the file is not a table of that many positive numbers.
+        ConfigError: if the file is not a table of U × K positive numbers.
     """
     allowed = f"{profile.rows} lines of {profile.columns} positive resistances in ohm"
     text = read_input("baseline", path).decode("utf-8", "replace")
@@ -68,13 +68,13 @@ def _ohm(word: str, key: str, allowed: str, where: str) -> float:
 
 
 def check_eds(path: Path, profile: PatchProfile) -> None:
-    """Check that an EDS file describes the wire format of the hand file, in either revision.
+    """Check that an EDS file describes the hand file's wire format, with or without the scan check.
 
     Raises:
         ConfigError: if the file cannot be read.
         ProfileError: if it is not an EDS, or an object differs or is missing.
     """
-    from canopen.objectdictionary.eds import import_eds  # it ignores the file name
+    from canopen.objectdictionary.eds import import_eds  # accepts any file name
 
     data = read_input("EDS", path, MOST_EDS_BYTES)
     try:
@@ -85,7 +85,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     check_form(text, str(path))
     try:
         described = import_eds(io.StringIO(text), None)  # type: ignore[no-untyped-call]
-    except Exception as error:  # the library does not catch what its parser raises
+    except Exception as error:  # canopen does not catch its parser's exceptions
         raise no_eds(error, str(path), text) from None
     checked = described.get_variable(od.SUMMARY, od.SUMMARY_CHECK) is not None
     for item in replace(profile, checked=checked).objects():

@@ -1,6 +1,6 @@
-"""Hand frames: the fields of all patches of one SYNC, gathered by the reader of fields.
+"""Hand frames: the fields of all patches for one SYNC, gathered on the thread that reads them.
 
-No thread of its own.
+This module starts no threads.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from skinnode.host.publish import Subscription, check_timeout
 from skinnode.model.frames import FieldFrame
 
 LATE: Final = "late"
-"""Reason for a missing field: the patch is operational, and its field did not come in time."""
+"""Reason for a missing field: the patch is operational, but its field did not arrive in time."""
 OVERTAKEN: Final = "overtaken"
-"""Reason for a missing field: a newer scan of the patch came first."""
+"""Reason for a missing field: a newer scan of the patch arrived first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandFrame:
-    """The fields of all patches at one SYNC."""
+    """The fields of all patches for one SYNC."""
 
     scan: int
     """Number of the SYNC since the host started, without wrapping: the scan number of every field."""
     t_sync_ns: int
-    """Monotonic time at which SYNC was sent or received on the last of the buses; 0 if unknown. Each field
-    has its own (``sync.stagger_ms``)."""
+    """Monotonic time at which SYNC was sent or received on the last bus; 0 if unknown. Each field holds the
+    time of its own bus, because SYNC may be staggered (``sync.stagger_ms``)."""
     fields: Mapping[str, FieldFrame]
-    """By patch."""
+    """Field by patch name."""
     missing: Mapping[str, str]
     """Why the field of a patch is missing: :data:`LATE`, :data:`OVERTAKEN`, or the condition of the patch,
     such as ``lost``."""
@@ -44,15 +44,15 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Makes hand frames from fields, in ascending order. No thread and no clock; one owner.
+    """Gatherer of fields into hand frames, in ascending order of scan. No thread, no clock; one owner.
 
-    A frame is ready when every awaited patch has delivered a field of it or a newer one. A patch that missed
-    :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is not awaited until it delivers again. No
-    patch is awaited for longer than ``patience_ns`` after the first field.
+    A frame is ready when every awaited patch has delivered its field for the frame or a newer field. A patch
+    that missed :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is not awaited until it delivers
+    again. No patch is awaited for longer than ``patience_ns`` after the first field.
 
     Args:
         patches: Names of the patches.
-        patience_ns: Longest wait after the first field of a frame.
+        patience_ns: Maximum wait after the first field of a frame.
         condition: Returns the condition of a patch.
     """
 
@@ -66,7 +66,7 @@ class HandGatherer:
         self._absences = dict.fromkeys(self._patches, 0)
         self._newest_given = 0
         self.late = 0
-        """Fields that came after their frame was complete or had been given up."""
+        """Number of fields that arrived after their frame had been delivered."""
 
     def add(self, field: FieldFrame, now_ns: int) -> None:
         """Add a field, received at monotonic time ``now_ns``."""
@@ -98,7 +98,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`next` has a frame if no field comes before; None if no frame has begun."""
+        """Return the deadline at which :meth:`next` returns the open frame; None if no frame is open."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -112,7 +112,7 @@ class HandGatherer:
 
 
 class HandSubscription:
-    """The hand frames of a running host. Iterate with ``for`` or ``async for``, or use :meth:`get`.
+    """Subscription to hand frames. Iterate with ``for`` or ``async for``, or use :meth:`get`.
 
     A slow reader loses the oldest fields, counted in ``dropped``, and then gets hand frames with patches
     missing. One thread reads.
@@ -129,20 +129,20 @@ class HandSubscription:
 
     @property
     def late(self) -> int:
-        """Fields that came after their frame was complete or had been given up."""
+        """Number of fields that arrived after their frame had been delivered."""
         return self._gatherer.late
 
     def get(self, timeout_s: float | None = None) -> HandFrame | None:
         """Return the next frame, or None.
 
         Args:
-            timeout_s: Longest wait, s; None waits without limit.
+            timeout_s: Maximum wait, s; None: no limit.
 
         Returns:
-            None if no frame came in time, or the host has closed.
+            The frame; None if no frame arrived in time, or if the host has closed.
 
         Raises:
-            SkinError: that stopped the host, if one did.
+            SkinError: the error that stopped the host, if any.
         """
         try:
             return self._next(timeout_s)
@@ -157,8 +157,8 @@ class HandSubscription:
         """Yield frames until the host closes.
 
         Raises:
-            TimeoutError: if no frame came for the subscription's timeout.
-            SkinError: that stopped the host, if one did.
+            TimeoutError: if no frame arrived within the subscription's timeout.
+            SkinError: the error that stopped the host, if any.
         """
         while True:
             try:
@@ -170,7 +170,7 @@ class HandSubscription:
             yield frame
 
     async def __aiter__(self) -> AsyncIterator[HandFrame]:
-        """Yield frames in an event loop, as ``for`` does."""
+        """Yield frames asynchronously, otherwise like :meth:`__iter__`."""
         while True:
             end_ns = _end_ns(self._timeout_s)
             while (frame := self._gatherer.next(time.monotonic_ns())) is None:
@@ -210,7 +210,7 @@ class HandSubscription:
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time until there is something to do, s."""
+        """Return the time until the next deadline, s; None if there is none."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - time.monotonic_ns()) * 1e-9 if times else None
 

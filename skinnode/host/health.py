@@ -1,4 +1,4 @@
-"""Health of patches and buses: conditions, and the rules by which facts lead to a condition.
+"""Health of patches and buses: conditions, and the rules that derive them from facts.
 
 :class:`~skinnode.host.node_monitor.NodeMonitor` collects the facts on the mainline.
 """
@@ -18,14 +18,15 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Heartbeat periods without a heartbeat after which a node is lost. CiA 301 leaves it to the integrator; one
-may be delayed by a burst of frames and one be destroyed by a bus error."""
+"""Number of heartbeat periods without a heartbeat after which a node is lost. CiA 301 leaves this number to
+the integrator; a burst of frames may delay one heartbeat and a bus error may destroy another."""
 
 SCANS_MISSED: Final = 3
-"""SYNC periods without a scan after which a patch is stale."""
+"""Number of SYNC periods without a scan after which a patch is stale."""
 
 SYNCS_MISSED: Final = 5
-"""SYNC periods without SYNC after which a bus of another master lacks SYNC; its patches are stale by then."""
+"""Number of SYNC periods without SYNC after which another master's bus is reported as lacking SYNC; its
+patches are stale by then."""
 
 
 class Condition(enum.StrEnum):
@@ -33,21 +34,21 @@ class Condition(enum.StrEnum):
 
     NEVER_SEEN = "never seen"
     BOOTING = "booting"
-    """The node sends, but is not operational yet."""
+    """The node is sending frames, but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
     """Operational by its heartbeat, but no scans arrive, or all are withheld."""
     RESTARTING = "restarting"
     """The node restarts by itself in a loop: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. A node
-    that restarted once, or that is operational again and has not restarted for 0.5 s, has the condition of
-    its present state."""
+    that restarted once, or that is operational again and has not restarted for 0.5 s, gets the condition that
+    fits its current state."""
     FROZEN = "frozen"
     """Scans arrive, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
     """The node's error register is not zero, or the host had a defect while serving the patch:
     :attr:`PatchHealth.defect`."""
     REFUSED = "refused"
-    """The node answers, but is not what the hand file says, or does not keep its configuration."""
+    """The node answers, but does not match the hand file or does not keep its configuration."""
     LOST = "lost"
     """The heartbeat of the node stopped."""
 
@@ -65,36 +66,38 @@ class PatchHealth:
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """EMCY messages that reported an error, since the host started."""
+    """Number of EMCY messages that reported an error since the host started."""
     last_emergency: int | None
-    """Code of the newest of them."""
+    """Error code of the newest of these messages; None before the first."""
     emergency_text: str
-    """Description of the newest of them; empty before the first."""
+    """Description of the newest of these messages; empty before the first."""
     error_register: int
     rejoins: int = 0
-    """Times the node came back and was brought up again since the host started."""
+    """Number of times the node came back and was brought up again since the host started."""
     refusal: str | None = None
-    """Why a node that answers is not used: another identity or layout, or a configuration not kept."""
+    """Why a node that answers is not used: wrong identity or layout, or configuration not kept."""
     restarts_in_a_loop: bool = False
-    """Whether the node restarted by itself three times within ten seconds, and continues to."""
+    """Whether the node restarted by itself three times within ten seconds, the last time within the past 5
+    s."""
     duplicate_id: bool = False
-    """Whether heartbeats come more often than one node sends them."""
+    """Whether heartbeats arrive more often than a single node sends them."""
     conflicts: int = 0
-    """Frames that contradict others of their scan: the node counts wrongly, or two nodes share a node-ID."""
+    """Number of frames that contradict other frames of their scan: the node counts wrongly, or two nodes
+    share a node-ID."""
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""
     defect: str | None = None
-    """Operation of the host that raised an exception, and the exception, until the patch is brought up again.
+    """The host's failed operation and its exception, until the patch has been brought up again.
     """
     slow_overruns: int = 0
-    """Number of emergencies 0x8110 that report a computer or bus too slow for the node's scans."""
+    """Number of EMCY messages 0x8110 reporting that the computer or bus is too slow for the node's scans."""
     baselines: int = 0
-    """Number of times a changed baseline was read, as after a tare."""
+    """Number of times a changed baseline was read, for example after a tare."""
     complaint: str | None = None
     """Why the last bring-up failed; None once a bring-up succeeded."""
     withheld: bool = False
-    """Whether scans arrive that cannot be decoded yet, because the node is being brought up or its baseline
-    is being read."""
+    """Whether arriving scans cannot be decoded yet because the node is being brought up or its baseline is
+    being read."""
 
     @property
     def reason(self) -> str:
@@ -119,7 +122,7 @@ class PatchHealth:
             case Condition.STALE:
                 return self._staleness()
             case Condition.FROZEN:
-                return f"node {self.node_id} sends the same codes again and again"
+                return f"node {self.node_id} sends the same codes in every scan"
 
     def _with_complaint(self, text: str) -> str:
         return f"{text}; {self.complaint}" if self.complaint else text
@@ -141,37 +144,37 @@ class PatchHealth:
 
 @dataclass(frozen=True, slots=True)
 class BusHealth:
-    """Health of a bus at one instant; counts are since the host started."""
+    """Health of a bus at one instant; events are counted from the start of the host."""
 
     bus: str
     away: str | None
     """Why the interface is away; None while it works."""
     load: float
-    """Share of the last second taken by frames."""
+    """Fraction of the last second during which frames occupied the bus."""
     error_frames: int
     bus_offs: int
     outages: int
     kernel_dropped: int
     dropped: int
-    """Frames that found the host's own queue full."""
+    """Frames dropped because the host's own queue was full."""
     malformed: int
     foreign: int
-    """Frames with COB-IDs that the hand file does not explain: those of ``foreign_ids``."""
+    """Frames with COB-IDs that no part of the hand file uses; ``foreign_ids`` lists the COB-IDs."""
     foreign_ids: tuple[int, ...]
     other_syncs: int
-    """SYNC messages of another producer on a bus where the host is the master."""
+    """SYNC messages from another producer on a bus where the host is the master."""
     other_masters: int
-    """NMT commands, SDO requests to nodes of the hand, or heartbeats with the host's node-ID, from another
-    sender."""
+    """NMT commands, SDO requests to nodes of the hand, and heartbeats with the host's node-ID, from other
+    senders."""
     controller: BusState | None = None
     """Newest reported state of the controller; None if none was reported."""
     no_sync: bool = False
-    """Whether another master runs the bus and its SYNC has not come for :data:`SYNCS_MISSED` periods."""
+    """Whether another master runs the bus and its SYNC has not arrived for :data:`SYNCS_MISSED` periods."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Facts about a patch from which its condition follows. Ages are in periods, None if never seen."""
+    """Facts about a patch that determine its condition. Ages are in periods; None if never received."""
 
     nmt_state: int | None
     late_heartbeats: float | None
@@ -184,7 +187,7 @@ class Evidence:
 
 
 def condition_of(facts: Evidence) -> Condition:
-    """Return the most serious condition that the facts show."""
+    """Return the most serious condition that the facts indicate."""
     late = facts.late_heartbeats
     stale = facts.late_scans is None or facts.late_scans > SCANS_MISSED
     rules = (

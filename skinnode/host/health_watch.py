@@ -1,4 +1,4 @@
-"""Watches the health of a running host and publishes what changed as events."""
+"""Watch the health of a running host and publish changes as events."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval of the checks, s: a change that ends sooner shows only in counters."""
+"""Interval between checks, s; a shorter change is visible only in the counters."""
 
 _QUIET_NS: Final = 1_000_000_000
-"""Minimum interval between events of a counter that keeps growing."""
+"""Minimum interval between events for a counter that keeps growing."""
 
 
 _PATCH_COUNTERS: Final = {
@@ -27,8 +27,8 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, each with the singular of what it counts, and the plural if that is
-irregular."""
+"""Counters of :class:`PatchHealth`, each with the noun for what it counts: the singular, and the plural if it
+is irregular."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),
@@ -44,9 +44,9 @@ _BUS_COUNTERS: Final = {
 
 
 class HealthWatch:
-    """Compares the health of all patches and buses with the last check, and publishes what changed.
+    """Watch that compares the health of all patches and buses with the last check and publishes changes.
 
-    Threads: one of its own checks, from construction to :meth:`close`.
+    Threads: a thread of its own runs the checks, from construction to :meth:`close`.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class HealthWatch:
     def _turn(self) -> bool:
         """Wait, then check. Returns False after the last check.
 
-        A check that raised is repeated: an event may come twice, but none is missed.
+        A check that raised an exception is repeated, so an event may be published twice, but none is missed.
         """
         if self._ended:
             return False
@@ -117,7 +117,7 @@ class HealthWatch:
         if now.away != before.away:
             self._publish(name, "away" if now.away else "back", now.away or "the bus is back")
         if now.no_sync != before.no_sync:
-            text = "no SYNC of its master is heard" if now.no_sync else "SYNC is heard"
+            text = "no SYNC received from its master" if now.no_sync else "SYNC received again"
             self._publish(name, "no SYNC" if now.no_sync else "SYNC", text)
         if now.controller is not before.controller and now.controller is not None:
             self._publish(name, now.controller.value, f"the controller is {now.controller}")
@@ -134,7 +134,7 @@ class HealthWatch:
         for fault in sorted({*now.wires} - {*before.wires}):
             self._publish(name, fault.state.value, f"{fault.side} wire {fault.number} is {fault.state}")
         for fault in sorted({*before.wires} - {*now.wires}):
-            self._publish(name, "well", f"{fault.side} wire {fault.number} is not {fault.state} any more")
+            self._publish(name, "well", f"{fault.side} wire {fault.number} is no longer {fault.state}")
         self._compare_counters(name, before, now, _PATCH_COUNTERS)
 
     def _compare_counters(

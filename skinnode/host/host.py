@@ -1,4 +1,4 @@
-"""A running host: fields, health, events, statistics and tare of a hand."""
+"""A running host: fields, health, events, statistics and taring of a hand."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class HostStats:
     malformed: tuple[CodecError, ...]
     """The first malformed frame of each bus that had one."""
     defects: Mapping[str, DefectStats]
-    """Exceptions that the host contained, by patch and by bus; under ``host`` those of neither."""
+    """Exceptions contained by the host, by patch and by bus; ``host`` holds those of neither."""
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
-        """Old name of :attr:`other_masters`, for one version."""
+        """Old name of :attr:`other_masters`; it will be removed in version 0.2."""
         warnings.warn(
-            "HostStats.rivals is HostStats.other_masters now; the old name goes in version 0.2",
+            "HostStats.rivals is now HostStats.other_masters; the old name will be removed in version 0.2",
             DeprecationWarning,
             stacklevel=2,
         )
@@ -68,7 +68,7 @@ class Host:
             for field in host.fields():
                 ...
 
-    Inside the block all nodes are operational, SYNC is sent, and a node that restarts or comes back is
+    Inside the block, all nodes are operational, SYNC is sent, and a node that restarts or comes back is
     brought up again. At the end of the block, and if bring-up fails, the nodes are pre-operational, every
     thread has ended and every interface is closed. On a bus that another master runs (``role = "guest"``),
     NMT and SYNC are left to that master.
@@ -99,7 +99,7 @@ class Host:
 
         Args:
             path: The hand file.
-            interface: As of :meth:`from_config`, like the other arguments.
+            interface: See :meth:`from_config`, as for the other arguments.
             channel: See there.
             boot_deadline_s: See there.
             cancelled: See there.
@@ -140,9 +140,9 @@ class Host:
 
         Args:
             hand: The hand.
-            interface: python-can interface to use in place of the file's.
-            channel: Channel to use in place of the file's; only for a hand of one bus.
-            boot_deadline_s: Longest time to the first response of a node, s.
+            interface: python-can interface to use in place of the hand's.
+            channel: Channel to use in place of the hand's; only for a hand with one bus.
+            boot_deadline_s: Maximum time to the first response of a node, s.
             cancelled: Called repeatedly during bring-up; once it returns True, bring-up ends with
                 BringUpCancelled.
             tap: Records the traffic, bring-up included: a :class:`skinnode.record.Recorder`.
@@ -154,7 +154,7 @@ class Host:
             BusError: if an interface does not open, or no node of a bus answers and ``bring_up.missing`` is
                 not ``wait``.
             NodeTimeout: if a node does not answer and ``bring_up.missing`` is not ``wait``.
-            NodeError: if a node is not what the hand says, or does not keep its configuration.
+            NodeError: if a node does not match the hand, or does not keep its configuration.
             BringUpCancelled: if ``cancelled`` returned True.
             ValueError: if ``boot_deadline_s`` is negative, infinite or not a number.
         """
@@ -173,10 +173,10 @@ class Host:
         """Subscribe to fields from now until the host closes, for ``for`` or ``async for``.
 
         Args:
-            timeout_s: The loop raises TimeoutError if no field came for this long, s; None: no limit.
-            capacity: Fields that the loop may lag behind before it loses the oldest; as in the hand file by
-                default.
-            patch: Only the fields of this patch; all patches by default.
+            timeout_s: Time without a field after which the loop raises TimeoutError, s; None: no limit.
+            capacity: Number of fields that the loop may lag behind before it loses the oldest; the hand
+                file's capacity by default.
+            patch: Patch whose fields are delivered; all patches by default.
 
         Raises:
             ValueError: if there is no such patch, or ``capacity`` or ``timeout_s`` is out of range.
@@ -187,11 +187,12 @@ class Host:
     def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
         """Subscribe to hand frames: the fields of all patches of one SYNC, for ``for`` or ``async for``.
 
-        A frame waits for the field of a patch for two SYNC periods at most, and not for a patch that is away.
+        A frame waits at most two SYNC periods for a patch's field, and does not wait for a patch that is
+        away.
 
         Args:
-            timeout_s: The loop raises TimeoutError if no hand frame came for this long, s; None: no limit.
-            capacity: Hand frames that the loop may lag behind; as in the hand file by default.
+            timeout_s: Time without a hand frame after which the loop raises TimeoutError, s; None: no limit.
+            capacity: Number of hand frames that the loop may lag behind; the hand file's capacity by default.
 
         Raises:
             ValueError: if the patches of the hand do not follow one SYNC with a counter.
@@ -210,18 +211,18 @@ class Host:
         patch: str | None = None,
         capacity: int | None = None,
     ) -> FieldCallback:
-        """Call ``function`` with each field from now on, on a thread of its own.
+        """Call ``function`` with each field from now on, on a separate thread.
 
-        The calls end with the host or with the callback's ``close()``. A function that blocks or raises loses
-        its own fields, counted by the callback.
+        The calls end with the host or with the callback's ``close()``. A function that blocks or raises an
+        exception loses only its own fields, which the callback counts.
 
         Args:
             function: Called with each field.
-            patch: Only the fields of this patch; all patches by default.
-            capacity: Fields that the function may lag behind; as in the hand file by default.
+            patch: Patch whose fields are delivered; all patches by default.
+            capacity: Number of fields that the function may lag behind; the hand file's capacity by default.
 
         Raises:
-            TypeError: if ``function`` is not a function, or is async.
+            TypeError: if ``function`` is not callable, or is async.
             ValueError: if there is no such patch, or ``capacity`` is out of range.
         """
         return self._callbacks.add(function, self.fields(capacity=capacity, patch=patch))
@@ -259,7 +260,7 @@ class Host:
         return served.health(no_sync=self._lacks_sync(served))
 
     def _lacks_sync(self, bus: ServedBus) -> bool:
-        """Return whether SYNC is missing. Patches that scan by their own clocks need none."""
+        """Return whether SYNC is missing. Patches that scan on their own clocks need no SYNC."""
         if not bus.sync_is_late(self._t_up_ns, self.hand.sync.period_ms * 1_000_000):
             return False
         streams = [node.stream for node in self._nodes.values() if node.link is bus.link]
@@ -269,7 +270,7 @@ class Host:
         """Subscribe to changes in the health of patches, wires and buses from now until the host closes.
 
         Args:
-            capacity: Events that the subscriber may lag behind before it loses the oldest.
+            capacity: Number of events that the subscriber may lag behind before it loses the oldest.
 
         Raises:
             ValueError: if ``capacity`` is below 1.
@@ -313,7 +314,7 @@ class Host:
         return untap
 
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
-        """Tare a patch: its present resistances become the baseline.
+        """Tare a patch: its current resistances become the baseline.
 
         Returns once the host has read the new baseline and solves with it. The event ``baselines`` confirms
         it to all subscribers. The command is RPDO1. The node loses the baseline at power-off unless it is
@@ -321,13 +322,13 @@ class Host:
 
         Args:
             patch: Name of the patch.
-            deadline_s: Longest wait, s; 5 s and three SYNC periods by default.
+            deadline_s: Maximum wait, s; 5 s plus three SYNC periods by default.
 
         Raises:
             KeyError: if there is no such patch.
-            NodeError: if another master runs its bus, a file keeps its baseline, or the node is not
+            NodeError: if another master runs its bus, its baseline is kept in a file, or the node is not
                 operational.
-            NodeTimeout: if no new baseline came in time.
+            NodeTimeout: if no new baseline arrived in time.
             BusError: if the command cannot be sent.
         """
         node = self._nodes[patch]

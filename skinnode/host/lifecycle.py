@@ -1,4 +1,4 @@
-"""Start and end of a host: the order in which its parts start, and the reverse order in which they end."""
+"""Start and shutdown of a host: its parts start in order and end in reverse order."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from skinnode.transport import CanPort
 _log = logging.getLogger(__name__)
 
 LAST_SCAN_S: Final = 0.5
-"""Longest wait of a host for its last scans when it ends, s."""
+"""Maximum wait for the last scans when a host closes, s."""
 
 _POLL_S: Final = 0.005
 
@@ -51,12 +51,12 @@ def never() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class StartOptions:
-    """How a host is started. Raises ValueError if the deadline is negative, infinite or not a number."""
+    """Start options. Raises ValueError if the deadline is negative, infinite or not a number."""
 
     boot_deadline_s: float = BOOT_DEADLINE_S
-    """Longest time to the first response of a node, s."""
+    """Maximum time to the first response of a node, s."""
     cancelled: Callable[[], bool] = never
-    """Called repeatedly during bring-up; once it returns True, bring-up ends with BringUpCancelled."""
+    """Called repeatedly during bring-up; once it returns True, bring-up raises BringUpCancelled."""
     tap: HostTap | None = None
     """Records the traffic, bring-up included."""
     open_port: Callable[[BusConfig], CanPort] = CanPort
@@ -83,14 +83,14 @@ class HostParts:
     callbacks: Callbacks
     events: Events
     defects: Defects
-    """Exceptions raised while serving no particular bus or patch."""
+    """Exceptions that concern no particular bus or patch."""
 
 
 @contextlib.contextmanager
 def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts]:
-    """Start the parts of a host, and end them with the ``with`` block.
+    """Start the parts of a host, and end them at the end of the ``with`` block.
 
-    At the end, in this order: SYNC stops, scans under way end, no node is configured any more, nodes become
+    At the end, in this order: SYNC stops, scans in progress end, configuration stops, nodes become
     pre-operational, the mainline ends, waiting scans are discarded, workers end, interfaces close, and the
     loops of subscribers end.
 
@@ -99,7 +99,7 @@ def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts
     """
     check_plan(hand)
     check_files(hand)
-    load_kernels()  # for the bus load: compiling them later would hold up the mainline
+    load_kernels()  # for the bus load: compiling them later would delay the mainline
     defects = Defects("host")
     publisher = Publisher(tuple(patch.name for patch in hand.patches), defects)
     callbacks = Callbacks(defects)
@@ -158,7 +158,7 @@ def _tap_all(tap: ContainedTap, buses: Iterable[ServedBus], nodes: Iterable[Remo
 def _brought_up(
     hand: HandConfig, nodes: Sequence[RemoteNode], options: StartOptions, stack: contextlib.ExitStack
 ) -> dict[RemoteNode, ScanSolver]:
-    """Configure and start the nodes; from now on, the end of ``stack`` puts them on stand-by."""
+    """Configure and start the nodes; closing ``stack`` makes them pre-operational again."""
     for patch in hand.patches:
         go_on_unless(options.cancelled)
         check_solvable(patch, hand.solver)
@@ -181,7 +181,7 @@ def _sync(
     nodes: Sequence[RemoteNode],
     stack: contextlib.ExitStack,
 ) -> SyncProducer | None:
-    """Send SYNC on the buses where the host is the master, until the end of ``stack``."""
+    """Send SYNC on the buses where the host is the master, until ``stack`` is closed."""
     own = [bus for bus in buses.values() if bus.link.config.role == "master"]
     if not own:
         return None
@@ -199,7 +199,7 @@ def _logged_already(error: Exception) -> None:
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans of the last SYNC, so that the end of the program cuts none off."""
+    """Wait for the scans of the last SYNC, so that the shutdown cuts none off."""
     end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if time.monotonic() > end_s:
@@ -214,4 +214,4 @@ def _stand_by(node: RemoteNode) -> None:
     try:
         nmt_master.stand_by(node.link.send, node.patch.node_id)
     except Exception as error:  # the bus is gone; the shutdown must continue
-        _log.warning("node %d was not put on stand-by: %s", node.patch.node_id, error)
+        _log.warning("node %d could not be made pre-operational: %s", node.patch.node_id, error)

@@ -1,4 +1,4 @@
-"""One bus of the hand: its port, what is sent on it, and what is received from it."""
+"""One bus of the hand: its port, and the sending and receiving of frames on it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class BusLink(Dispatcher):
     """An open bus, from construction to :meth:`close` or the end of a ``with`` block.
 
     An exception in a handler, a poller, a listener or a job loses that frame or call; an exception in the
-    mainline's own work pauses the bus, while received frames wait. An interface that fails later is reopened
-    until it works.
+    mainline's own work pauses the bus, while received frames wait. An interface that fails after opening is
+    reopened until it works.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
-    :class:`~skinnode.host.mainline.Mainline` calls the rest. A thread of its own reopens the interface.
+    :class:`~skinnode.host.mainline.Mainline` calls the rest. A separate thread reopens the interface.
 
     Args:
         config: The bus.
         handlers: Called on the mainline with the data frames of their COB-IDs.
-        on_defect: Called with the first occurrence of each complaint, on the thread that raised it.
+        on_defect: Called with the first occurrence of each distinct message, on the thread that raised it.
         open_port: Opens the interface.
 
     Raises:
@@ -53,15 +53,15 @@ class BusLink(Dispatcher):
     ) -> None:
         super().__init__(config, handlers, time.monotonic_ns())
         self.defects = Defects(config.name, on_defect)
-        """Exceptions raised while serving the bus, but no patch on it."""
+        """Collector of the exceptions raised while serving the bus itself, not one of its patches."""
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
         """Why the bus is away; None while it works."""
-        self._due_s = 0.0  # when a reopened interface that has not failed counts as working
+        self._due_s = 0.0  # when a reopened interface counts as working unless it failed
         self._outages = 0
         self.t_dispatched_ns = 0
-        """Monotonic time: all frames received up to then have been dispatched."""
+        """Monotonic time up to which all received frames have been dispatched."""
         self._rests = False  # True while the bus is away, and for a while after a defect
         self._rest_end_s = 0.0
         self._opening = False
@@ -80,11 +80,11 @@ class BusLink(Dispatcher):
         """Send a data frame. Any thread.
 
         Raises:
-            BusError: if the interface does not take it.
+            BusError: if the interface does not accept it.
         """
         t_ns = time.monotonic_ns()
         self._port.send(can_id, data)
-        try:  # the frame is sent; a listener must not fail the caller
+        try:  # the frame has been sent; a listener's exception must not reach the caller
             if can_id != SYNC_COB_ID:
                 self.intake.asked(t_ns)
             self.count_sent(can_id, data)
@@ -104,8 +104,8 @@ class BusLink(Dispatcher):
         Args:
             node_id: Node-ID of the node.
             on_answer: Called with the monotonic time of each SDO response, on the mainline.
-            defects: As of :meth:`handle`; if given, an exception in a transfer that is retried counts for the
-                bus.
+            defects: As in :meth:`handle`; if given, an exception in a transfer that is retried is counted for
+                the bus.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -125,7 +125,7 @@ class BusLink(Dispatcher):
         """Send a remote frame, as node guarding does. Any thread.
 
         Raises:
-            BusError: if the interface does not take it.
+            BusError: if the interface does not accept it.
         """
         t_ns = time.monotonic_ns()
         self._port.send(can_id, b"", remote=True)
@@ -138,7 +138,7 @@ class BusLink(Dispatcher):
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """End :meth:`listen_to_sent` for this listener. On the mainline."""
+        """Undo :meth:`listen_to_sent` for this listener. Mainline only."""
         self._sent_listeners = tuple(each for each in self._sent_listeners if each is not listener)
 
     def call(self, job: Callable[[], object], defects: Defects | None = None) -> None:
@@ -146,7 +146,7 @@ class BusLink(Dispatcher):
 
         Args:
             job: The function to run.
-            defects: Gets its exception; by default those of the bus.
+            defects: Collects its exception; the bus's collector by default.
         """
         self._jobs.append((job, self.defects if defects is None else defects))
 
@@ -168,7 +168,7 @@ class BusLink(Dispatcher):
         )
 
     def close(self) -> None:
-        """Close the interface. The mainline must have ended before."""
+        """Close the interface. The mainline must have ended."""
         self._port.close()
 
     def __enter__(self) -> Self:
@@ -179,14 +179,14 @@ class BusLink(Dispatcher):
     ) -> None:
         self.close()
 
-    # --- the mainline's
+    # --- called by the mainline
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict arrivals, as :meth:`Intake.expect`."""
+        """Predict arrivals, as :meth:`Intake.expect` does."""
         self.intake.expect(what, times_ns)
 
     def begin(self, resume: Callable[[], None]) -> None:
-        """Prepare for the first turn; ``resume`` is called to receive again on a reopened interface."""
+        """Prepare for the first turn; ``resume`` restarts reception on a reopened interface."""
         self._resume = resume
 
     def turn(self) -> None:
@@ -216,14 +216,14 @@ class BusLink(Dispatcher):
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
-        """End after the last turn: reopen the interface no more."""
+        """Stop reopening the interface. Called after the last turn."""
         self._stop.set()
         if self._reopening is not None:
             self._reopening.join()
 
     def _dispatch_received(self) -> bool:
-        """Dispatch one batch of frames. Returns whether there was any."""
-        seen_ns = self.intake.seen_ns  # read first: the batch then holds all frames that came before it
+        """Dispatch one batch of frames. Returns whether any frame was received."""
+        seen_ns = self.intake.seen_ns  # read first, so that the batch holds all frames up to this time
         batch = self.intake.take()
         while self._jobs:
             job, owner = self._jobs.popleft()
@@ -231,8 +231,8 @@ class BusLink(Dispatcher):
                 job()
             except Exception as error:
                 owner.report("a job of the mainline", error)
-        # While frames wait, here or in the interface, time is that of the newest dispatched one, so that a
-        # delay of the host makes no node late.
+        # While frames wait, here or in the interface, the time of the newest dispatched frame counts as now,
+        # so that a delay of the host makes no node appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns
@@ -244,7 +244,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """Pause until the interface is open again, or until the pause is over."""
+        """End a pause that is over, or start reopening the interface again if the thread did not start."""
         if not self._opening:
             self._rests = time.monotonic() < self._rest_end_s
         elif (
@@ -274,7 +274,7 @@ class BusLink(Dispatcher):
         self._reopening = thread  # set after start(): a thread that did not start cannot be joined
 
     def _reopen(self) -> None:
-        """Reopen the interface. If that fails, retry after a pause, a longer one after a defect."""
+        """Reopen the interface. Failures are retried after a pause, which is longer after a defect."""
         keep_on(self._reopens_not, self.defects, "reopening the interface")
 
     def _reopens_not(self) -> bool:

@@ -1,9 +1,9 @@
-"""LSS master (CiA 305 v3.0): finds nodes without a node-ID, and sets node-ID and bit rate of a node.
+"""LSS master (CiA 305 v3.0): finds nodes without a node-ID, and sets a node's node-ID and bit rate.
 
-A slave that does not match is silent, so every *no* costs a waiting time. Responses have no number: a late
-response to an earlier request looks like one to the present request. So a node counts as found or selected
-only once it has sent its own address, which no other response equals; and after a service without a response
-the master waits until no response can still arrive.
+A slave that does not match stays silent, so every negative answer costs a timeout. Responses are not
+numbered: a late response to an earlier request looks like one to the current request. Therefore a node counts
+as found or selected only once it has sent its own address, which no other response equals; and after a
+service without a response, the master waits until no late response can arrive.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ from skinnode.canopen.lss import (
 from skinnode.errors import BusError
 
 ANSWER_S: Final = 0.1
-"""Longest wait for a response, s; only heartbeats have a lower priority."""
+"""Maximum wait for a response, s; LSS frames have the lowest priority of all CANopen frames."""
 
 STORE_ANSWER_S: Final = 2.0
-"""Longest wait for the response to the store command, s: the node writes to flash memory, or to a file that
+"""Maximum wait for the response to the store command, s: the node writes to flash memory, or to a file that
 it synchronises to disk. CANopenNode's LSS master waits 1 s for any response."""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Waiting times in a fastscan, where every *no* costs one, s; the longer one if the first attempt found no
-node."""
+"""Timeouts in a fastscan, where every negative answer costs one, s; the longer timeout is used if the first
+attempt found no node."""
 
 _TRIES: Final = 2
-"""Requests without a response after which no node is assumed; a busy machine may miss one."""
+"""Number of requests without a response after which no node is assumed; a busy machine may miss one."""
 
 _SETTLE: Final = 0.2
-"""Share of the waiting time by which the responses of several slaves to one request may differ."""
+"""Spread in time of several slaves' responses to one request, as a fraction of the timeout."""
 
 _UNDER_WAY_S: Final = 0.4
-"""Time after which a missing response cannot arrive any more, s."""
+"""Time after which a missing response can no longer arrive, s."""
 
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""Addresses of skinnode patches, which fastscan tries first: three or four requests in place of 96."""
+"""Address parts of skinnode patches, which fastscan tries first: three or four requests instead of 96."""
 
 
 class LssFailed(BusError):
@@ -60,9 +60,9 @@ class LssFailed(BusError):
 
 
 class LssMaster:
-    """LSS master on one bus. It sends with ``send``; :meth:`on_response` gets the frames of COB-ID 0x7E4.
+    """LSS master on one bus. Sends with ``send``; :meth:`on_response` takes the frames with COB-ID 0x7E4.
 
-    Threads: one thread at a time may use it, except that :meth:`give_node_id` waits for its turn; the
+    Threads: only one thread at a time may use it, but calls of :meth:`give_node_id` wait for each other; the
     mainline calls :meth:`on_response`.
     """
 
@@ -72,17 +72,17 @@ class LssMaster:
         self._dialogue = threading.Lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """Take a response of a slave. One without 8 bytes is ignored, as the standard requires."""
+        """Process a slave's response. A response without 8 bytes is ignored, as the standard requires."""
         if len(data) == 8:
             self._answers.put(data)
 
     def give_node_id(self, serial: int, node_id: int) -> bool:
-        """Make the patch with this serial number boot at ``node_id``, without storing it.
+        """Make the patch with this serial number boot with ``node_id``, without storing the node-ID.
 
-        Storing is left to technicians. A patch that has the node-ID already stays unchanged.
+        Storing is left to technicians. A patch that already has the node-ID stays unchanged.
 
         Returns:
-            Whether there is such a patch and it took the node-ID.
+            Whether there is such a patch and it accepted the node-ID.
 
         Raises:
             BusError: if a frame cannot be sent.
@@ -116,7 +116,7 @@ class LssMaster:
         return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
     def find_unconfigured(self) -> LssAddress | None:
-        """Find a node without a node-ID by fastscan; it is in configuration state until :meth:`release`.
+        """Find a node without a node-ID by fastscan; it stays in configuration state until :meth:`release`.
 
         Returns:
             Its address, or None if no node was found.
@@ -137,7 +137,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """Return one part of the address of the node that remains in the scan; None if no node remains."""
+        """Return one part of the address of a node still in the scan; None if no node remains."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -151,14 +151,14 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        if answer is not None:  # other slaves may answer a little later, before the next request
+        if answer is not None:  # other slaves may answer a little later; wait before the next request
             time.sleep(answer_s * _SETTLE)
         return answer
 
     # --- one node
 
     def select(self, address: LssAddress) -> bool:
-        """Switch the node with that address to configuration state. Returns whether there is one."""
+        """Switch the node with this address to configuration state. Returns whether there is such a node."""
         self.release()
         for command, value in enumerate(address[:3], LssCommand.SELECT_VENDOR):
             self._request(command, value.to_bytes(4, "little"))
@@ -183,7 +183,7 @@ class LssMaster:
         return None
 
     def _is_in_configuration(self, address: LssAddress) -> bool:
-        """Return whether the node in configuration state answers that it has that address."""
+        """Return whether the node in configuration state reports this address."""
         return all(
             self._ask(command, b"", bytes((command,)) + value.to_bytes(4, "little")) is not None
             for command, value in enumerate(address, LssCommand.INQUIRE_VENDOR)
@@ -195,11 +195,11 @@ class LssMaster:
         Raises:
             LssFailed: if the node does not answer.
         """
-        answer = self._must(LssCommand.INQUIRE_NODE_ID, b"", "the inquiry for its node-ID")
+        answer = self._must(LssCommand.INQUIRE_NODE_ID, b"", "the node-ID inquiry")
         return None if answer[1] == NOT_CONFIGURED else answer[1]
 
     def set_node_id(self, node_id: int) -> None:
-        """Set the node-ID that the node has after its next reset of communication.
+        """Set the node-ID that the node uses after its next communication reset.
 
         Raises:
             LssFailed: if the node refuses or does not answer.
@@ -208,7 +208,7 @@ class LssMaster:
         _require_done(answer, f"node-ID {node_id}")
 
     def set_bit_rate(self, bitrate_bps: int) -> None:
-        """Set the bit rate that the node has after its next power-on, if it is stored.
+        """Set the bit rate that the node uses after its next power-on, provided it is stored.
 
         Raises:
             LssFailed: if the node refuses or does not answer.
@@ -222,7 +222,7 @@ class LssMaster:
         _require_done(self._must(LssCommand.CONFIGURE_BIT_TIMING, request, what), what)
 
     def store(self) -> None:
-        """Make the node keep its node-ID and bit rate over a power cycle.
+        """Make the node store its node-ID and bit rate, so that it keeps them over a power cycle.
 
         Raises:
             LssFailed: if the node refuses or does not answer.
@@ -231,7 +231,7 @@ class LssMaster:
         _require_done(answer, "the store command")
 
     def release(self) -> None:
-        """Switch all nodes to waiting state; a node that got its first node-ID boots."""
+        """Switch all nodes to waiting state; a node that has just got its first node-ID boots."""
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
     # --- frames
@@ -240,16 +240,16 @@ class LssMaster:
         answer = self._ask(command, data, answer_s=answer_s)
         if answer is None:
             time.sleep(_UNDER_WAY_S)
-            raise LssFailed(f"{what}: got no answer by LSS within {answer_s:g} s")
+            raise LssFailed(f"{what}: got no LSS answer within {answer_s:g} s")
         return answer
 
     def _ask(
         self, command: int, data: bytes = b"", expected: bytes | None = None, answer_s: float = ANSWER_S
     ) -> bytes | None:
-        """Send a request and return the first response in time that begins with ``expected``.
+        """Send a request and return the first response in time that starts with ``expected``.
 
-        By default that is the command. Other responses belong to earlier requests. Returns None if there is
-        none.
+        ``expected`` is the command by default. Other responses belong to earlier requests. Returns None if no
+        such response arrives.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

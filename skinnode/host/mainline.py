@@ -14,20 +14,20 @@ from skinnode.host.link import BusLink
 from skinnode.transport import Receiver
 
 _WAIT_S: Final = 0.02
-"""Longest wait for a frame, after which pollers run, s."""
+"""Maximum wait for a frame before the pollers run, s."""
 
 
 class Mainline:
-    """Receives and dispatches on ``links``, from construction to :meth:`stop` or the end of a ``with`` block.
+    """Thread that receives and dispatches on ``links`` until :meth:`stop` or the end of a ``with`` block.
 
     A failure on one bus does not affect the others.
 
-    Threads: one for all buses, because their frames come at the same time, and waking costs as much as twenty
-    frames.
+    Threads: one thread serves all buses, because their frames arrive at the same time and waking a thread
+    costs as much as handling twenty frames.
 
     Args:
         links: The buses.
-        defects: Gets exceptions raised outside the service of a bus; by default those of the first bus.
+        defects: Collects exceptions that concern no particular bus; the first bus's collector by default.
     """
 
     def __init__(self, links: Sequence[BusLink], defects: Defects | None = None) -> None:

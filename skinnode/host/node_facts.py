@@ -1,4 +1,4 @@
-"""What the host knows of a patch once its node has been configured."""
+"""Facts that the host knows about a patch once its node has been configured."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class NodeFacts:
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) resistances at rest, as the node encodes with them."""
+    """(U, K) resistances at rest with which the node encodes, ohm."""
     serial: int | None
-    """Serial number; None if the host may not ask."""
+    """Serial number; None if the host may not ask for it."""
     heartbeat_s: float
     """Heartbeat period of the node, s."""
     checked: bool = False
     """Whether the node is known to send a check with every scan; False if its revision could not be read."""
 
     def with_baseline(self, baseline_ohm: Float) -> NodeFacts:
-        """Return the facts after a tare."""
+        """Return a copy with another baseline, for example after a tare."""
         return replace(self, baseline_ohm=baseline_ohm)

@@ -1,4 +1,4 @@
-"""Collects what a node sends besides scans, and derives the health of its patch from it."""
+"""Collect what a node sends besides scans, and derive the health of its patch from it."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ RESTART_MEMORY_NS: Final = 5_000_000_000
 """Time after the last restart during which a node counts as restarting in a loop."""
 
 SETTLED_NS: Final = 500_000_000
-"""Time after the last restart in a loop during which a node counts as restarting although it is operational
+"""Time after the last restart in a loop during which a node counts as restarting even if it is operational
 again, ns."""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""Restarts of a node by itself, and the time within which they make a loop."""
+"""Number of restarts by the node itself, and the time within which they count as a loop."""
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
-"""Heartbeats observed, and the share of their expected duration below which two nodes send them. Two nodes
-with one node-ID send one every half period on average; a single node that catches up after a delay does not
-come near."""
+"""Number of heartbeats observed, and the fraction of their expected duration below which two nodes must be
+sending them. Two nodes with the same node-ID send a heartbeat every half period on average; a single node
+that catches up after a delay stays well above this fraction."""
 
 
 class NodeMonitor:
@@ -71,7 +71,7 @@ class NodeMonitor:
         self._registers_said = 0
         self._last_emergency: tuple[int, bytes] | None = None  # code and detail
         self.running = False
-        """Set once the node was started: from then on a boot-up is a restart."""
+        """Whether the node has been started; from then on, a boot-up counts as a restart."""
         self.rejoins = self.baselines = 0
         self.refusal: str | None = None
         self.defect: str | None = None
@@ -94,7 +94,7 @@ class NodeMonitor:
         return self._t_scan_ns
 
     def on_heartbeat(self, data: bytes, t_ns: int) -> None:
-        """Take a heartbeat or boot-up; reject it if it is not one byte long."""
+        """Process a heartbeat or boot-up; reject it if it is not one byte long."""
         if len(data) != 1:
             self.on_reject(CodecError(heartbeat_cob_id(self.node_id), data, "1 byte (heartbeat)"))
             return
@@ -111,7 +111,7 @@ class NodeMonitor:
         self._t_heartbeat_ns = t_ns
 
     def on_emergency(self, data: bytes, t_ns: int) -> None:
-        """Take an EMCY: u16 code, u8 error register, five manufacturer bytes.
+        """Process an EMCY: u16 code, u8 error register, five manufacturer bytes.
 
         Code 0 means that the error is gone.
         """
@@ -136,7 +136,7 @@ class NodeMonitor:
         return self._registers_said
 
     def on_register_read(self, register: int, said: int) -> None:
-        """Take an error register read by SDO, unless a newer report came since the request.
+        """Use an error register read by SDO, unless a newer report has arrived since the request.
 
         Args:
             register: The value read.
@@ -155,7 +155,7 @@ class NodeMonitor:
         return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
 
     def on_scan(self, t_ns: int) -> None:
-        """Note that a scan ended at monotonic time ``t_ns``."""
+        """Record that a scan ended at monotonic time ``t_ns``."""
         self._t_scan_ns = t_ns
 
     def health(
@@ -172,7 +172,7 @@ class NodeMonitor:
             now_ns: Monotonic time.
             heartbeat_s: Heartbeat period of the node, s.
             scan_s: Scan period, s.
-            conflicts: Frames that contradict others of their scan.
+            conflicts: Number of frames that contradict other frames of their scan.
             t_passed_ns: Monotonic time at which the newest scan that was not withheld was received; 0 before
                 the first, None if scans are never withheld.
         """
@@ -228,9 +228,9 @@ class NodeMonitor:
         )
 
     def _emergency_text(self, code: int, detail: bytes) -> str:
-        """Return the text of an emergency, that of a skinnode patch unless the node is refused.
+        """Return the text of an emergency, using skinnode's error texts unless the node is refused.
 
-        A refused node may be another device.
+        A refused node may be a different kind of device.
         """
         return error_text(code, detail, ours=self.refusal is None)
 
@@ -241,7 +241,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats come as often as two nodes send them."""
+        """Return whether heartbeats arrive as often as if two nodes sent them."""
         beats, period_ns = list(self._beats), heartbeat_s * 1e9
         if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
             return False

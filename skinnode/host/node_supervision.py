@@ -1,4 +1,4 @@
-"""The phases of a supervised node: what is done in each, and what leads to the next."""
+"""Phases of a supervised node: the actions in each phase, and the transitions between phases."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Longest time to a heartbeat that reports operational after the start command, s: four heartbeats."""
+"""Maximum time from the start command to a heartbeat that reports operational, s: four heartbeats."""
 
 _PROBE_NS: Final = 250_000_000
-"""Interval of requests to an absent node: its boot-up may have been lost, and a node without a heartbeat
-would never be noticed. For four nodes 0.1 % of a bus."""
+"""Interval of requests to an absent node: its boot-up message may have been lost, and a node that sends no
+heartbeat would never be noticed. For four nodes, the requests take 0.1 % of a bus."""
 
 _SEARCH_NS: Final = 1_000_000_000
-"""Interval of searches by LSS for an absent node."""
+"""Interval of LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
 """Silence after which a node is no longer reported as refused or faulty."""
@@ -37,9 +37,9 @@ _MUTE_NS: Final = 1_000_000_000
 
 
 class NodeSupervision:
-    """Decides what happens to each supervised node. Owned by the supervisor's thread.
+    """State machine of each supervised node. Owned by the supervisor's thread.
 
-    Jobs that wait for a node run on ``pool``, one job a node at a time.
+    Jobs that wait for a node run on ``pool``, one job per node at a time.
     """
 
     def __init__(self, pool: ThreadPoolExecutor) -> None:
@@ -47,12 +47,12 @@ class NodeSupervision:
         self._baselines = BaselineWatch(pool)
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Decide what happens to a node now, at monotonic time ``now_ns``."""
+        """Advance the state machine of a node at monotonic time ``now_ns``."""
         count = node.remote.defects.count
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
-        if count != node.defects:  # a bring-up is due anyway; exceptions from frames must not delay it
+        if count != node.defects:  # a bring-up is due anyway; exceptions raised by frames must not delay it
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
         match node.phase:
@@ -75,7 +75,7 @@ class NodeSupervision:
                 self._begin(node, now_ns)
             return
         if now_ns - max(heard_ns, node.since_ns) > _FORGET_NS:
-            monitor.refusal = monitor.defect = None  # the node is gone, whatever it was
+            monitor.refusal = monitor.defect = None  # the node is gone, so its fault no longer applies
         if remote.listen_only or remote.link.failure is not None:
             return
         if now_ns >= node.probe_ns:
@@ -88,9 +88,9 @@ class NodeSupervision:
             node.searching = self._pool.submit(_search, remote)
 
     def _begin(self, node: Supervised, now_ns: int) -> None:
-        """Start configuring the node, once no other job uses it.
+        """Start configuring the node, unless another job still uses it.
 
-        A job that still uses it is aborted, and the next turn tries again.
+        Such a job is aborted, and the next turn tries again.
         """
         if node.job is not None and not node.job.done():
             node.abandon.set()
@@ -107,9 +107,9 @@ class NodeSupervision:
 
     def _join(self, node: Supervised, now_ns: int) -> None:
         remote, job = node.remote, node.job
-        assert job is not None  # there is one in this phase
+        assert job is not None  # a job exists in this phase
         if remote.monitor.boot_ups != remote.boot_ups:
-            node.abandon.set()  # it booted again: what was written so far is lost
+            node.abandon.set()  # it booted again: the configuration written so far is lost
         if not job.done():
             return
         if node.abandon.is_set():
@@ -119,7 +119,7 @@ class NodeSupervision:
         node.job = None
         try:
             joined = job.result()
-            assert joined is not None  # a bring-up has a result
+            assert joined is not None  # a bring-up always has a result
             assert joined.solver is not None
             remote.start(joined.solver, joined.withholdings)
             note_baseline(node)
@@ -132,7 +132,7 @@ class NodeSupervision:
             remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if remote.has_other_master:  # its own master starts it
+        if remote.has_other_master:  # the other master starts it
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:
@@ -142,9 +142,9 @@ class NodeSupervision:
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL  # its state before the command
+            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL  # a state from before the command
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
-        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: it may have been lost
+        elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: the command may be lost
             node.probe_ns = now_ns + _PROBE_NS
             with contextlib.suppress(BusError):
                 nmt_master.start(remote.link.send, remote.patch.node_id)
@@ -158,7 +158,7 @@ class NodeSupervision:
         remote.monitor.rejoins = node.rejoins
         remote.monitor.refusal = remote.monitor.defect = None
         remote.monitor.complaint = None
-        _log.warning("node %d (%s) was brought up and runs", remote.patch.node_id, remote.patch.name)
+        _log.warning("node %d (%s) was brought up and is running", remote.patch.node_id, remote.patch.name)
 
     def _fail(self, node: Supervised, complaint: str, now_ns: int, *, refused: bool) -> None:
         if complaint != node.complaint:
@@ -168,11 +168,11 @@ class NodeSupervision:
         monitor = node.remote.monitor
         monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
-        monitor.running = monitor.running and not refused  # another host may use it now
-        self._await_again(node, now_ns, was_silent=True)  # also if refused: it may be another node by now
+        monitor.running = monitor.running and not refused  # another host may be using it now
+        self._await_again(node, now_ns, was_silent=True)  # also if refused: another node may replace it
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
-        """Make a patch faulty after a defect. Repeated at the next turn if it raises."""
+        """Mark a patch as faulty after a defect. If this raises an exception, the next turn repeats it."""
         remote = node.remote
         count = remote.defects.count
         node.abandon.set()
@@ -210,7 +210,7 @@ class NodeSupervision:
                     nmt_master.stand_by(remote.link.send, remote.patch.node_id)
             if node.phase is Phase.JOINING:
                 _log.warning(
-                    "node %d (%s) left NMT state %d for %s without a command of the host",
+                    "node %d (%s) left NMT state %d for %s without a command from the host",
                     remote.patch.node_id,
                     remote.patch.name,
                     NmtState.OPERATIONAL,
@@ -236,8 +236,8 @@ class NodeSupervision:
 
 
 def _read_back(node: Supervised) -> None:
-    """Find out whether a node that sends no scans lost its configuration."""
-    with contextlib.suppress(BusError, ConfigError):  # it is read again later
+    """Find out whether a node that sends no scans has lost its configuration."""
+    with contextlib.suppress(BusError, ConfigError):  # the configuration is read again later
         node.unconfigured = not node.remote.is_configured()
 
 

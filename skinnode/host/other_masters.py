@@ -1,4 +1,4 @@
-"""Detect other masters on a bus: the host does not receive its own frames, so these come from elsewhere."""
+"""Detect other masters on a bus by frames that only masters send; the host receives none of its own."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes",
 class OtherMasterStats:
     """Frames that only a master sends, from senders other than this host.
 
-    On a bus that another master runs, the first two counters are expected to be 0: they are not counted
+    On a bus that another master runs, the first two counters stay 0: SYNC and NMT commands are not counted
     there.
     """
 
     syncs: int
     nmt_commands: int
     sdo_requests: int
-    """To nodes of the hand, by a second host or a technician's tool."""
+    """SDO requests to nodes of the hand, from a second host or a technician's tool."""
     heartbeats: int
-    """With the node-ID of the host."""
+    """Heartbeats with the host's node-ID."""
     last_ns: int | None
-    """Monotonic time of the newest of them."""
+    """Monotonic time of the newest such frame; None before the first."""
 
 
 class OtherMasters:
-    """Counts the frames of other masters on one bus, and logs each kind once. Mainline only."""
+    """Counter of other masters' frames on one bus; logs the first of each kind. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus
@@ -47,7 +47,7 @@ class OtherMasters:
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
         """Return handlers for frames that only a master sends.
 
-        If another master runs the bus, those that it sends itself are left out.
+        If another master runs the bus, the SYNC and NMT commands that it sends itself are left out.
 
         Args:
             node_ids: Node-IDs of the hand on this bus.

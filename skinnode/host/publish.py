@@ -62,13 +62,13 @@ class Subscription:
         """Return the next field, or None.
 
         Args:
-            timeout_s: Longest wait, s; None waits without limit.
+            timeout_s: Maximum wait, s; None: no limit.
 
         Returns:
             None if no field came in time, or at once if the host has closed.
 
         Raises:
-            SkinError: that stopped the host, if one did.
+            SkinError: the error that stopped the host, if any.
         """
         try:
             return self.take(timeout_s)
@@ -80,7 +80,7 @@ class Subscription:
 
         Raises:
             queue.Empty: if no field came within ``timeout_s``.
-            SkinError: that stopped the host, if one did.
+            SkinError: the error that stopped the host, if any.
         """
         check_timeout(timeout_s)
         return self._open(self._queue.get(timeout_s))
@@ -125,8 +125,8 @@ class Subscription:
         """Yield fields until the host closes.
 
         Raises:
-            TimeoutError: if no field came for the subscription's timeout.
-            SkinError: that stopped the host, if one did.
+            TimeoutError: if no field arrived within the subscription's timeout.
+            SkinError: the error that stopped the host, if any.
         """
         while True:
             try:

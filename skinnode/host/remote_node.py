@@ -22,7 +22,7 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Longest wait for a small job on the mainline, which takes a turn fifty times a second unless its bus is
+"""Maximum wait for a small job on the mainline, which takes a turn fifty times a second unless its bus is
 away, s."""
 
 _ANSWER_S: Final = 0.05
@@ -94,8 +94,8 @@ class RemoteNode:
         """Configure the node; scans are withheld meanwhile.
 
         Args:
-            deadline_s: Longest time to its first response, s.
-            abandoned: Called repeatedly; once it returns True, configuring ends with Abandoned.
+            deadline_s: Maximum time to its first response, s.
+            abandoned: Called repeatedly; once it returns True, configuration raises Abandoned.
             on_answer: Called when the node has answered.
 
         Returns:

@@ -54,7 +54,7 @@ def configure_all(
     Args:
         nodes: The nodes.
         missing: ``wait`` if silent nodes may join later, ``refuse`` if all must be there.
-        deadline_s: Longest time to the first response of a node, s.
+        deadline_s: Maximum time to the first response of a node, s.
         cancelled: Called repeatedly; once it returns True, configuring ends.
 
     Returns:

@@ -29,7 +29,7 @@ def tare(
         node: The node of the patch.
         baselines: Returns how many baselines have been read.
         health: Returns the health of the patch.
-        deadline_s: Longest wait, s.
+        deadline_s: Maximum wait, s.
 
     Raises:
         NodeTimeout: after ``deadline_s``.

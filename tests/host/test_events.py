@@ -113,7 +113,7 @@ def test_each_wire_is_reported_when_it_breaks_and_when_it_is_mended(hand: HandHe
     one, two = WireFault("upper", 3, WireState.OPEN), WireFault("lower", 7, WireState.SHORT)
     assert after(hand, patch={"wires": (one,)}) == [("thumb", "open", "upper wire 3 is open")]
     assert after(hand, patch={"wires": (one, two)}) == [("thumb", "short", "lower wire 7 is short")]
-    assert after(hand, patch={"wires": (two,)}) == [("thumb", "well", "upper wire 3 is not open any more")]
+    assert after(hand, patch={"wires": (two,)}) == [("thumb", "well", "upper wire 3 is no longer open")]
 
 
 def test_a_condition_is_reported_with_its_reason(hand: HandHealth) -> None:
@@ -134,8 +134,8 @@ def test_two_nodes_of_one_node_id_are_reported_once(hand: HandHealth) -> None:
 
 
 def test_the_sync_of_a_guest_and_the_controller_are_reported(hand: HandHealth) -> None:
-    assert after(hand, bus={"no_sync": True}) == [("can0", "no SYNC", "no SYNC of its master is heard")]
-    assert after(hand, bus={"no_sync": False}) == [("can0", "SYNC", "SYNC is heard")]
+    assert after(hand, bus={"no_sync": True}) == [("can0", "no SYNC", "no SYNC received from its master")]
+    assert after(hand, bus={"no_sync": False}) == [("can0", "SYNC", "SYNC received again")]
     assert after(hand, bus={"controller": BusState.OFF, "bus_offs": 1}) == [
         ("can0", "bus-off", "the controller is bus-off"),
         ("can0", "bus_offs", "1 bus-off"),

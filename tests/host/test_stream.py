@@ -150,9 +150,9 @@ def test_pdo_of_wrong_length_is_rejected_counted_and_said_once(
     assert stats.patches["p0"].assembler.bad_length == 3
     assert stats.patches["p1"].assembler.bad_length == 1
     assert [record.getMessage() for record in caplog.records] == [
-        f"can0: {line}; rejected, as are others like it",
+        f"can0: {line}; this and similar frames are rejected",
         "can0: COB-ID 0x286: got 0 bytes (nothing), allowed: 8 bytes (scan summary); "
-        "rejected, as are others like it",
+        "this and similar frames are rejected",
     ]
 
 
@@ -202,7 +202,7 @@ def test_node_that_restarts_by_itself(hand: HandConfig, rack: Rack, caplog: pyte
         take(host.fields(timeout_s=10, patch="p1"), 4)
         assert host.health("p1").condition is Condition.OPERATIONAL
     said = [record.getMessage() for record in caplog.records if record.name.startswith("skinnode.")]
-    assert said == ["node 6 (p1) restarted by itself", "node 6 (p1) was brought up and runs"]
+    assert said == ["node 6 (p1) restarted by itself", "node 6 (p1) was brought up and is running"]
 
 
 def test_bus_that_fails_is_opened_again_and_the_stream_goes_on(

@@ -1,9 +1,9 @@
 """Traffic plan of a hand's buses: all frames, their load, and their worst-case delay.
 
 Each bus carries the SYNC, the host's heartbeat if enabled, the frames of other devices listed in the hand
-file, and consecutive SDO transfers that use :data:`SDO_SHARE` of the bus. For each patch, it also carries all
-chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every heartbeat period.
-Configuring a returning node by SDO is not counted, because SDO has a lower priority than any PDO and
+file, and a sequence of SDO transfers that uses :data:`SDO_SHARE` of the bus. For each patch, it also carries
+all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every heartbeat
+period. Configuring a returning node by SDO is not counted, because SDO has a lower priority than any PDO and
 therefore uses only spare bandwidth.
 """
 
@@ -105,7 +105,7 @@ class BusPlan:
 
     @property
     def frames_per_s(self) -> float:
-        """Frames per second on the whole bus."""
+        """Total number of frames per second on the bus."""
         return sum(frame.frames_per_s for frame in self.frames)
 
     @property
@@ -185,7 +185,7 @@ def _rate(bus: BusConfig) -> str:
 
 
 def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
-    """Return the plan of each bus that has patches, regardless of its load.
+    """Return the plan of each bus that has patches, without checking its load.
 
     Args:
         hand: the hand.
@@ -225,7 +225,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # for every node, although the plan counts SDO only once per bus
+    for patch in patches:  # identifiers of every node, although the plan counts SDO only once
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",

@@ -74,8 +74,8 @@ def are_loaded() -> bool:
 def load_kernels() -> None:
     """Compile the kernels, or read them from the cache.
 
-    This takes half a second, during which a receiving thread could not answer requests, so call it in
-    advance.
+    This takes half a second, during which a receiving thread could not answer requests, so call this function
+    in advance.
     """
     global _loaded
     _loaded = True
@@ -162,6 +162,7 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
             code = 6 + length // 4  # 12, 16, 20, 24
         else:
             code = 11 + length // 16  # 32, 48, 64
+
         # Two filler bits extend the 22 bits up to the length code to three bytes, and the data bytes follow.
         # FDF, res and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code

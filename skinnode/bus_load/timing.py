@@ -9,7 +9,7 @@ CRC and stuffing are computed bytewise with tables. The head of a frame is padde
 For the CRC, the padding is zeros, which leave the CRC at 0. For stuffing, it is alternating bits that end in
 a 1, so the dominant start of frame begins a new run.
 
-CAN FD frames have an 11-bit identifier and switch the bit rate. They are stuffed by the same rule up to the
+CAN FD frames have an 11-bit identifier and switch the bit rate. Bit stuffing follows the same rule up to the
 end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and
 fixed stuff bits: one before the field and one after every 4 bits. The bits from ESI to the CRC delimiter are
 sent at the data bit rate. The 17 bits before them and the 12 bits after them (ACK slot, ACK delimiter, 7-bit
@@ -155,8 +155,9 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
     # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 and every 4 further bits. FDF, res and
-    # BRS alternate, ESI is 0 and the length code is known. The data are the worst case.
-    stuff = {(1 << 2) + 1: 0}  # a run of one recessive bit, BRS
+    # BRS alternate, ESI is 0 and the length code is known. The data are the worst case. The first run is one
+    # recessive bit, BRS.
+    stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
     choices += [(0, 1)] * (8 * length)
@@ -243,7 +244,7 @@ class BusLoad:
         dlc: int = 0,
         fd: bool = False,
     ) -> None:
-        """Count a frame, whose bits :func:`exact_bits` or, if ``fd``, :func:`fd_bits` determines.
+        """Count a frame and its bits, as given by :func:`exact_bits` or, if ``fd``, :func:`fd_bits`.
 
         ``data`` is kept until the next batch, without being copied.
         """

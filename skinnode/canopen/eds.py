@@ -2,8 +2,8 @@
 
 An EDS (electronic data sheet) describes a type of device; a DCF (device configuration file) describes the
 configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as conforming
-tools expect. The canopen library expects decimal numbers and discards such a default; 0 is the same in both
-notations.
+tools expect. The canopen library expects decimal numbers and discards a hexadecimal default; 0 is the same in
+both notations.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Commissioning:
 
 
 def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissioning | None = None) -> str:
-    """Return the text of an EDS or DCF file, determined by the arguments alone; lines end in LF.
+    """Return the text of an EDS or DCF file; it depends only on the arguments, and its lines end in LF.
 
     Args:
         info: the device.

@@ -44,7 +44,7 @@ class EmcyCode(IntEnum):
 TOO_SLOW: Final = 1
 """Third detail byte of EMCY 0x8110 if a slow computer or bus delayed chunks beyond the inhibit time.
 
-It follows the u16 count of skipped scans. The value 0 means that a scan takes longer than the scan period.
+This byte follows the u16 count of skipped scans; 0 means that a scan takes longer than the scan period.
 """
 
 _CODES: Final = {

@@ -171,9 +171,9 @@ LOWER_WIRE_FAULTS: Final = 0x2031
 REJECTED_FRAMES: Final = 0x2040
 """Counters; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Index for upper wire 0 (add r for wire r) of the last codes, with one sub-index per column."""
+"""Index of the last codes of upper wire 0, with one sub-index per column; add r for upper wire r."""
 BASELINE: Final = 0x2200
-"""Index for upper wire 0 (add r for wire r) of R0, ohm, one sub-index per column; 0 if R0 is unknown."""
+"""Index of R0 of upper wire 0, ohm (0 if unknown), one sub-index per column; add r for upper wire r."""
 COORDINATES: Final = 0x2300
 """DOMAIN; see :func:`skinnode.protocol.coordinates.pack_coordinates`."""
 BASELINE_DOMAIN: Final = 0x2301

@@ -144,7 +144,7 @@ class PoseConfig(Table):
         return self
 
     def build(self) -> Pose:
-        """Return the pose, for :func:`skinnode.model.pose.positions_in_hand_m`."""
+        """Return the pose as :func:`skinnode.model.pose.positions_in_hand_m` takes it."""
         if self.rpy_rad is not None:
             return Pose.from_rpy(self.position_m, self.rpy_rad)
         return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))

@@ -25,7 +25,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """The path is a symbolic link, a folder, a pipe or a device, none of which is locked."""
+    """The path is a symbolic link, a folder, a pipe or a device; only regular files can be locked."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -34,7 +34,7 @@ class NotARegularFile(OSError):
 
 @dataclass(frozen=True, slots=True)
 class FileLock:
-    """Acquired lock. The kernel releases it when the process ends, even if the process is killed."""
+    """Acquired lock. The kernel releases the lock when the process ends, even if the process is killed."""
 
     path: Path
     descriptor: int

@@ -15,7 +15,7 @@ def require_matplotlib(file: Path) -> None:
     """Check that matplotlib is installed and can write the format given by the suffix of ``file``.
 
     Raises:
-        ConfigError: matplotlib is missing, or does not write such files.
+        ConfigError: matplotlib is missing, or cannot write this format.
     """
     if find_spec("matplotlib") is None:
         raise ConfigError("--plot", str(file), "only with matplotlib: sh install.sh plot")

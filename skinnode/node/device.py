@@ -43,7 +43,7 @@ Handler = Callable[[bytes, int], None]
 
 
 class CanopenDevice:
-    """A CANopen node. It sends nothing until :meth:`power_on`.
+    """A CANopen node. The node sends nothing until :meth:`power_on`.
 
     Args:
         node_id: 1 to 127, or 255 to wait for a node-ID. A node-ID that LSS stored in the memory takes
@@ -79,7 +79,7 @@ class CanopenDevice:
             raise ValueError(f"serial: got {serial}, must be an unsigned 32-bit integer")
         self._default_node_id = node_id
         self.node_id = node_id
-        """Active node-ID; 255 while there is none."""
+        """Active node-ID; 255 while the node has none."""
         self._send = send
         self._now_ns = 0
         self._store = ObjectStore(objects, node_id)
@@ -240,7 +240,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Initialise and boot with the node-ID set by LSS, or wait for one if there is none."""
+        """Initialise and boot with the node-ID set by LSS, or wait for a node-ID if there is none."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id

@@ -170,7 +170,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return the number of errors at sub-index 0, otherwise an error; sub-index 1 is the newest."""
+        """Return the number of errors (sub-index 0) or one of the errors; sub-index 1 is the newest."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):

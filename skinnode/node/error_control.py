@@ -24,7 +24,7 @@ from skinnode.node.services import NodeServices
 Handler = Callable[[bytes, int], None]
 
 _RIVAL_BEATS: Final = 3
-"""Number of own heartbeat periods after which another node with this node-ID counts as gone if silent. Both
+"""Number of own heartbeat periods of silence after which another node with this node-ID counts as gone. Both
 nodes usually have the same period, set by the same master, and one heartbeat may be lost."""
 _RIVAL_NS: Final = 750_000_000
 """Time after which the other node counts as gone if this node sends no heartbeats, ns; three default periods.
@@ -52,8 +52,8 @@ class ErrorControl:
         self._rejected, self._send = services.rejected, services.send
         self._listen = listen
         self._booted_ns: int | None = None  # time of a boot-up message that has not been sent yet
-        self._rival_until_ns = NO_DEADLINE_NS  # when another node with this node-ID counts as gone
         self._producer = HeartbeatProducer()
+        self._rival_until_ns = NO_DEADLINE_NS  # time at which another node with this node-ID counts as gone
         self._guarding = Guarding(store, emcy, failed)
         self._consumer = HeartbeatConsumer(store, emcy, failed)
         store.watch(od.HEARTBEAT_PRODUCER, lambda _: self._on_period())

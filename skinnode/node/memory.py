@@ -1,6 +1,6 @@
 """Values that a node keeps across a power cycle.
 
-A memory holds one :class:`Kept` as a whole. Reading returns either the last or the previous saved content,
+A memory stores one :class:`Kept` as a unit. Reading returns either the last or the previous saved content,
 never a mixture. :mod:`skinnode.node.memory_file` stores it in a file.
 """
 
@@ -43,7 +43,7 @@ class Kept:
 
 
 class Fault(IntEnum):
-    """Reason why all or part of a memory cannot be used; its value is sent in the emergency message."""
+    """Reason why a memory is wholly or partly unusable; its value is sent in the emergency message."""
 
     UNREADABLE = 1
     DAMAGED = 2
@@ -82,7 +82,7 @@ class Memory(Protocol):
 
 
 class VolatileMemory:
-    """Memory that lasts as long as this object, used as the non-volatile memory of a simulated board."""
+    """Memory that lasts as long as this object; serves as the non-volatile memory of a simulated board."""
 
     def __init__(self) -> None:
         self._kept: Kept | None = None

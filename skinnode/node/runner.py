@@ -36,9 +36,9 @@ REOPEN_S: Final = 1.0
 class NodeRunner:
     """Runner that powers nodes on and runs them until :meth:`stop`.
 
-    A runner can be started once. Bus errors do not end it. Its thread owns the nodes from :meth:`start` to
-    :meth:`stop`; other threads may only read the nodes' counters. The port stays open afterwards. Timers are
-    as precise as the most demanding node requires.
+    A runner can be started once. Bus errors do not stop it. The runner's thread owns the nodes from
+    :meth:`start` to :meth:`stop`; other threads may only read the nodes' counters. The port stays open
+    afterwards. Timers are as precise as the most demanding node requires.
 
     Args:
         port: the port that all nodes share.
@@ -75,7 +75,7 @@ class NodeRunner:
         return self._error is not None
 
     def start(self) -> None:
-        """Power the nodes on in order, and return once each has its node-ID.
+        """Power the nodes on in order, and return once each is on and has loaded any stored node-ID.
 
         If an error ends the thread, :meth:`stop` raises it.
         """

@@ -54,7 +54,7 @@ class Storage:
         """Latest problem with the memory, in one line; empty if there was no problem."""
         self.baseline_ohm: Callable[[], Rows] = tuple
         """Function that returns the current R0, ohm; set by the application."""
-        able = int(memory is not None).to_bytes(4, "little")  # 1: saves and restores on command
+        able = int(memory is not None).to_bytes(4, "little")  # 1: the node saves and restores on command
         for index, signature, command in (
             (od.STORE, od.STORE_SIGNATURE, self._save),
             (od.RESTORE, od.RESTORE_SIGNATURE, self._forget),

@@ -89,8 +89,8 @@ class Sync:
         self.window = SyncWindow(store, services.emcy)
         """The synchronous window."""
         self._communicates = False
-        self._period_ns = 0
         self._counter = 0  # counter of the last SYNC produced
+        self._period_ns = 0
         self._wrong_length: int | None = None  # length of the last SYNC consumed, if wrong
         self.cob_id = od.SYNC_COB_ID
         """COB-ID of SYNC messages."""
@@ -173,7 +173,7 @@ class Sync:
             raise Refused(AbortCode.INVALID_VALUE)
 
     def _guard_overflow(self, _: int, value: int) -> None:
-        if value == 1:  # 0, or 2 to 240
+        if value == 1:  # allowed: 0, or 2 to 240
             raise Refused(AbortCode.INVALID_VALUE)
         if self._store.integer(od.CYCLE_PERIOD):
             raise Refused(AbortCode.DEVICE_STATE)

@@ -29,8 +29,8 @@ def write_configuration(store: ObjectStore, values: Mapping[Key, bytes]) -> list
         values: bytes of each value, by index and sub-index.
 
     Returns:
-        Index and sub-index of each value that is not allowed. That object keeps its default; if it is a
-        mapping entry, the whole mapping keeps its default.
+        Index and sub-index of each value that is not allowed. Such an object keeps its default; if the object
+        is a mapping entry, the whole mapping keeps its default.
     """
     known = {key: value for key, value in values.items() if store.has(*key)}
     refused = [key for key in values if key not in known]

@@ -2,8 +2,8 @@
 
 **Scans are never mixed.** A scan holds only frames with its own counter that arrived within the *timeout* of
 its first frame, and it is closed for good when a frame of a newer scan arrives. Frames of two scans can
-therefore share a scan only if they carry the same counter and arrive within the timeout of each other. That
-cannot happen while counter range × period is longer than the timeout plus the age of the oldest frame,
+therefore share a scan only if they carry the same counter and arrive within the timeout of each other. Such
+mixing cannot happen while counter range × period is longer than the timeout plus the age of the oldest frame,
 measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter range is
 shorter), so with the usual range of 240 scans a frame may be 237 periods old.
 
@@ -28,8 +28,8 @@ its frame is dropped. After a timeout without an accepted frame any counter star
 node or the SYNC producer may have been restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the others keep
-their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan in between was lost, torn or overrun, or a
-silence was long enough to hide such a scan, these codes may have changed and are invalid until their chunks
+their last codes (:mod:`skinnode.protocol.partial_scan`). If any scan since then was lost, torn or overrun, or
+a silence was long enough to hide such a scan, these codes may have changed and are invalid until their chunks
 are sent again.
 """
 
@@ -63,8 +63,8 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 class ScanAssembler:
     """Assembler of one patch's scans. Every method returns at most one scan, in ascending order.
 
-    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. It returns a scan whose
-    missing frames have timed out, or a scan that ended in the same call as the previous scan.
+    Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. ``poll`` returns a scan
+    whose missing frames have timed out, or a scan that ended in the same call as the scan before it.
 
     Args:
         profile: sizes of the patch.

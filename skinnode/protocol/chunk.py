@@ -21,7 +21,7 @@ _COB_ID: Final = od.chunk_cob_id(0)
 
 
 class Chunk(NamedTuple):
-    """Chunk of a scan as sent."""
+    """Chunk of a scan, as sent on the bus."""
 
     chunk: int
     """Chunk index; the chunk's first code is code number ``chunk · codes_per_chunk`` of the scan."""

@@ -20,7 +20,7 @@ class SendMode(enum.IntEnum):
 
 
 class Command(NamedTuple):
-    """Command as sent."""
+    """Command, as sent on the bus."""
 
     tare: int
     """:data:`~skinnode.canopen.indices.TARE_SIGNATURE` to tare; any other number has no effect."""

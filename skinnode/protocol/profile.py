@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period on which the defaults are based, ms; four 10×30 patches load 1 Mbit/s to about two thirds."""
+"""SYNC period on which the defaults are based, ms; four 10×30 patches use about 2/3 of 1 Mbit/s."""
 
 BusType = Literal["classic", "fd"]
 """Kind of frame that carries PDOs: CAN 2.0 with up to 8 bytes, or CAN FD with up to 64 bytes."""
@@ -59,9 +59,9 @@ class PatchProfile:
     code_bits: int = 16
     """Width of a code, bits: 16 or 24."""
     rpdos: int = 4
-    """Number of RPDOs: RPDO1 takes commands, the others are spare."""
+    """Number of RPDOs: RPDO1 takes commands; the others are spare."""
     tpdos: int = 4
-    """Number of TPDOs: TPDO1 carries chunks, TPDO2 summaries, the others are spare."""
+    """Number of TPDOs: TPDO1 carries chunks and TPDO2 summaries; the others are spare."""
     bus: BusType = "classic"
     """Kind of frame that carries PDOs."""
     checked: bool = True

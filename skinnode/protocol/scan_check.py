@@ -31,7 +31,7 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
     """Return the scan check, a CRC over the codes that the receiver must hold and over the summary.
 
     CRC-16/IBM-3740: polynomial x¹⁶ + x¹² + x⁵ + 1 (0x1021), initial value 0xFFFF, most significant bit first,
-    not inverted; check value 0x29B1 for the ASCII digits ``123456789``. It covers, in this order:
+    not inverted; check value 0x29B1 for the ASCII digits ``123456789``. The CRC covers, in this order:
 
     1. All U·K codes, one upper wire after another, little-endian: 2 bytes each, or 3 for 24-bit codes.
        These are the codes that a receiver holds after this scan. If only changed chunks are sent, they are
@@ -40,8 +40,8 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
        of a different scan therefore fails the check.
 
     The check always detects changes within a span of 16 bits, such as a change of one 16-bit code, and any
-    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. It misses
-    one in 65,536 of all other errors.
+    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. The check
+    misses one in 65,536 of all other errors.
 
     Args:
         check_of_codes: result of :func:`check_of_codes`.

@@ -29,16 +29,16 @@ class SummaryFlag(enum.IntFlag):
     WIRE_FAULT = 0x04
     """A wire is open or shorted; see 0x2030 and 0x2031."""
     BASELINE_CHANGED = 0x08
-    """The codes of this scan are the first with a new baseline; read 0x2200 … again."""
+    """This scan is the first with a new baseline; read the baseline (0x2200 and above) again."""
     SOURCE_FAILED = 0x10
     """The converter returned no valid reading, so no chunk was sent and this scan's codes are unknown."""
     CHECKED = 0x20
     """Bytes 4 to 7 are u16 device time in steps of 64 µs and u16 scan check. Without this flag, as in patches
-    of revision 1.0, they are u32 device time in µs."""
+    of revision 1.0, these bytes are u32 device time in µs."""
 
 
 class Summary(NamedTuple):
-    """Scan summary as sent."""
+    """Scan summary, as sent on the bus."""
 
     scan: int
     """Scan counter, u8."""

@@ -88,7 +88,7 @@ class PatchApplication:
         return min(self._scan_ns, self.stream.deadline_ns)
 
     def power_on(self, t_ns: int) -> None:
-        """Load the baseline from the memory, or tare if it holds none.
+        """Load the baseline from the memory, or tare if the memory holds none.
 
         Args:
             t_ns: current time, ns.

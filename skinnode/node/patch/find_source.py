@@ -35,7 +35,7 @@ def load(reference: str, option: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (Exception, SystemExit) as error:  # importing a module can raise anything
+    except (Exception, SystemExit) as error:  # importing a module can raise any exception
         raise ConfigError(option, reference, f"MODULE:NAME that can be imported ({_line(error)})") from error
     return found
 

@@ -24,7 +24,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 class PatchNode(CanopenDevice):
-    """CANopen node of one patch. It sends nothing until :meth:`power_on`.
+    """CANopen node of one patch. The node sends nothing until :meth:`power_on`.
 
     Args:
         node_id: 1 to 127, or 255 to obtain a node-ID by LSS. A node-ID that LSS stored in the memory takes
@@ -102,7 +102,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def memory_problem(self) -> str:
-        """Latest problem with the memory, in one line; empty if there was no problem."""
+        """Latest problem with the memory, in one line; empty if there was none."""
         return self._storage.problem
 
     @property

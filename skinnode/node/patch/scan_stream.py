@@ -11,9 +11,9 @@ therefore compensates for lateness of up to ``catch_up_ns``, if necessary with s
 never exceeds the mean rate (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum
 interval is strict.
 
-The node knows the time of a SYNC, but not how long sampling then takes. It therefore requests a timer event
-right after the first chunk of a scan. This event supplies the current time, from which the interval to the
-second chunk is measured.
+The node knows the time of a SYNC, but not how long sampling then takes. The node therefore requests a timer
+event immediately after the first chunk of a scan. This event supplies the current time, from which the
+interval to the second chunk is measured.
 
 Synchronous TPDOs obey the synchronous window (0x1007): chunks and a summary not sent before the window closes
 are discarded. The window does not apply to event-driven TPDOs.
@@ -74,13 +74,13 @@ class ScanStream:
         self._whole_record = [(od.CHUNK, sub) for sub in range(1, store.integer(od.CHUNK, 0) + 1)]
         self._scan: OutgoingScan | None = None
         self._next_scan: OutgoingScan | None = None
+        self._carrier: Tpdo | None = None  # TPDO that carries the chunks of the scan being sent
         self._unsent: deque[bytes] = deque()
-        self._carrier: Tpdo | None = None  # carries the chunks of the scan being sent
         self._verbatim = False  # whether the carrier maps the whole record unchanged
         self._chunks_sent = 0
-        self._just_begun = False
         self._busy_ns = 0  # start of the current run of back-to-back scans
-        self._paced_ns = 0  # sum of the inhibit times since then
+        self._just_begun = False
+        self._paced_ns = 0  # sum of the inhibit times since the start of the run
         self.chunk = chunk
         """Chunk record sent last."""
         self.summary = bytes(12)
@@ -111,7 +111,7 @@ class ScanStream:
             return NO_DEADLINE_NS
         return 0 if self._carrier is None or self._just_begun else self._carrier.ready_ns
 
-    # --- as the owner of TPDOs
+    # --- callbacks as the owner of TPDOs
 
     def sends(self, tpdo: Tpdo) -> bool:
         """Return whether a TPDO is currently carrying the chunks of a scan."""

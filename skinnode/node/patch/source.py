@@ -33,7 +33,7 @@ class SourceFault(IntEnum):
 
 
 class SourceFailed(Exception):
-    """Error raised if a reading fails. It never propagates out of the node."""
+    """Error raised if a reading fails. This error never leaves the node."""
 
     def __init__(self, fault: SourceFault, message: str) -> None:
         self.fault = fault

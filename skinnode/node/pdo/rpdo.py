@@ -65,6 +65,7 @@ class RpdoEngine:
         self._timers = Timers()
         self._by_cob_id: dict[int, list[_Rpdo]] = {}
         self._pending: dict[int, bytes] = {}  # synchronous RPDOs received since the last SYNC
+
         # Numbers of the RPDOs with a lasting error.
         self._short: set[int] = set()
         self._late: set[int] = set()

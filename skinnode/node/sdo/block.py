@@ -99,8 +99,8 @@ class BlockUpload(Transfer):
         self._segments = max(1, -(-len(data) // SEGMENT_BYTES))  # an empty value also takes one segment
         self._block_size = _checked(upload.block_size)
         self._first = 0  # segments sent before the current block
-        self._sent = 0  # segments of the current block
         self._pace_ns = SEGMENT_NS
+        self._sent = 0  # segments sent of the current block
         self._waits_for = _Upload.START
         self._previous, self._previous_ns = b"", t_ns
         # Both sides must offer a CRC. Some clients expect a CRC they did not request if the server offers it.

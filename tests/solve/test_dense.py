@@ -109,11 +109,9 @@ def test_inverse_diagonal(n, seed):
 def test_products(m, k, n, seed):
     rng = np.random.default_rng(seed)
     a, b = rng.normal(size=(m, k)), rng.normal(size=(k, n))
-    c, again = np.full((m, n), np.nan), np.full((m, n), np.nan)
+    c = np.full((m, n), np.nan)
     dense.multiply(a, b, c)
-    dense.multiply_transposed(a, np.ascontiguousarray(b.T), again, np.empty((k, n)))
     assert (np.abs(c - a @ b) <= 2 * k * EPS * (np.abs(a) @ np.abs(b))).all()
-    np.testing.assert_array_equal(again, c)
     v, one = rng.normal(size=k), np.full(m, np.nan)
     dense.multiply_vector(a, v, one)
     assert (np.abs(one - a @ v) <= 2 * k * EPS * (np.abs(a) @ np.abs(v))).all()

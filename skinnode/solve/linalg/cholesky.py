@@ -230,19 +230,6 @@ def multiply_vector(a: Float, v: Float, out: Float) -> None:
 
 
 @njit
-def multiply_transposed(a: Float, b: Float, c: Float, work: Float) -> None:
-    """Write ``a`` (m, k) · ``b``ᵀ into ``c`` (m, n), ``b`` (n, k); ``work`` (k, n) is scratch.
-
-    If Bᵀ is available, use :func:`multiply` instead.
-    """
-    for j in range(b.shape[0]):
-        row = b[j]
-        for k in range(row.size):
-            work[k, j] = row[k]
-    multiply(a, work, c)
-
-
-@njit
 def inverse_diagonal(l: Float, work: Float, out: Float, n: int) -> None:
     """Write the diagonal of (L Lᵀ)⁻¹ into the leading n elements of ``out``: out_j = Σ_i (L⁻¹)_ij².
 

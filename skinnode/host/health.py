@@ -87,8 +87,7 @@ class PatchHealth:
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""
     defect: str | None = None
-    """The host's failed operation and its exception, until the patch has been brought up again.
-    """
+    """The host's failed operation and its exception, until the patch has been brought up again."""
     slow_overruns: int = 0
     """Number of EMCY messages 0x8110 reporting that the computer or bus is too slow for the node's scans."""
     baselines: int = 0

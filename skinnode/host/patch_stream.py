@@ -1,8 +1,8 @@
 """From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
 
-The mainline assembles scans and leaves the newest in a box of one; a worker takes it and solves it. A scan
-that is overtaken while the worker is busy is skipped and counted. The stream's token makes sure that at most
-one worker is in it.
+The mainline assembles scans and leaves the newest in a box for one scan, from which a worker takes and solves
+it. A scan that is overtaken while the worker is busy is skipped and counted. The stream's token ensures that
+at most one worker processes the stream at a time.
 """
 
 from __future__ import annotations
@@ -33,23 +33,24 @@ _log = logging.getLogger(__name__)
 _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 WATCH_AFTER_NS: Final = 5_000_000
-"""Delay after the last frame of a scan before its codes are evaluated for faults: fields that a program waits
-for come first, and those of all patches of one SYNC are due together."""
+"""Delay after the last frame of a scan before its codes are evaluated for faults. Fields have priority
+because programs wait for them, and the fields of all patches for one SYNC are due at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamStats:
     """Counters of a patch's scans.
 
-    ``offered`` + ``withheld`` + ``partial`` are the assembled scans; ``solved`` + ``failed`` + ``skipped`` +
-    at most two in work are the offered ones.
+    ``offered`` + ``withheld`` + ``partial`` is the number of assembled scans; ``offered`` is ``solved`` +
+    ``failed`` + ``skipped`` + at most two scans in progress.
     """
 
     frames: int
     """Chunks and summaries passed to the stream."""
     offered: int
     withheld: int
-    """Scans that came while the patch was brought up or its baseline was read, and could not be decoded."""
+    """Scans that could not be decoded because the patch was being brought up or its baseline was being
+    read."""
     partial: int
     """Incomplete scans withheld because of ``stream.partial`` in the hand file."""
     solved: int
@@ -65,33 +66,33 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Records what decides, besides the frames, which scans a stream passes on. Called on the mainline."""
+    """Recorder of the events, besides frames, that decide which scans a stream passes on. Mainline only."""
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
-        """:meth:`PatchStream.resume` began to pass scans on."""
+        """Record that :meth:`PatchStream.resume` began to pass scans on."""
 
     def withheld(self, patch: str) -> None:
-        """:meth:`PatchStream.withhold` was called."""
+        """Record that :meth:`PatchStream.withhold` was called."""
 
     def polled(self, patch: str, t_ns: int) -> None:
-        """:meth:`PatchStream.poll` ended an incomplete scan."""
+        """Record that :meth:`PatchStream.poll` ended an incomplete scan."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """A newer scan replaced this one, whose last frame was received at ``t_receive_ns``, in the box."""
+        """Record that a newer scan replaced this scan, last received at ``t_receive_ns``, in the box."""
 
 
 def _ignore(scan: Scan) -> None:
-    """Take no notice of a scan."""
+    """Ignore a scan."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamOutput:
-    """Where the scans of a stream are solved, and where fields and exceptions go."""
+    """Destination of a stream's scans, fields and exceptions."""
 
     workers: Workers | Inline
     publisher: Publisher
     defects: Defects | None = None
-    """Gets the exceptions of decoding and solving; without it, the first one ends the publisher."""
+    """Collects exceptions raised by decoding and solving; if None, the first exception ends the publisher."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +100,7 @@ class StreamOptions:
     """Settings of a stream."""
 
     tick: Callable[[int], Tick | None]
-    """Returns the newest SYNC with this counter."""
+    """Returns the newest SYNC with the given counter."""
     on_scan: Callable[[Scan], None] = _ignore
     """Called with each assembled scan at once."""
     watch: Callable[[Scan], None] = _ignore
@@ -107,13 +108,15 @@ class StreamOptions:
     partial: Partial = "pass"
     """``pass`` or ``withhold``: what to do with incomplete scans."""
     under_way: bool = False
-    """Whether another master starts the node, which may be sending when its scans are first passed on."""
+    """Whether another master starts the node, so that it may already be sending when scans are first passed
+    on."""
 
 
 class PatchStream:
-    """The scans of one patch on their way from frames to fields.
+    """Path of one patch's scans from frames to fields.
 
-    Scans are withheld until :meth:`resume` passes a solver. A scan whose decoding or solving raises is lost.
+    Scans are withheld until :meth:`resume` passes a solver. A scan whose decoding or solving raises an
+    exception is lost.
 
     Threads: the mainline calls all methods; any thread may also call :meth:`settled` and :meth:`stats`.
     """
@@ -127,34 +130,34 @@ class PatchStream:
         self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        self._box: deque[tuple[Scan, ScanStamp, ScanSolver]] = deque()  # one at most; both ends are atomic
+        self._box: deque[tuple[Scan, ScanStamp, ScanSolver]] = deque()  # one scan; both ends are atomic
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None
         self._left_out: list[int] = []
         self._left_out_within_ns = 0
         self.withholdings = 0
-        """Times that withholding began."""
+        """Number of times that withholding began."""
         self.doubtful = False
-        """Whether a summary was lost, or discarded with its scan, that may have announced a new baseline."""
+        """Whether a summary that may have announced a new baseline was lost or discarded with its scan."""
         self._frames = self._withheld = self._partial = 0
         self._offered = self._taken = self._solved = self._failed = self._untrusted = self._invalid = 0
         self._newest = 0
         self._solving = 0
-        """Number of the scan that the worker in the stream is solving."""
+        """Number of the scan that a worker is solving."""
         self.t_passed_ns = 0
         """Monotonic time at which the newest scan that was not withheld was received; 0 before the first."""
 
     # --- mainline
 
     def on_chunk(self, data: bytes, t_ns: int) -> None:
-        """Take a chunk (TPDO1)."""
+        """Process a chunk (TPDO1)."""
         self._frames += 1
         scan = self._assembler.on_chunk(data, t_ns)
         if scan is not None:
             self._offer(scan)
 
     def on_summary(self, data: bytes, t_ns: int) -> None:
-        """Take a summary (TPDO2)."""
+        """Process a summary (TPDO2)."""
         self._frames += 1
         scan = self._assembler.on_summary(data, t_ns)
         if scan is not None:
@@ -170,11 +173,11 @@ class PatchStream:
         if self.tap is not None:
             self.tap.polled(self._patch, t_ns)
         scan = self._assembler.poll(t_ns)
-        if scan is not None:  # it may have been discarded
+        if scan is not None:  # None if the scan was discarded
             self._offer(scan)
 
     def withhold(self) -> int:
-        """Pass no scan on from now on, including the one being assembled. Returns ``withholdings``."""
+        """Stop passing scans on, including the scan being assembled. Returns ``withholdings``."""
         self._solver = None
         self.withholdings += 1
         if self.tap is not None:
@@ -191,9 +194,10 @@ class PatchStream:
 
         Args:
             solver: Decodes and solves the scans.
-            withholdings: Number of withholdings known to the caller; if there were more since, nothing
+            withholdings: Number of withholdings known to the caller; if there have been more since, nothing
                 happens.
-            anew: Whether the node was started, so that frames received before belong to another stream.
+            anew: Whether the node has been started anew, so that frames received before belong to another
+                stream.
         """
         if withholdings != self.withholdings:
             return
@@ -208,7 +212,7 @@ class PatchStream:
             self.tap.resumed(self._patch, solver, anew=anew)
 
     def inform_tap(self) -> None:
-        """Pass to a new tap whether scans are passed on."""
+        """Tell a new tap that scans are being passed on, if they are."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
@@ -241,7 +245,7 @@ class PatchStream:
             patch=self._patch,
             scan=scan.scan if tick is None else tick.number,
             counter=scan.counter,
-            device_time_us=scan.device_time_us or 0,  # None: the summary was lost
+            device_time_us=scan.device_time_us or 0,  # None if the summary was lost
             t_sync_ns=0 if tick is None else tick.t_ns,
             t_receive_ns=scan.t_last_ns,
         )
@@ -260,12 +264,13 @@ class PatchStream:
         self._call_worker()
 
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
-        """Skip the scans that a newer one overtook when a recording was made.
+        """Skip the scans that newer scans overtook when the recording was made.
 
-        Scan numbers would not do: after a pause, the two halves of a scan may be two scans of one number.
+        Scan numbers cannot identify them: after a pause, the two halves of a scan may be two scans with the
+        same number.
 
         Args:
-            times_ns: Monotonic times at which their last frames came.
+            times_ns: Monotonic times at which their last frames arrived.
             within_ns: Tolerance of these times.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns
@@ -277,7 +282,7 @@ class PatchStream:
         return i < len(self._left_out) and self._left_out[i] <= t_ns + self._left_out_within_ns
 
     def settled(self, scan: int) -> bool:
-        """Return whether no scan is left to solve, and ``scan`` has come or scans are withheld."""
+        """Return whether no scan is left to solve, and ``scan`` has arrived or scans are withheld."""
         return (self._newest >= scan or self._solver is None) and not self._box and bool(self._token)
 
     # --- worker
@@ -286,7 +291,7 @@ class PatchStream:
         try:
             self._token.pop()
         except IndexError:
-            return  # a worker is in the stream and checks the box when it is done
+            return  # a worker is busy, and checks the box when it is done
         try:
             self._workers.submit(self._work, self._work_failed)
         except Exception:
@@ -301,7 +306,7 @@ class PatchStream:
         self._leave()
 
     def _solve_next(self) -> None:
-        self._taken += 1  # before it leaves the box, so that the counters always include it
+        self._taken += 1  # before the scan leaves the box, so that the counters always include it
         try:
             scan, stamp, solver = self._box.popleft()
         except IndexError:  # the stream was closed
@@ -319,20 +324,20 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle a job that could not start."""
+        """Handle the exception of a job that could not start."""
         self._report(error)
         self._leave()
 
     def _leave(self) -> None:
         """Release the stream to the next worker, at once if a scan is waiting.
 
-        Never raises: the holder must return the token exactly once.
+        Never raises, because the holder must return the token exactly once.
         """
         self._token.append(None)
         try:
             if self._box:
                 self._call_worker()
-        except Exception as error:  # the scan waits for the next
+        except Exception as error:  # the scan waits for the next call
             self._report(error)
 
     def _report(self, error: Exception) -> None:
@@ -347,7 +352,7 @@ class PatchStream:
     def stats(self) -> StreamStats:
         """Return all counters.
 
-        They are read in an order in which no scan that may still be solved counts as skipped.
+        They are read in such an order that no scan that may still be solved counts as skipped.
         """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(

@@ -32,26 +32,27 @@ def check_capacity(capacity: int) -> None:
     """Check the capacity of a queue.
 
     Raises:
-        ValueError: if it is not an integer from 1.
+        ValueError: if it is not an integer of at least 1.
     """
     if not isinstance(capacity, int) or capacity < 1:
-        raise ValueError(f"capacity: got {capacity!r}, must be at least 1, an integer")
+        raise ValueError(f"capacity: got {capacity!r}, must be an integer of at least 1")
 
 
 class Subscription:
-    """The fields of a running host, newest last. Iterate with ``for`` or ``async for``, or use :meth:`get`.
+    """Subscription to fields, newest last. Iterate with ``for`` or ``async for``, or use :meth:`get`.
 
-    A full queue drops its oldest field; ``dropped`` counts. The subscription ends with :meth:`close`, at the
-    end of a ``with`` block, or when the last reference to it is deleted. Any thread or event loop may read.
+    A full queue drops its oldest field, counted in ``dropped``. The subscription ends with :meth:`close`, at
+    the end of a ``with`` block, or when the last reference to it is deleted. Any thread or event loop may
+    read.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
         self._queue: DropOldestQueue[FieldFrame] = DropOldestQueue(capacity)
         self._timeout_s = timeout_s
         self._subscribed = patches
-        # One counter a patch: a patch has one worker at a time, so each has a single writer.
+        # One counter per patch: a patch has one worker at a time, so each counter has a single writer.
         self._dropped = dict.fromkeys([*patches, ""], 0)
-        self._wakers: dict[object, Callable[[], object]] = {}  # one for each waiting event loop
+        self._wakers: dict[object, Callable[[], object]] = {}  # one per waiting event loop
 
     @property
     def dropped(self) -> int:
@@ -65,7 +66,7 @@ class Subscription:
             timeout_s: Maximum wait, s; None: no limit.
 
         Returns:
-            None if no field came in time, or at once if the host has closed.
+            The field; None if no field arrived in time, or immediately if the host has closed.
 
         Raises:
             SkinError: the error that stopped the host, if any.
@@ -79,14 +80,14 @@ class Subscription:
         """Return the next field, or None if the host has closed.
 
         Raises:
-            queue.Empty: if no field came within ``timeout_s``.
+            queue.Empty: if no field arrived within ``timeout_s``.
             SkinError: the error that stopped the host, if any.
         """
         check_timeout(timeout_s)
         return self._open(self._queue.get(timeout_s))
 
     async def take_async(self, timeout_s: float | None) -> FieldFrame | None:
-        """Return the next field as :meth:`take` does, in an event loop."""
+        """Return the next field as :meth:`take` does, but asynchronously."""
         check_timeout(timeout_s)
         loop, arrived, key = asyncio.get_running_loop(), asyncio.Event(), object()
 
@@ -99,25 +100,25 @@ class Subscription:
         try:
             async with limit:
                 while True:
-                    await asyncio.sleep(0)  # let other tasks run, however fast fields come
+                    await asyncio.sleep(0)  # let other tasks run, however fast fields arrive
                     arrived.clear()
                     try:
                         return self._open(self._queue.get(0.0))
                     except queue.Empty:
                         await arrived.wait()
         except TimeoutError:
-            if not limit.expired():  # the error that stopped the host
+            if not limit.expired():  # the host was stopped by a TimeoutError
                 raise
             raise queue.Empty from None
         finally:
             del self._wakers[key]
 
     def close(self) -> None:
-        """Take no more fields. Fields still queued are lost."""
+        """Stop accepting fields. Fields still queued are lost."""
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Take no more fields, and end the reading loop, on any thread, after the fields still queued."""
+        """Stop accepting fields, and end the reading loop after the fields still queued. Any thread."""
         self.close()
         self.offer(End(), "")
 
@@ -138,7 +139,7 @@ class Subscription:
             yield field
 
     async def __aiter__(self) -> AsyncIterator[FieldFrame]:
-        """Yield fields in an event loop, as ``for`` does."""
+        """Yield fields asynchronously, otherwise like :meth:`__iter__`."""
         while True:
             try:
                 field = await self.take_async(self._timeout_s)
@@ -160,7 +161,7 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end, or a field of ``patch`` if it is subscribed to. Never blocks; any thread."""
+        """Queue an end, or a field of ``patch`` if the patch is subscribed to. Never blocks; any thread."""
         if patch and patch not in self._subscribed:
             return
         self._dropped[patch] += self._queue.put(item)
@@ -169,7 +170,7 @@ class Subscription:
     def _open(self, item: FieldFrame | End) -> FieldFrame | None:
         if isinstance(item, FieldFrame):
             return item
-        self._wake()  # every reader gets the end
+        self._wake()  # wake the other readers: each must get the end
         if item.error is not None:
             raise item.error
         return None
@@ -185,7 +186,7 @@ class Publisher:
     An exception while passing a field to a subscriber is reported to ``defects``, and that subscriber loses
     the field.
 
-    Threads: workers publish, each patch from one at a time; any thread may call the rest.
+    Threads: workers publish, one worker per patch at a time; any thread may call the rest.
     """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
@@ -209,7 +210,7 @@ class Publisher:
         chosen = self._patches if patch is None else frozenset([patch])
         subscription = Subscription(capacity, timeout_s, chosen)
         key = next(self._keys)
-        # Item assignment and removal of a dict are atomic, and readers take a copy: no lock is needed.
+        # Setting and removing a dict item are atomic, and readers take a copy, so no lock is needed.
         forget = self._subscriptions
         self._subscriptions[key] = weakref.ref(subscription, lambda _: forget.pop(key, None))
         if self._last is not None:
@@ -237,12 +238,12 @@ class Publisher:
         return None if self._last is None else self._last.error
 
     def fail(self, error: SkinError) -> None:
-        """End every subscription with ``error``, after the fields it has queued: the host cannot continue."""
+        """End every subscription with ``error`` after its queued fields: the host cannot continue."""
         self._last = self._last or End(error)
         self._offer(self._last, "")
 
     def end(self) -> None:
-        """End every subscription, after the fields it has queued: the host has closed."""
+        """End every subscription after its queued fields: the host has closed."""
         self._last = self._last or End()
         self._offer(self._last, "")
 

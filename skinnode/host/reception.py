@@ -1,6 +1,6 @@
-"""Connect the handlers of a host to the frames of a bus: which COB-ID goes where.
+"""Connect the handlers of a host to the frames of a bus, by COB-ID.
 
-Nothing here sends, waits or has a thread, so a replay uses it with recorded frames.
+Nothing here sends, waits or starts a thread, so a replay can use it with recorded frames.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
-"""Minimum time to wait for a summary when all chunks are there; half a period if that is longer. On a full
-bus the summary gives way to the chunks of all other patches."""
+"""Minimum time to wait for a summary once all chunks have arrived; half a period if that is longer. On a full
+bus, the summary yields to the chunks of all other patches."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReception:
-    """What receives the frames of a patch."""
+    """Receivers of a patch's frames."""
 
     stream: PatchStream
     monitor: NodeMonitor
@@ -38,14 +38,14 @@ class PatchReception:
 
 @dataclass(frozen=True, slots=True)
 class BusReception:
-    """What receives the frames of other senders on a bus: other masters, and their SYNC."""
+    """Receivers of frames from other masters on a bus, and of their SYNC."""
 
     other_masters: OtherMasters
     follower: SyncFollower
 
 
 def receive_bus(hand: HandConfig, dispatcher: Dispatcher, ticks: Ticks) -> BusReception:
-    """Listen for other masters on a bus, and for their SYNC, from now on."""
+    """Start listening for other masters on a bus, and for their SYNC."""
     config = dispatcher.config
     other_masters, follower = OtherMasters(config), SyncFollower(ticks)
     for cob_id, handler in other_masters.handlers(
@@ -65,17 +65,17 @@ def receive_patch(
     ticks: Ticks,
     output: StreamOutput,
 ) -> PatchReception:
-    """Pass the frames of a patch to its monitor and its stream from now on.
+    """Start passing the frames of a patch to its monitor and its stream.
 
     The stream withholds scans until it has a solver, because a node that an earlier host left operational may
     be sending already.
 
     Args:
         patch: The patch.
-        hand: Its hand.
+        hand: The hand that it belongs to.
         dispatcher: Dispatches the frames of its bus.
         ticks: The SYNC counters of its bus.
-        output: Where scans are solved. With its ``defects``, exceptions are reported there; without, they are
+        output: Where scans are solved. Exceptions are reported to its ``defects``; if this is None, they are
             raised, and the publisher fails.
     """
     period_ns = hand.sync.period_ms * 1_000_000
@@ -122,4 +122,4 @@ def receive_patch(
 
 
 def _ignore(data: bytes, t_ns: int) -> None:
-    """Ignore NMT commands of another master to its nodes."""
+    """Ignore NMT commands from another master to its nodes."""

@@ -22,24 +22,24 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum wait for a small job on the mainline, which takes a turn fifty times a second unless its bus is
-away, s."""
+"""Maximum wait for a short job on the mainline, which runs jobs fifty times a second unless its bus is away,
+s."""
 
 _ANSWER_S: Final = 0.05
-"""Wait for the responses to a single SDO request, s. It delays a failed bring-up twice if the node is alone.
-"""
+"""Wait for the responses to a single SDO request, s. If no other node has the node-ID, this wait delays a
+failed bring-up twice."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
-"""Time and SYNC periods without a scan after which the configuration of a node is read back: the stream must
-recover within a second."""
+"""Time, s, and number of SYNC periods without a scan after which a node's configuration is read back (the
+longer applies): the stream must recover within a second."""
 
 
 class RemoteNode:
     """One patch and its node.
 
-    Threads: one thread at a time may bring the node up, not the mainline; it calls all methods except those
-    for which any thread is mentioned.
+    Threads: one thread at a time, other than the mainline, may bring the node up; that thread calls all
+    methods except those documented for any thread.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class RemoteNode:
         """Whether nothing at all may be sent to the node."""
         self.facts: NodeFacts | None = None
         self.boot_ups = 0
-        """Number of boot-up messages when its bring-up began; if there are more, it must be repeated."""
+        """Number of boot-up messages when bring-up began; if more arrive, bring-up must be repeated."""
         self.t_answer_ns = 0
         """Monotonic time of its newest SDO response."""
         self._answers = 0
@@ -77,7 +77,7 @@ class RemoteNode:
 
     @property
     def heard(self) -> bool:
-        """Whether any frame of the node was received since the host opened its bus."""
+        """Whether any frame from the node has been received since the host opened its bus."""
         return self.monitor.t_heartbeat_ns is not None or self.stream.stats().withheld > 0
 
     @property
@@ -99,18 +99,18 @@ class RemoteNode:
             on_answer: Called when the node has answered.
 
         Returns:
-            The solver of its scans.
+            The solver for its scans.
 
         Raises:
-            NodeError: if its electrodes cannot be solved, or one node-ID belongs to two nodes.
+            NodeError: if its electrode layout cannot be solved, or two nodes have the same node-ID.
             SkinError: as :meth:`Configurator.configure`.
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
-            nmt_master.stand_by(self.link.send, self.patch.node_id)  # a stopped node does not answer SDO
+            nmt_master.stand_by(self.link.send, self.patch.node_id)  # stopped nodes answer no SDO request
 
         def answered(patch: PatchConfig) -> None:
-            self.boot_ups = self.monitor.boot_ups  # earlier boot-ups were awaited
+            self.boot_ups = self.monitor.boot_ups  # earlier boot-ups were expected
             if on_answer is not None:
                 on_answer(patch)
 
@@ -128,11 +128,11 @@ class RemoteNode:
             raise kind(node_id, f"{text}; {why}") from error
         try:
             return ScanSolver(self.facts, self._hand.solver)
-        except ValueError as error:  # the electrodes were read from the node
+        except ValueError as error:  # the electrode layout was read from the node
             raise NodeError(self.patch.node_id, f"patch {self.patch.name!r}: {error}") from None
 
     def start(self, solver: ScanSolver, withholdings: int) -> None:
-        """Pass scans on to ``solver`` and, as master, start the node.
+        """Start passing scans to ``solver`` and, if the host is the master, start the node.
 
         Args:
             solver: Decodes and solves the scans.
@@ -141,7 +141,8 @@ class RemoteNode:
         Raises:
             BusError: if the command cannot be sent.
         """
-        # The stream of a node that another master runs goes on from the opening of the bus, unless it booted.
+        # If another master runs the node, its stream has continued since the bus was opened, unless it
+        # booted.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
         self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
         if not self.has_other_master:
@@ -149,10 +150,10 @@ class RemoteNode:
         self.monitor.running = True
 
     def renew_baseline(self, deadline_s: float, abandoned: Callable[[], bool]) -> ScanSolver | None:
-        """Read the baseline that the node has now.
+        """Read the node's current baseline.
 
         Returns:
-            A solver with it; None if it is the known one and scans are passed on.
+            A solver with this baseline; None if the baseline is unchanged and scans are being passed on.
 
         Raises:
             SkinError: as :meth:`Configurator.settle_baseline`.
@@ -166,7 +167,7 @@ class RemoteNode:
             return None
         facts = facts.with_baseline(baseline_ohm)
         solver = ScanSolver(facts, self._hand.solver)
-        self.facts = facts  # last: if there is no solver, the old baseline stays in use
+        self.facts = facts  # set last: without a solver, the old baseline stays in use
         return solver
 
     def renew_register(self) -> None:
@@ -180,23 +181,23 @@ class RemoteNode:
         self.link.call(lambda: self.monitor.on_register_read(register, said), self.defects)
 
     def is_mute(self, since_ns: int) -> bool:
-        """Return whether an operational node sends no scans, so that it may have lost its configuration.
+        """Return whether an operational node sends no scans and so may have lost its configuration.
 
-        Always False on a bus of another master, which alone may restore the configuration.
+        Always False on another master's bus, because only that master may restore the configuration.
 
         Args:
-            since_ns: Monotonic time since which the node is operational.
+            since_ns: Monotonic time since which the node has been operational.
         """
         scan_ns = max(self.monitor.t_scan_ns or 0, since_ns)
         patience_ns = max(_MUTE_S, _MUTE_SCANS * self._hand.sync.period_s) * 1e9
         return not self.has_other_master and self.link.t_dispatched_ns > scan_ns + patience_ns
 
     def is_configured(self) -> bool:
-        """Return whether the node is configured, as :func:`~skinnode.host.configurator.is_configured`."""
+        """Return whether the node is configured: see :func:`~skinnode.host.configurator.is_configured`."""
         return is_configured(self.patch, self._hand, self._remote)
 
     def tare(self) -> None:
-        """Tell the node to take its present resistances as its baseline. Any thread.
+        """Command the node to use its current resistances as its baseline. Any thread.
 
         Raises:
             SkinError: as :meth:`Host.tare`.
@@ -204,7 +205,7 @@ class RemoteNode:
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:
             raise NodeError(node_id, f"{said}: another master runs the bus")
-        if self.patch.baseline is not None:  # the host would restore that one at once
+        if self.patch.baseline is not None:  # the host would restore the file's baseline at once
             raise NodeError(node_id, f"{said}: its baseline is kept in {self.patch.baseline}")
         if (
             not self.monitor.running or self.monitor.nmt_state != NmtState.OPERATIONAL
@@ -242,7 +243,8 @@ class RemoteNode:
     def _answers_to_one_question(self) -> int:
         """Return how many responses a single SDO request gets: two if two nodes have this node-ID.
 
-        It is the smaller count of two requests, because a response to an earlier request may be late.
+        The result is the smaller of two requests' counts, because a response to an earlier request may be
+        late.
         """
         time.sleep(_ANSWER_S)
         counts = []
@@ -257,13 +259,13 @@ class RemoteNode:
 
     @property
     def searchable(self) -> bool:
-        """Whether the hand file has its serial number and the host is the master of its bus."""
+        """Whether the hand file states the serial number and the host is the master of the bus."""
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the patch by its serial number, if there is one. Returns whether it was found.
+        """Search for the patch by its serial number, if known. Returns whether it was found.
 
-        It will boot at its node-ID.
+        If found, the patch will boot with its node-ID.
         """
         if self.has_other_master or self.patch.serial is None:
             return False

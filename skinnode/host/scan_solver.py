@@ -1,4 +1,4 @@
-"""Decodes and solves the scans of a patch: codes to resistances to a field."""
+"""Decode and solve the scans of a patch: from codes to resistances to a field."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from skinnode.solve.tracker import Tracker
 
 
 class ScanSolver:
-    """Decodes and solves scans of one patch. Owned by one thread at a time.
+    """Decoder and solver of one patch's scans. Owned by one thread at a time.
 
     Args:
-        facts: The patch: layout, scale of its codes, baseline.
+        facts: Layout, code scale and baseline of the patch.
         config: Settings of the solver.
         clock: Returns the monotonic time at which a field is ready, ns.
     """
@@ -61,17 +61,17 @@ class ScanSolver:
         self._decoder = Decoder(facts.baseline_ohm, scale)
 
     def decode(self, scan: Scan, stamp: ScanStamp) -> ResistanceFrame:
-        """Return the resistances of a scan, NaN where a code is no measurement."""
+        """Return the resistances of a scan, NaN where a code is not a measurement."""
         resistance_ohm, valid = self._decoder.decode(scan.codes)
         if self._codes.gain is not None:
             resistance_ohm *= self._codes.gain
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan. The noise is that of the front end and of the codes together.
+        """Solve a scan. The noise combines that of the front end and that of the codes.
 
         Returns:
-            The field with its stamp, its arrays read-only, and the number of codes that are no measurement.
+            The stamped field, with read-only arrays, and the number of codes that are not measurements.
         """
         if self._tracker.method == "posterior":
             frame, codes = self.decode(scan, stamp), self._codes
@@ -87,7 +87,7 @@ class ScanSolver:
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
     """Check that a layout can be solved, and compile the kernels or load them from the cache.
 
-    Call it before a node waits for the host.
+    Call this before a node waits for the host.
 
     Raises:
         ConfigError: if the layout can be sensed but not solved.

@@ -1,10 +1,11 @@
 """SDO client: read and write the object dictionary of a remote node.
 
-canopen's client waits in the thread that asks; the mainline feeds it the responses through
-:meth:`SkinNetwork.notify`. Why limits by hand: canopen's client reads as many bytes as a server sends, for as
-long as it sends; a faulty node could fill the memory or hold a thread forever.
+canopen's client blocks the requesting thread; the mainline feeds it the responses through
+:meth:`SkinNetwork.notify`. This module limits the length and duration of a transfer, because canopen's client
+reads as many bytes as a server sends, for as long as it sends: a faulty node could fill the memory or block a
+thread forever.
 
-Threads: one thread at a time may use a node; different nodes may be used side by side.
+Threads: one thread at a time may use a node; different nodes may be used in parallel.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from skinnode.host.sdo_streams import BlockDownload, BlockUpload, Client, Downlo
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Number of attempts of a transfer without a response, or with the response to an earlier one."""
+"""Maximum number of attempts at a transfer that gets no response, or the response to an earlier transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""Messages of canopen if no response came, the second after it requested segments again."""
+"""Messages of canopen if no response arrived; the second applies after segments were requested again."""
 
 _OUT_OF_STEP: Final = (
     AbortCode.TOGGLE_BIT,
@@ -55,12 +56,12 @@ _MAX_NUMBER_BYTES: Final = 8
 
 _TRANSFER_S: Final = 5.0
 _SEGMENT_S: Final = 0.02
-"""Maximum duration of a transfer: 5 s, and 20 ms for each segment of the longest value allowed."""
+"""Maximum duration of a transfer: 5 s, plus 20 ms for each segment of the longest value allowed."""
 
 _PLAIN: Final = {"u8": "<B", "u16": "<H", "u32": "<I", "f32": "<f"}
 
-# What goes wrong in a transfer is raised here with the node and the object; the library's own log lines
-# would reach a terminal as well, because Python prints warnings that are not handled.
+# Transfer errors are raised here with the node and the object. Without a handler, Python would also print
+# canopen's own warnings on the terminal.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
@@ -69,11 +70,11 @@ class Abandoned(Exception):
 
 
 class _UploadTooLong(Exception):
-    """The node sends more than a value can have, or takes too long."""
+    """The node sends more bytes than a value can have, or takes too long."""
 
 
 class SkinNetwork(canopen.Network):
-    """canopen's network over a port of skinnode; its frames go to ``send``."""
+    """canopen network on a skinnode port; its frames go to ``send``."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
@@ -83,7 +84,7 @@ class SkinNetwork(canopen.Network):
         """Send a data frame.
 
         Raises:
-            ValueError: if ``remote``, because the host sends data frames only.
+            ValueError: if ``remote`` is True, because the host sends data frames only.
         """
         if remote:
             raise ValueError("remote: got True, the host sends data frames only")
@@ -93,20 +94,20 @@ class SkinNetwork(canopen.Network):
 class RemoteOd:
     """The object dictionary of a node, read and written by SDO.
 
-    Values have one of the types ``u8 u16 u32 f32``. If ``abandoned`` returns True, which is called after each
-    segment, the transfer is aborted and Abandoned raised. A transfer is also retried after an exception that
-    is not a response of the node.
+    Values have one of the types ``u8 u16 u32 f32``. ``abandoned`` is called after each segment; if it returns
+    True, the transfer is aborted and Abandoned is raised. A transfer is also retried after an exception that
+    is not due to a response from the node.
 
     Threads: one at a time.
 
     Args:
         network: Sends the requests.
         node_id: Node-ID of the server.
-        on_defect: Called with each exception that is not a response of the node.
+        on_defect: Called with each exception that is not due to a response from the node.
 
     Raises:
         NodeTimeout: from all methods, if the node does not answer.
-        SdoAbort: from all methods, if it refuses.
+        SdoAbort: from all methods, if the node aborts the transfer.
         NodeError: from all methods, if a response is malformed, longer than allowed, or has no end.
     """
 
@@ -143,7 +144,7 @@ class RemoteOd:
             raise
         except SkinError:
             raise
-        except Exception as error:  # no response, or not one of CiA 301
+        except Exception as error:  # no response, or a response that violates CiA 301
             if not isinstance(error, SdoError):
                 self._on_defect(error)
             self._client.give_up(DEVICE_TYPE, 0)
@@ -151,7 +152,7 @@ class RemoteOd:
         return True
 
     def read_bytes(self, index: int, subindex: int, most: int = MAX_TEXT_BYTES) -> bytes:
-        """Return the value as received, of at most ``most`` bytes."""
+        """Return the value as received, at most ``most`` bytes."""
         return bytes(self._transfer(index, subindex, "read", lambda: self._upload(index, subindex, most)))
 
     def read_block(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
@@ -206,7 +207,7 @@ class RemoteOd:
         self._transfer(index, subindex, "write", ask)
 
     def write_if_different(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write the value, and read it back, if the node has another one."""
+        """Write the value and read it back if the node has a different value."""
         if self.read(index, subindex, kind) != value:
             self.write_checked(index, subindex, kind, value)
 
@@ -242,7 +243,7 @@ class RemoteOd:
                 failure = abort
                 if abort.code not in _OUT_OF_STEP:
                     break
-            except Exception as error:  # canopen's own bugs also raise: AttributeError, struct.error …
+            except Exception as error:  # bugs in canopen also raise: AttributeError, struct.error …
                 failure = error
                 if not isinstance(error, SdoError):
                     self._on_defect(error)
@@ -257,10 +258,10 @@ class RemoteOd:
         """Read a stream to its end.
 
         Raises SdoCommunicationError if the data is not as long as announced, _UploadTooLong if it is longer
-        than ``most`` or takes too long, and Abandoned.
+        than ``most`` or takes too long, and Abandoned once ``abandoned`` returns True.
         """
         if stream.size is not None and stream.size > most:
-            raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected {most} at most")
+            raise _UploadTooLong(f"a value of {counted(stream.size, 'byte')}, expected at most {most}")
         limit_s = _TRANSFER_S + _SEGMENT_S * most / SEGMENT_BYTES
         end_s = time.monotonic() + limit_s
         data = bytearray()
@@ -268,13 +269,13 @@ class RemoteOd:
             data += segment
             if len(data) > (most if stream.size is None else stream.size):
                 if stream.size is None:
-                    raise _UploadTooLong(f"more than {counted(most, 'byte')}, expected {most} at most")
+                    raise _UploadTooLong(f"more than {counted(most, 'byte')}, expected at most {most}")
                 break
             if self.abandoned():
                 raise Abandoned
             if time.monotonic() > end_s:
                 raise _UploadTooLong(
-                    f"{counted(len(data), 'byte')} and no end, expected it within {limit_s:.1f} s"
+                    f"{counted(len(data), 'byte')} without an end, expected the end within {limit_s:.1f} s"
                 )
         if stream.size is not None and len(data) != stream.size:
             raise SdoCommunicationError(f"{len(data)} of {stream.size} bytes")
@@ -291,7 +292,7 @@ class RemoteOd:
             failure
         ):  # the response to another client's request, or from another node
             got = f"{where}: got the answer for another object"
-            why = f"two nodes answer with node-ID {self.node_id}, or another SDO client asks it"
+            why = f"two nodes answer with node-ID {self.node_id}, or another SDO client is using it"
             return NodeError(self.node_id, f"{got}; {why}")
         if isinstance(failure, SdoError):
             return NodeError(self.node_id, f"{where}: got {failure}, expected an answer as in CiA 301")

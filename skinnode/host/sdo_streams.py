@@ -1,11 +1,11 @@
-"""Streams of one SDO transfer: those of canopen 2.4, with fixes for lost frames.
+"""Streams for SDO transfers: canopen 2.4's streams, with fixes for lost frames.
 
 ==================  =========================================================  ==============================
 stream              canopen 2.4.1                                              here
 ==================  =========================================================  ==============================
 block upload        calls its own ``abort``, which it does not have, if the    has one
                     end of the transfer does not arrive
-block upload        requests a segment that is late twice                      requests it once
+block upload        requests a late segment twice                              requests it once
 block download      raises RuntimeError if a segment of the last block must    sends it again
                     be sent again; its CRC then counts segments twice
 both downloads      closing a failed transfer continues it, and waits for      closing sends nothing
@@ -35,13 +35,13 @@ from skinnode.canopen.indices import sdo_request_cob_id, sdo_response_cob_id
 from skinnode.canopen.sdo import ABORT
 
 _QUIET_S: Final = 0.02
-"""Silence after an abort, in s, that shows that no response to the old transfer is still to come."""
+"""Silence after an abort, s, that shows that no more responses to the old transfer will arrive."""
 
 _SETTLE_S: Final = 0.1
-"""Maximum wait for that silence, in s: another SDO client may keep the node busy."""
+"""Maximum wait for that silence, s: another SDO client may keep the node busy."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum retransmitted blocks in one transfer; a node that needs more accepts none."""
+"""Maximum number of retransmitted blocks in one transfer; a node that needs more accepts no block at all."""
 
 
 class Client(SdoClient):
@@ -62,8 +62,8 @@ class Client(SdoClient):
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return the response.
 
-        For a request that begins a transfer, that is the first response that names its object: a slow node
-        may still send frames of the previous transfer.
+        For a request that begins a transfer, this is the first response that names the same object, because a
+        slow node may still be sending frames of the previous transfer.
 
         Raises:
             SdoError: if there is no response, or it is an abort.
@@ -109,8 +109,8 @@ class BlockUpload(BlockUploadStream):
     """A block upload.
 
     canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than its
-    time-out ended in a wrong CRC. It requests a segment that is out of order only once, so a late segment is
-    made to look out of order.
+    timeout ends in a wrong CRC. It requests an out-of-order segment only once, so this class makes a late
+    segment look out of order.
     """
 
     def read(self, size: int = -1) -> bytes:
@@ -143,7 +143,7 @@ class BlockDownload(BlockDownloadStream):
     def __init__(self, client: Client, index: int, data: bytes) -> None:
         super().__init__(client, index, 0, len(data))  # type: ignore[no-untyped-call]
         self._crc.process(data)
-        self._retransmitting = True  # canopen then does not update the CRC
+        self._retransmitting = True  # stops canopen from updating the CRC
         self._left = _RETRANSMISSIONS
 
     def close(self) -> None:
@@ -154,7 +154,7 @@ class BlockDownload(BlockDownloadStream):
         """Send the CRC and wait for the end of the transfer.
 
         Raises:
-            SdoError: if the node does not confirm it.
+            SdoError: if the node does not confirm the end.
         """
         super().close()  # type: ignore[no-untyped-call]
 

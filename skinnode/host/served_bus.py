@@ -1,4 +1,4 @@
-"""A bus of the hand with everything the host does on it besides its patches."""
+"""A bus of the hand, with everything that the host does on it besides serving patches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skinnode.host.sync import SyncFollower, Ticks
 
 @dataclass(frozen=True, slots=True)
 class ServedBus:
-    """A bus, the SYNC counters on it, and what listens and speaks there for the whole bus."""
+    """A bus with its SYNC counters, its listeners for other masters and SYNC, and its LSS master."""
 
     link: BusLink
     ticks: Ticks
@@ -25,7 +25,7 @@ class ServedBus:
     lss: LssMaster
 
     def health(self, *, no_sync: bool) -> BusHealth:
-        """Return the health of the bus; ``no_sync`` is passed on."""
+        """Return the health of the bus; ``no_sync`` is copied to it."""
         masters, stats, failure = self.other_masters.stats(), self.link.stats(), self.link.failure
         return BusHealth(
             bus=self.link.config.name,
@@ -46,12 +46,12 @@ class ServedBus:
         )
 
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
-        """Return whether another master's SYNC has not come for :data:`SYNCS_MISSED` periods.
+        """Return whether another master's SYNC has not arrived for :data:`SYNCS_MISSED` periods.
 
-        Time is that of the newest dispatched frame, so that a delay of the host does not count.
+        The time of the newest dispatched frame counts as now, so that a delay of the host does not count.
 
         Args:
-            t_up_ns: Monotonic time at which the host was up.
+            t_up_ns: Monotonic time at which bring-up of the host was complete.
             period_ns: SYNC period.
         """
         if self.link.config.role == "master" or self.link.failure is not None:
@@ -61,7 +61,7 @@ class ServedBus:
 
 
 def serve_bus(hand: HandConfig, link: BusLink) -> ServedBus:
-    """Listen for other masters, for their SYNC, and for LSS responses on a bus from now on."""
+    """Start listening for other masters, their SYNC, and LSS responses on a bus."""
     ticks = Ticks(hand.sync.counter_overflow)
     heard, lss = receive_bus(hand, link, ticks), LssMaster(link.send)
     link.handle(od.LSS_RESPONSE_COB_ID, lss.on_response)

@@ -1,4 +1,4 @@
-"""Start of a host: configure all nodes side by side, and make them operational."""
+"""Start of a host: configure all nodes in parallel, and make them operational."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from skinnode.host.sdo_client import Abandoned
 from skinnode.text.words import known
 
 BRING_UP_THREADS: Final = 16
-"""Nodes configured at the same time; more would only wait for the bus."""
+"""Maximum number of nodes configured in parallel; more would only wait for the bus."""
 
 _BRING_UPS: Final = 3
-"""Maximum attempts to configure a node that boots meanwhile, as nodes just found by LSS do, or whose
-configuration raises an unforeseen exception."""
+"""Maximum number of attempts to configure a node that boots meanwhile, as nodes just found by LSS do, or
+whose configuration raises an unexpected exception."""
 
 _START_AGAIN_NAPS: Final = 50
-"""Naps, a quarter of a second in all, after which an unconfirmed start command is sent again, because it may
-have been lost."""
+"""Number of polling pauses, a quarter of a second in total, after which an unconfirmed start command is sent
+again, because it may have been lost."""
 
 _POLL_S: Final = 0.005
 
@@ -49,16 +49,16 @@ def go_on_unless(cancelled: Callable[[], bool]) -> None:
 def configure_all(
     nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
 ) -> dict[RemoteNode, ScanSolver]:
-    """Configure all nodes side by side. The first failure stops the others at their next transfer.
+    """Configure all nodes in parallel. The first failure stops the others at their next transfer.
 
     Args:
         nodes: The nodes.
-        missing: ``wait`` if silent nodes may join later, ``refuse`` if all must be there.
+        missing: ``wait`` if silent nodes may join later, ``refuse`` if all must be present.
         deadline_s: Maximum time to the first response of a node, s.
-        cancelled: Called repeatedly; once it returns True, configuring ends.
+        cancelled: Called repeatedly; once it returns True, configuration ends.
 
     Returns:
-        The nodes that are there, each with the solver of its scans.
+        The nodes that are present, each with the solver for its scans.
 
     Raises:
         NodeTimeout: if a node is silent and ``missing`` is ``refuse``.
@@ -70,7 +70,7 @@ def configure_all(
 
 
 class _Start:
-    """Configures nodes side by side, on a pool of threads."""
+    """Parallel configuration of nodes on a pool of threads."""
 
     def __init__(
         self, nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
@@ -81,13 +81,13 @@ class _Start:
         self._answered: list[PatchConfig] = []
 
     def run(self) -> dict[RemoteNode, ScanSolver]:
-        """Return the nodes that are there."""
+        """Configure the nodes and return those that are present, with their solvers."""
         threads = min(len(self._nodes), BRING_UP_THREADS)
         with ThreadPoolExecutor(threads, thread_name_prefix="bring-up") as pool:
             try:
                 jobs = {node: pool.submit(self._configure, node) for node in self._nodes}
                 self._wait_for(jobs)
-            finally:  # jobs that still run after the first failure, or after Ctrl-C, stop
+            finally:  # stop jobs that still run after the first failure or Ctrl-C
                 self._over.set()
                 pool.shutdown(cancel_futures=True)
         solvers = {node: self._result(node, job) for node, job in jobs.items()}
@@ -125,7 +125,7 @@ class _Start:
         return self._waits and (silent or isinstance(failure, _Defective))
 
     def _wait_for(self, jobs: dict[RemoteNode, Future[ScanSolver]]) -> None:
-        """Wait for all jobs, or until one fails so that the host cannot start."""
+        """Wait until all jobs have ended, or one fails in a way that prevents the start."""
         pending = set(jobs.values())
         while pending:
             done, pending = wait(pending, return_when=FIRST_EXCEPTION)
@@ -134,7 +134,7 @@ class _Start:
                 break
 
     def _result(self, node: RemoteNode, job: Future[ScanSolver]) -> ScanSolver | None:
-        """Return the solver of a node, None if the node is not there; raise what must end the start."""
+        """Return a node's solver, or None if the node is absent; raise a failure that must end the start."""
         failure = None if job.cancelled() else job.exception()
         if job.cancelled() or isinstance(failure, Abandoned):
             return None
@@ -148,9 +148,9 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start all nodes where the host is the master, and wait for heartbeats that report operational.
+    """Start all nodes whose master is the host, and wait until their heartbeats report operational.
 
-    The deadline is counted in naps, so that no node is late while the host's machine stands still.
+    The deadline is counted in polling pauses, so that no node is late while the host's machine is suspended.
 
     Raises:
         NodeTimeout: if a node does not report operational in time.
@@ -176,7 +176,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a frame of a node that must not be asked; raise NodeTimeout after the deadline."""
+    """Wait for a frame from a node that must not be sent requests; raise NodeTimeout after the deadline."""
     end_s = time.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
@@ -195,7 +195,7 @@ def _silence(
 ) -> BusError:
     """Return the error for a silent node.
 
-    If all nodes of a bus are silent, suspect cable, supply or bit rate.
+    If all nodes of a bus are silent, the error is for the bus: suspect cable, supply or bit rate.
     """
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]

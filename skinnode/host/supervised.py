@@ -14,7 +14,7 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Longest time of a node that was heard to its first SDO response, and to tare itself, s."""
+"""Maximum time for a node that has been heard to send its first SDO response, and to tare itself, s."""
 
 LEAST_NS: Final = 300_000_000
 """Minimum time from one bring-up of a node to the next, for nodes that restart in a loop."""
@@ -31,15 +31,15 @@ class Phase(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeStats:
-    """Statistics of the supervisor for a node."""
+    """The supervisor's statistics for a node."""
 
     phase: Phase
     rejoins: int
-    """Bring-ups after the start that ended with the node running."""
+    """Number of bring-ups after the start that ended with the node running."""
     failures: int
-    """Bring-ups after the start that failed."""
+    """Number of bring-ups after the start that failed."""
     baselines: int
-    """Number of new baselines in use."""
+    """Number of times that a new baseline came into use."""
     complaint: str | None
     """Why the last bring-up failed; None if it succeeded."""
 
@@ -76,13 +76,13 @@ class Supervised:
     defects: int = 0
     """Number of reported defects already handled."""
     upset: bool = False
-    """Whether supervising the node had a defect, so that its state is unknown."""
+    """Whether supervising the node raised an exception, so that its state is unknown."""
     probe_ns: int = 0
     search_ns: int = 0
     register_ns: int = 0
     mute_ns: int = 0
     unconfigured: bool = False
-    """Set by a job that found that the node lost its configuration."""
+    """Whether a job found that the node has lost its configuration."""
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None

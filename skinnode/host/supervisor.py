@@ -1,9 +1,9 @@
 """Keep the nodes of a running hand running.
 
-A node that comes back, or comes late, is configured and started; a changed baseline is read again. Nodes do
+A node that comes back, or appears late, is configured and started; a changed baseline is read again. Nodes do
 not affect each other. One thread decides fifty times a second what to do, from the facts that the mainline
-collected. What waits for a node (configuring, reading a baseline) runs on a pool, one job a node at a time;
-the thread takes the result when the job is done. So all state has one owner.
+collected. Operations that wait for a node (configuration, reading a baseline) run on a pool, one job per node
+at a time; the thread takes the result when the job is done, so all state has one owner.
 
 =========  ========================================  =========================================
 phase      means                                     left when
@@ -16,9 +16,9 @@ RUNNING    its scans are passed on                   it booted, or left operatio
 =========  ========================================  =========================================
 
 A defect is an exception raised while serving a patch that is STARTING or RUNNING, or while configuring it. It
-makes the patch faulty: its scans are withheld, and it is AWAITED for a pause of 0.1 s to 1 s that grows with
-each defect. A node that could not be configured is AWAITED likewise. Its boot-up ends the pause; after
-silence or a refusal, any frame from it does.
+makes the patch faulty: its scans are withheld, and its node is AWAITED for a pause of 0.1 s to 1 s that grows
+with each defect. A node that could not be configured is AWAITED likewise. A boot-up ends the pause; after
+silence or a refusal, so does any frame from the node.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ from skinnode.host.supervised import LEAST_NS, NodeStats, Phase, Supervised
 _log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Nodes configured at the same time after the start; more would only wait for the bus."""
+"""Maximum number of nodes configured in parallel after the start; more would only wait for the bus."""
 
 _TURN_S: Final = 0.02
 """Interval between two decisions, s."""
 
 
 class Supervisor:
-    """Supervises ``nodes`` from construction to :meth:`close`.
+    """Supervisor of ``nodes`` from construction until :meth:`close`.
 
-    It also sends the heartbeats of the host. Threads: one decides; a pool runs jobs that wait for nodes; any
-    thread may call :meth:`stats`.
+    It also sends the host's heartbeats. Threads: one thread decides; a pool runs jobs that wait for nodes;
+    any thread may call :meth:`stats`.
 
     Args:
         nodes: All nodes of the hand.
-        running: Those that run already.
+        running: Nodes that are already running.
         heartbeat_s: Period of the host's heartbeat, s.
-        defects: Gets exceptions raised while serving no particular patch.
+        defects: Collects exceptions that concern no particular patch.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Supervisor:
         }
 
     def close(self) -> None:
-        """Begin nothing more; end and join all threads."""
+        """Start no more jobs; end and join all threads."""
         self._stop.set()
         self._thread.join()
         for node in self._nodes:
@@ -129,7 +129,7 @@ class Supervisor:
         for node in self._nodes:
             try:
                 self._supervision.look(node, time.monotonic_ns())
-            except Exception as error:  # the next turn makes it faulty
+            except Exception as error:  # the next turn marks the patch as faulty
                 node.upset = True
                 node.remote.defects.report("supervision", error)
         self._beat(time.monotonic_ns())
@@ -142,10 +142,10 @@ class Supervisor:
         self._beat_ns = max(self._beat_ns + self._heartbeat_ns, now_ns)
         for link in self._links.values():
             node_id = link.config.heartbeat_node_id
-            assert node_id is not None  # only buses with one are here
+            assert node_id is not None  # only buses with such a node-ID are kept
             try:
                 link.send(od.heartbeat_cob_id(node_id), bytes([NmtState.OPERATIONAL]))
-            except BusError:  # nodes that miss it report that themselves
+            except BusError:  # nodes that miss the heartbeat report it themselves
                 continue
             except Exception as error:
                 link.defects.report("sending a heartbeat", error)

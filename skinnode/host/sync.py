@@ -1,4 +1,4 @@
-"""SYNC: a producer with a counter at a fixed rate without drift, and a follower of another producer."""
+"""SYNC: a producer with a counter and a fixed, drift-free rate, and a follower of another producer."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ class SyncStats:
 
     sent: int
     missed: int
-    """Periods that passed before the thread ran."""
+    """Number of periods skipped because the thread ran too late."""
     failed: int
-    """SYNC messages that a bus did not take."""
+    """SYNC messages that a bus did not accept."""
     latest_ns: int
     """Longest delay of a SYNC after its due time."""
     received: int = 0
     """SYNC messages of other producers on buses that another master runs."""
     irregular: int = 0
-    """Those of them whose counter is missing or does not follow the previous one: lost, or from a second
-    producer."""
+    """Received SYNC messages whose counter is missing or does not follow the previous counter: a SYNC was
+    lost, or there is a second producer."""
 
 
 class Ticks:
-    """The newest SYNC of each counter value.
+    """Newest SYNC for each counter value.
 
     Written by the thread that sends or follows SYNC, read by the mainline.
     """
@@ -64,7 +64,7 @@ class Ticks:
 
 
 class SyncFollower:
-    """Numbers the SYNC messages of another producer for ``ticks``. Mainline only."""
+    """Follower that numbers another producer's SYNC messages for ``ticks``. Mainline only."""
 
     def __init__(self, ticks: Ticks) -> None:
         self._ticks = ticks
@@ -73,7 +73,7 @@ class SyncFollower:
         """Monotonic time of the newest SYNC; 0 before the first."""
 
     def on_sync(self, data: bytes, t_ns: int) -> None:
-        """Take a SYNC. If its counter is missing or out of range, it cannot be numbered."""
+        """Process a SYNC. A SYNC whose counter is missing or out of range cannot be numbered."""
         self.received += 1
         self.t_newest_ns = t_ns
         overflow = self._ticks.counter_overflow
@@ -95,19 +95,19 @@ Send = Callable[[int, bytes], None]
 
 
 class SyncProducer:
-    """Sends SYNC on every bus from construction until :meth:`close`: at the same instant, or staggered.
+    """Producer of SYNC on every bus, at the same instant or staggered, until :meth:`close`.
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
-    first; if the thread wakes a whole period late, it skips that period and does not send two in a row. Every
-    SYNC that was begun goes to all buses.
+    first; if the thread wakes a whole period late, it skips that period rather than sending two SYNC messages
+    in a row. A SYNC that has begun is sent on all buses.
 
-    Threads: one of its own sends.
+    Threads: a thread of its own sends.
 
     Args:
         buses: For each bus, the function that sends and the SYNC counters.
         period_s: SYNC period, s.
         stagger_s: Delay from one bus to the next, s.
-        defects: For each bus, gets the exceptions raised while sending there.
+        defects: For each bus, the collector of exceptions raised while sending on it.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class SyncProducer:
         return SyncStats(self._sent, self._missed, self._failed, self._latest_ns)
 
     def close(self) -> None:
-        """Send no more; end and join the thread."""
+        """Stop sending; end and join the thread."""
         self._stop.set()
         self._thread.join()
 

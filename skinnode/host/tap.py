@@ -14,17 +14,17 @@ from skinnode.transport import Frame
 
 
 class HostTap(StreamTap, Protocol):
-    """Records all frames, and what else decides what a host makes of them. Never waits."""
+    """Recorder of all frames and of the other events that affect how a host decodes them. Never waits."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Take a batch that is about to be dispatched, on the mainline."""
+        """Record a batch that is about to be dispatched. Called on the mainline."""
 
     def sent(self, bus: str, frame: Frame) -> None:
-        """Take a frame that the interface accepted, on the thread that sent it."""
+        """Record a frame that the interface accepted. Called on the sending thread."""
 
 
 class ContainedTap:
-    """Wraps a tap and never raises.
+    """Wrapper of a tap that never raises.
 
     An exception is reported to ``defects``, and the tap loses that entry.
     """
@@ -64,7 +64,7 @@ class ContainedTap:
 
 
 def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
-    """Pass every frame to ``tap`` from now on. On the mainline, or before it runs.
+    """Start passing every frame to ``tap``. Call on the mainline, or before it runs.
 
     Returns:
         A function that ends this, to be called under the same condition.
@@ -82,10 +82,10 @@ def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
 
 
 def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Callable[[], None]:
-    """Have the mainline pass every frame and every change of the streams to ``tap``, their state first.
+    """Make the mainline pass the streams' state, then every frame and stream change, to ``tap``.
 
     Returns:
-        A function that ends this, for any thread.
+        A function that ends this; any thread may call it.
     """
     ends: list[Callable[[], None]] = []
 

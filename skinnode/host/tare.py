@@ -1,4 +1,4 @@
-"""Tare a patch: the node takes a new baseline, the host reads it and solves with it."""
+"""Tare a patch: the node takes a new baseline, and the host reads it and solves with it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from skinnode.host.health import PatchHealth
 from skinnode.host.remote_node import RemoteNode
 
 TARE_DEADLINE_S: Final = 5.0
-"""Default deadline of a tare without the SYNC periods below, s: 16 readings take milliseconds, reading a
-baseline 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
+"""Default deadline of a tare, excluding the SYNC periods below, s: 16 readings take milliseconds, reading a
+baseline takes 0.1 to 0.3 s, and the supervisor may pause for 2 s after the previous reading."""
 
 TARE_DEADLINE_SYNCS: Final = 3
 """SYNC periods added to the deadline, because the summary of the next scan announces the new baseline."""
@@ -49,4 +49,4 @@ def _why(node: RemoteNode, now: PatchHealth, emergencies: int, deadline_s: float
     if now.emergencies > emergencies and now.emergency_text:
         said += f" and reported {now.emergency_text}"
     where = f"patch {node.patch.name!r} on {node.patch.bus}"
-    return f"{where}: tare commanded, but no new baseline came within {deadline_s:g} s; {said}"
+    return f"{where}: tare commanded, but no new baseline arrived within {deadline_s:g} s; {said}"

@@ -232,7 +232,7 @@ def test_what_cannot_be_waited_for_counted_or_called_is_refused_at_once(
                 asyncio.run(host.fields().take_async(timeout_s))
         for capacity in (float("nan"), 1.5, 0):
             for subscribe in (host.fields, host.hands, host.events):
-                with pytest.raises(ValueError, match=r"capacity: got .*, must be at least 1, an integer"):
+                with pytest.raises(ValueError, match=r"capacity: got .*, must be an integer of at least 1"):
                     subscribe(capacity=capacity)
         for function in (3, None, awaited, Awaited(), functools.partial(awaited)):
             with pytest.raises(TypeError, match=r"function: got .*, must"):

@@ -136,7 +136,7 @@ def test_a_tare_that_the_node_does_not_take_is_a_timeout(hand: HandConfig, rack:
         rack.pull("p0")  # its last heartbeat still counts
         with pytest.raises(
             NodeTimeout,
-            match=r"node 5: patch 'p0' on can0: tare commanded, but no new baseline came within 0.2 s",
+            match=r"node 5: patch 'p0' on can0: tare commanded, but no new baseline arrived within 0.2 s",
         ):
             host.tare("p0", deadline_s=0.2)
         host.tare("p1")

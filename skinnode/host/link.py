@@ -41,7 +41,7 @@ class BusLink(Dispatcher):
         open_port: Opens the interface.
 
     Raises:
-        BusError: if the interface does not open.
+        BusError: if the interface cannot be opened.
     """
 
     def __init__(
@@ -257,7 +257,7 @@ class BusLink(Dispatcher):
         self._rests = self._opening = True
         if not isinstance(error, BusError):
             self.defects.report("receiving", error)
-            error = BusError(f"{self.config.name}: does not receive ({one_line(error)})")
+            error = BusError(f"{self.config.name}: cannot receive ({one_line(error)})")
         if self.failure is None:
             self._outages += 1
             self.failure = error

@@ -1,8 +1,8 @@
-"""Journal of a recording: JSON lines next to the log, holding what a replay needs besides the frames.
+"""Journal of a recording: JSON lines next to the log with everything that a replay needs besides the frames.
 
 The first line holds the hand and the offset of the host's clock (:class:`Header`). Each further line is an
 event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
-the event, ``t_ns`` its time (monotonic clock of the host).
+the event, and ``t_ns`` is its time on the host's monotonic clock.
 
 =============  ==============================================================================
 ``event``      meaning
@@ -40,7 +40,7 @@ FORMAT: Final = "skinnode recording 1"
 SUFFIX: Final = ".jsonl"
 
 COMPLAINTS_KEPT: Final = 100
-"""Maximum unreadable lines reported one by one; further lines are only counted."""
+"""Maximum number of unreadable lines reported individually; further lines are only counted."""
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
@@ -148,7 +148,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         with path.open("rb") as file:
             return _read_lines(path, file)
     except OSError as error:
-        allowed = f"a journal beside the log that can be read ({error.strerror})"
+        allowed = f"a readable journal next to the log ({error.strerror})"
         raise ConfigError("recording", str(path), allowed) from None
 
 
@@ -187,7 +187,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
 
 
 def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
-    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it holds no event."""
+    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it is not a valid event."""
     event: dict[str, Any] = json.loads(line)
     _whole(event["at"])
     _whole(event["t_ns"])

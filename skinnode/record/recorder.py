@@ -30,13 +30,14 @@ from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFr
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""Interval of flushes to the kernel: older entries survive a crash of this process."""
+"""Interval between flushes to the kernel: older entries survive a crash of this process."""
 
 SYNC_S: Final = 1.0
-"""Interval of fsync: older entries are on the disk. Each fsync takes the writer thread about 10 ms."""
+"""Interval between fsync calls: older entries are on the disk. Each fsync takes the writer thread about 10
+ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum batches queued for the disk: several seconds of four fully loaded buses."""
+"""Maximum number of batches queued for the disk: several seconds of four fully loaded buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -50,13 +51,13 @@ class RecorderStats:
     frames: int
     """Frames written."""
     dropped: int
-    """Frames not written, because the disk was too slow or failed."""
+    """Frames not written because the disk was too slow or failed."""
     failure: str | None
     """One-line reason why writing has stopped; None while the recorder works."""
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
-    """Return the path in ``folder`` of a recording named after hand, date and time."""
+    """Return the path of a recording in ``folder``, named after hand, date and time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -238,7 +239,7 @@ class Recorder:
         try:
             job()
         except OSError as error:
-            self._failure = f"{self.path}: recording ended, the disk does not take it ({error.strerror})"
+            self._failure = f"{self.path}: recording ended: cannot write to the disk ({error.strerror})"
             _log.warning("%s", self._failure)
         except Exception as error:
             self._lost += 1

@@ -1,4 +1,4 @@
-"""Replays a recording as fields, with the code that decodes live frames.
+"""Replay a recording as fields, using the code that decodes live frames.
 
 Dispatcher, assembler, decoder, stream, solver and publisher are the host's. No threads are used: each scan is
 solved when its last frame is dispatched.
@@ -50,7 +50,7 @@ def _never() -> bool:
 
 
 def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[[], bool] = _never) -> Replay:
-    """Return the fields of a recording, as an iterable.
+    """Return the fields of a recording as an iterable.
 
     Example::
 
@@ -141,10 +141,12 @@ class Replay:
     def _lack(self) -> str | None:
         if not self.ended:
             span_s = (self._now_ns - (self._first_ns or 0)) * 1e-9
-            return "was not ended: " + (f"reads up to {span_s:.1f} s" if self._read else "has no frame")
+            return "was not ended properly: " + (
+                f"readable up to {span_s:.1f} s" if self._read else "no frames"
+            )
         if self._recorded is None or self._read == self._recorded:
             return None
-        return f"has {self._read} frames of the {self._recorded} that were recorded"
+        return f"has {self._read} frames, but {self._recorded} were recorded"
 
     @property
     def flaws(self) -> list[str]:
@@ -159,7 +161,7 @@ class Replay:
             lost = counted(self.dropped, "frame was", "frames were")
             found.append(f"{lost} not recorded: the disk was too slow")
         if self.strange:
-            found.append(f"{counted(self.strange, 'frame')} on channels of no bus in the hand")
+            found.append(f"{counted(self.strange, 'frame')} on channels that belong to no bus of the hand")
         return found
 
     def stop(self) -> None:
@@ -193,7 +195,7 @@ class Replay:
             time.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:
-        """Report an event of the journal that is malformed."""
+        """Report a malformed event of the journal."""
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
@@ -307,5 +309,5 @@ class _Bus:
                 facts = facts_of(event["facts"], replay.hand.patch(name), self._config)
                 self._solvers[name] = ScanSolver(facts, replay.hand.solver, replay.clock)
             except (KeyError, TypeError, OverflowError, ValueError) as error:
-                replay.complain(event, f"no facts of {name} ({type(error).__name__}: {error})")
+                replay.complain(event, f"no facts about {name} ({type(error).__name__}: {error})")
         return self._solvers.get(name)

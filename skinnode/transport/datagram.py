@@ -48,7 +48,7 @@ class DatagramPort(CanPort):
         try:
             return _DatagramBus(self.config.channel)
         except (OSError, ValueError, OverflowError) as error:
-            raise BusError(f"{self._where}: does not open ({error}), allowed: a free UDP port") from error
+            raise BusError(f"{self._where}: cannot be opened ({error}), allowed: a free UDP port") from error
 
     def _open_reader(self) -> SocketReader | None:
         bus: Any = self._bus

@@ -27,7 +27,7 @@ frame is split between two containers."""
 
 
 class LoggedFrame(NamedTuple):
-    """A frame in a log; its ``t_ns`` is wall-clock time, to 1 µs."""
+    """A frame in a log; its ``t_ns`` is wall-clock time with a resolution of 1 µs."""
 
     frame: Frame
     channel: str

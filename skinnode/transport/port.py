@@ -38,7 +38,7 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 22
 """Size of the receive buffer requested from the kernel, if the interface is a socket; a waiting frame takes
 about 800 bytes."""
 
-# Python has no names for these. <asm-generic/socket.h>, <linux/in.h>, <linux/in6.h>
+# Python has no names for these constants from <asm-generic/socket.h>, <linux/in.h> and <linux/in6.h>.
 SO_RCVBUFFORCE: Final = 33
 _IP_MULTICAST_ALL: Final = 49
 _IPV6_MULTICAST_ALL: Final = 29
@@ -48,8 +48,8 @@ _OLDEST_STAMP_S: Final = 10.0
 the time of reading is used."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Errors by which the kernel reports, once per socket, that its interface went down; a send may receive them
-instead of a receive."""
+"""Errors by which the kernel reports, once per socket, that its interface went down; a send call may get such
+an error instead of a receive call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
@@ -110,7 +110,7 @@ class CanPort:
         config: The bus: interface, channel, bit rates and options.
 
     Raises:
-        BusError: if the interface does not open.
+        BusError: if the interface cannot be opened.
     """
 
     def __init__(self, config: BusConfig) -> None:
@@ -143,11 +143,9 @@ class CanPort:
             raise BusError(f"{self._where}: no such interface, allowed: {allowed_interfaces(config)}")
         try:
             bus = can.Bus(interface=config.interface, channel=config.channel, ignore_config=True, **options)
-        except (
-            Exception
-        ) as error:  # backends raise what their drivers raise: OSError, ImportError, TypeError …
+        except Exception as error:  # backends pass on driver exceptions: OSError, ImportError, TypeError …
             raise BusError(
-                f"{self._where}: does not open ({_why(error)}), allowed: {_channel_hint(config)}"
+                f"{self._where}: cannot be opened ({_why(error)}), allowed: {_channel_hint(config)}"
             ) from error
         if config.interface in (_MULTICAST, _SOCKETCAN):
             _tune_socket(bus.fileno())
@@ -268,11 +266,11 @@ class CanPort:
             frames = self._reader.read(timeout_s, most)
         except (OSError, ValueError) as error:  # ValueError: the socket was closed
             self._errors += 1
-            raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
+            raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
         self._received += len(frames)
         if not frames and self._link_gone is not None:
             self._errors += 1
-            raise BusError(f"{self._where}: does not receive ({_why(self._link_gone)})") from self._link_gone
+            raise BusError(f"{self._where}: cannot receive ({_why(self._link_gone)})") from self._link_gone
         return frames
 
     def _recv_message(self, timeout_s: float) -> list[Frame]:
@@ -288,7 +286,7 @@ class CanPort:
             except (can.CanError, OSError, ValueError) as error:
                 if self._closed or not _is_garbage(error):
                     self._errors += 1
-                    raise BusError(f"{self._where}: does not receive ({_why(error)})") from error
+                    raise BusError(f"{self._where}: cannot receive ({_why(error)})") from error
                 self._malformed += 1
             # The endpoint's own frame, or a malformed packet: wait for the remaining time.
             timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
@@ -299,7 +297,7 @@ class CanPort:
         While it is closed, sending raises BusError. The receiving thread must have ended first.
 
         Raises:
-            BusError: if the interface does not open; a later call may succeed.
+            BusError: if the interface cannot be opened; a later call may succeed.
         """
         if not self._away:
             self._away = True

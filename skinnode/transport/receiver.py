@@ -124,7 +124,7 @@ class Intake:
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Note that a request was sent at monotonic time ``t_ns``, and may be answered. Any thread."""
+        """Record that a request was sent at monotonic time ``t_ns`` and may be answered. Any thread."""
         self._asked_ns = t_ns
 
     # --- called by the receiver
@@ -195,12 +195,12 @@ class _Shared:
     """Intakes and poller of the shared thread."""
 
     intakes: dict[Intake, None]
-    """Intakes in order, each once."""
+    """Intakes in order, without duplicates."""
     poll: select.poll
 
 
 class Receiver:
-    """Receives on the ports of ``intakes`` from construction until :meth:`close`.
+    """Receiver on the ports of ``intakes``, from construction until :meth:`close`.
 
     Threads: ports that read batches share one thread, which wakes once for several buses where possible. Any
     other port may block in python-can and has its own thread. A failing port stops only its own reception.
@@ -318,7 +318,7 @@ class Receiver:
 
 
 def _fetch(intakes: Iterable[Intake]) -> bool:
-    """Fetch from every intake. Returns whether any has something new to take."""
+    """Fetch from every intake. Returns whether any intake has something new to take."""
     return sum(intake.fetch(0.0) for intake in intakes) > 0  # any() would skip intakes
 
 
@@ -331,7 +331,7 @@ def _together(now_ns: int, pause_ns: int) -> int:
 
 
 def _before(t_ns: int, now_ns: int) -> int:
-    """Return when to fetch for a frame predicted at ``t_ns``."""
+    """Return the time at which to fetch a frame predicted for ``t_ns``."""
     due_ns = t_ns + _LAG_NS
     if due_ns >= now_ns + _BEFORE_NS + GATHER_NS:
         due_ns -= _BEFORE_NS

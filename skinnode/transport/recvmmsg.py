@@ -1,7 +1,7 @@
 """Receives many messages from a socket in one system call: recvmmsg(2), which Python's socket module lacks.
 
-The call holds the interpreter's lock. It does not wait and takes about 1 µs per message; releasing the lock
-for each of 8,000 messages/s would cost the other threads more.
+The call holds Python's global interpreter lock. It does not wait and takes about 1 µs per message; releasing
+the lock for each of 8,000 messages/s would cost the other threads more.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most`` and ``count`` waiting messages, replacing the last batch; never waits.
+        """Receive up to ``most``, and at most ``count``, messages, replacing the last batch; never waits.
 
         Returns:
             Number of messages received.
@@ -89,7 +89,7 @@ class MessageBatch:
         return self._got
 
     def used(self) -> Iterator[tuple[int, int]]:
-        """Yield the lengths of ancillary data and of the message for each received message, bytes."""
+        """Yield the lengths of the ancillary data and the message, bytes, for each received message."""
         return _USED.iter_unpack(self._memory[: self._got * _USED.size])
 
     def taken(self) -> memoryview:

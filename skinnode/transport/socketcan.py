@@ -1,8 +1,8 @@
-"""Reads a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
+"""Read a raw SocketCAN socket in batches, with kernel timestamps and the kernel's drop counter.
 
 python-can opens and configures the socket and sends, but is not used to receive: it would need a ``select``,
-a ``recvmsg`` and a ``Message`` per frame, and ignores the drop counter. Structures and constants:
-<linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h>, <linux/net_tstamp.h>.
+a ``recvmsg`` and a ``Message`` per frame, and ignores the drop counter. Structures and constants are from
+<linux/can.h>, <linux/can/raw.h>, <asm-generic/socket.h> and <linux/net_tstamp.h>.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ FD_MTU: Final = 72
 """Size of struct canfd_frame, bytes; a classic frame is shorter."""
 _STAMPS: Final = struct.Struct("@qqqqqq")  # seconds and nanoseconds: software, unused, hardware
 _DROPS: Final = struct.Struct("@I")
-_CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head, level, type
+_CONTROL: Final = struct.Struct("@Nii")  # struct cmsghdr: length including this header, level, type
 _ALIGNED: Final = struct.calcsize("@N")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size) + socket.CMSG_SPACE(_DROPS.size)
 _STAMPED_BYTES: Final = socket.CMSG_SPACE(_STAMPS.size)  # ancillary data that holds only a time
 _RECORD: Final = struct.Struct(f"@IB3x8s56x{_CONTROL.size}xqq16xq8x{_ANCILLARY_BYTES - _STAMPED_BYTES}x")
-"""A frame and its time in their usual form: identifier, length, 8 bytes, software and hardware time."""
+"""Usual memory layout of a frame and its times: identifier, length, 8 bytes, software and hardware time."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 
@@ -45,7 +45,7 @@ _OLDEST_NS: Final = 10_000_000_000
 is used."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum arrival time of a frame after the reading of its batch began."""
+"""Maximum time by which a frame may arrive after the reading of its batch began."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
@@ -55,7 +55,7 @@ BATCH_FRAMES: Final = 256
 
 
 class SocketReader:
-    """Reads batches of frames from a bound socket. Owned by the receiving thread.
+    """Reader of batches of frames from a bound socket. Owned by the receiving thread.
 
     Hardware timestamps are used if the driver offers them: see :class:`HardwareDelay`.
     """
@@ -165,7 +165,7 @@ def set_link_bitrate(config: BusConfig) -> None:
     except (OSError, subprocess.SubprocessError) as error:
         said = getattr(error, "stderr", "") or str(error)
         raise BusError(
-            f"{config.name}: interface 'socketcan', channel {config.channel!r}: does not take "
+            f"{config.name}: interface 'socketcan', channel {config.channel!r}: does not accept "
             f"{config.bitrate_bps} bit/s ({' '.join(said.split())})"
         ) from error
 
@@ -176,7 +176,7 @@ def _ip_link(config: BusConfig, *arguments: str) -> None:
 
 
 class HardwareDelay:
-    """Converter of times on a controller's own clock to the monotonic clock.
+    """Converter of times from a controller's own clock to the monotonic clock.
 
     A frame that the kernel timestamped late thus keeps its arrival time. The kernel's timestamp is never
     early, so each frame gives an upper bound of the difference between the clocks. The lower envelope of

@@ -339,7 +339,7 @@ def test_interface_that_does_not_open(hand: HandConfig) -> None:
     with pytest.raises(BusError) as caught, Host.from_config(hand, interface="socketcan", channel="nocan0"):
         pass
     line = str(caught.value)
-    assert line.startswith("can0: interface 'socketcan', channel 'nocan0': does not open (")
+    assert line.startswith("can0: interface 'socketcan', channel 'nocan0': cannot be opened (")
     assert ", allowed: " in line
     assert "\n" not in line
 

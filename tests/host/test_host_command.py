@@ -296,7 +296,7 @@ def test_interface_that_does_not_open(error_of: Callable[..., str], tmp_path: Pa
     path = write_hand(tmp_path, "socketcan", "nocan0")
     line = error_of(str(path))
     assert re.fullmatch(
-        r"error: can0: interface 'socketcan', channel 'nocan0': does not open \(.+\), allowed: .+", line
+        r"error: can0: interface 'socketcan', channel 'nocan0': cannot be opened \(.+\), allowed: .+", line
     )
     assert error_of(str(path), "--interface", "smoke-signal").startswith(
         "error: can0: interface 'smoke-signal', channel 'nocan0': no such interface, allowed: "

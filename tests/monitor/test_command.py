@@ -75,7 +75,7 @@ def test_a_recording_that_is_not_all_there_is_a_fault(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert len(said) == 2
     assert said[0].startswith("fault: run.log line ")
-    assert said[1].startswith("fault: run.log was not ended: reads up to ")
+    assert said[1].startswith("fault: run.log was not ended properly: readable up to ")
     played = run(str(path), "--fast", program=[*PROGRAM[:-1], "replay"])
     assert played.stdout.splitlines()[1:] == said
 

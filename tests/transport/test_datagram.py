@@ -107,7 +107,7 @@ def test_what_the_kernel_has_no_room_for_is_counted(port: DatagramPort, send: Ca
 def test_it_only_listens_and_says_why_it_does_not_open(port: DatagramPort) -> None:
     with pytest.raises(BusError, match="0x080 not sent"):
         port.send(0x80, b"")
-    with pytest.raises(BusError, match=r"channel '\d+': does not open .* allowed: a free UDP port"):
+    with pytest.raises(BusError, match=r"channel '\d+': cannot be opened .* allowed: a free UDP port"):
         DatagramPort(port.config)
-    with pytest.raises(BusError, match="channel 'skin': does not open"):
+    with pytest.raises(BusError, match="channel 'skin': cannot be opened"):
         DatagramPort(port.config.model_copy(update={"channel": "skin"}))

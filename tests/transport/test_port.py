@@ -183,7 +183,7 @@ def test_closed(open_port) -> None:
     port.close()
     with pytest.raises(BusError, match=r"^can7: interface .* 0x001 not sent"):
         port.send(1, b"")
-    with pytest.raises(BusError, match=r"^can7: interface .* does not receive"):
+    with pytest.raises(BusError, match=r"^can7: interface .* cannot receive"):
         port.recv(0.0)
     assert (port.sent, port.errors) == (0, 2)
 
@@ -192,9 +192,9 @@ def test_closed(open_port) -> None:
     ("interface", "channel", "says"),
     [
         ("sockecan", "can0", "no such interface, allowed: "),
-        ("udp_multicast", "10.0.0.1", "does not open .* allowed: a multicast address"),
-        ("socketcan", "nosuchcan7", "does not open .* allowed: a CAN network interface that exists"),
-        ("slcan", "/dev/nosuchtty", "does not open .* allowed: a channel that"),
+        ("udp_multicast", "10.0.0.1", "cannot be opened .* allowed: a multicast address"),
+        ("socketcan", "nosuchcan7", "cannot be opened .* allowed: a CAN network interface that exists"),
+        ("slcan", "/dev/nosuchtty", "cannot be opened .* allowed: a channel that"),
     ],
 )
 def test_interfaces_that_do_not_open(interface: str, channel: str, says: str) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from skinnode.model.layout import PatchLayout
 
 OPTION = "--layout"
-HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as layout.file of a hand; or MODULE:NAME."
+HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as for layout.file in a hand; or MODULE:NAME."
 
 
 def import_from_here() -> None:

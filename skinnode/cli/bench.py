@@ -18,7 +18,7 @@ JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures to FILE.")
 ]
 PlotFile = Annotated[
-    Path | None, typer.Option("--plot", metavar="FILE", help="Draw the figures to FILE (needs matplotlib).")
+    Path | None, typer.Option("--plot", metavar="FILE", help="Plot the figures to FILE (needs matplotlib).")
 ]
 Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per candidate.")]
 
@@ -35,8 +35,8 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
     for row in figures["rows"]:
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
-        "F + J and steps: per wire. A step includes its evaluations; the trust radius is so short that the\n"
-        "operator must search for a step within it. LAPACK and BLAS use one thread, as skinnode does."
+        "F + J and steps are timed per wire. A step includes its evaluations; the trust radius is so short\n"
+        "that the operator must search for a step within it. LAPACK and BLAS use one thread, as skinnode."
     )
     _write(json, figures)
     if plot is not None:
@@ -57,7 +57,9 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
     for row in figures["rows"]:
         spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
         typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
-    typer.echo("ratio: to skinnode dogleg; tolerance: the loosest setting of the solver that reaches 1e-9.")
+    typer.echo(
+        "ratio: relative to skinnode dogleg; tolerance: the solver's loosest setting that reaches 1e-9."
+    )
     if not any("pyceres" in row["who"] for row in figures["rows"]):
         typer.echo("Ceres is not installed; to measure it too, run sh install.sh bench.")
     _write(json, figures)
@@ -182,7 +184,7 @@ def node(
     for row in figures["handling"]:
         typer.echo(f"{row['what']:30}{row['us']:8.1f}")
     typer.echo(
-        "\nexact: for a board; thrifty: for many nodes on one machine, in bursts at the same mean pace.\n"
+        "\nexact pacing is for a board; thrifty pacing, in bursts at the same mean pace, for many nodes.\n"
         "The figures include the effect of other work on this machine."
     )
     _write(json, figures)

@@ -27,7 +27,7 @@ def demo(
         Path | None, typer.Option("--json", help="Write all figures to this file.", metavar="FILE")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Draw truth, field and error to this file.", metavar="FILE.png")
+        Path | None, typer.Option(help="Plot truth, field and error to this file.", metavar="FILE.png")
     ] = None,
 ) -> None:
     """Press simulated patches and decode them from real CANopen traffic.

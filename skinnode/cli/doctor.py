@@ -152,4 +152,4 @@ def _summary(groups: list[Group]) -> str:
         return "no fault found in what was checked"
     below = sum(len(group.consequences) for group in groups)
     causes = counted(len(groups), "finding")
-    return f"{causes}, and {counted(below, 'consequence')} of them" if below else causes
+    return f"{causes} with {counted(below, 'consequence')}" if below else causes

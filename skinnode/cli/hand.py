@@ -172,7 +172,7 @@ def _remarks(plan: BusPlan) -> list[str]:
     late = [s.patch for s in plan.scans if s.worst_s is None or s.worst_s > plan.period_s]
     if not late:
         return []
-    return [f"note: at worst a scan of {', '.join(late)} has not ended when the next SYNC comes"]
+    return [f"note: in the worst case a scan of {', '.join(late)} has not ended at the next SYNC"]
 
 
 @app.command()
@@ -203,7 +203,7 @@ def new(
     from skinnode.errors import ConfigError
 
     if buses > patches:
-        raise ConfigError("--buses", buses, f"at most {patches}, a bus for each patch of --patches")
+        raise ConfigError("--buses", buses, f"at most {patches}, one bus per patch (--patches)")
     bus_of = {i: f"can{(i - 1) * buses // patches}" for i in range(1, patches + 1)}
     plans = plan_of(parse_hand(_table_of(bus_of, period_ms=60_000)))
     shortest_ms = max(plan.shortest_period_ms or 60_000 for plan in plans)
@@ -228,14 +228,14 @@ def _table_of(bus_of: dict[int, str], period_ms: int) -> dict[str, Any]:
 
 _NEW = """\
 #:schema hand.schema.json
-# A hand. Check it:  skinnode hand check hand.toml
-# Play it:           vcan-sim hand.toml, and in another terminal: skinnode host hand.toml
-# Editors complete and check it after:  skinnode hand schema > hand.schema.json
+# Hand file. Check it:  skinnode hand check hand.toml
+# Simulate it:          vcan-sim hand.toml, and in another terminal: skinnode host hand.toml
+# Editors can complete and check it after:  skinnode hand schema > hand.schema.json
 
 name = "hand"
 {buses}
 [sync]
-period_ms = {period_ms}                    # one SYNC is one scan of every patch: {rate} a second
+period_ms = {period_ms}                    # each SYNC starts one scan of every patch: {rate} per second
 
 [stream]
 partial = "pass"                  # incomplete scans: pass them on with a mask, or "withhold"
@@ -243,11 +243,11 @@ partial = "pass"                  # incomplete scans: pass them on with a mask, 
 _NEW_BUS = """
 [[buses]]
 name = "can{n}"
-interface = "udp_multicast"       # socketcan, pcan, kvaser, ...: any that python-can knows
+interface = "udp_multicast"       # socketcan, pcan, kvaser or another python-can interface
 channel = "239.74.163.{group}"          # for socketcan: "can{n}"
 bitrate_bps = 1_000_000
 role = "master"                   # "guest" if the robot has its own CANopen master
-max_load = 0.7                    # maximum share of the bus load for this plan
+max_load = 0.7                    # maximum planned load of this bus, as a fraction
 """
 _NEW_PATCH = """
 [[patches]]

@@ -21,7 +21,7 @@ _LONGEST_WAIT_S = 0.1
 
 
 def host(
-    hand: Annotated[Path, typer.Argument(help="The hand to run.", metavar="HAND.toml")],
+    hand: Annotated[Path, typer.Argument(help="Hand file to run.", metavar="HAND.toml")],
     interface: OtherInterface = None,
     channel: OtherChannel = None,
     seconds: Seconds = None,

@@ -63,7 +63,7 @@ def set_node(
     serial: Annotated[
         int | None,
         typer.Option(
-            min=0, max=0xFFFF_FFFF, help="Serial number of the node; default: the only one without a node-ID."
+            min=0, max=0xFFFF_FFFF, help="Serial number of the node; default: the only node without one."
         ),
     ] = None,
     node_id: Annotated[
@@ -73,9 +73,7 @@ def set_node(
     bit_rate: Annotated[
         int | None, typer.Option(help="New bit rate, used from the next power-on.", metavar="BPS")
     ] = None,
-    store: Annotated[
-        bool, typer.Option(help="Store both, so that the node keeps them when powered off.")
-    ] = True,
+    store: Annotated[bool, typer.Option(help="Store both settings, so that they survive power-off.")] = True,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
     vendor: Annotated[
         int | None, typer.Option(help="Vendor-ID of a device other than a patch.", metavar="N")
@@ -133,7 +131,7 @@ def set_node(
 
         done = commission(connection, address, Commissioning(node_id, bit_rate, store), agreed)
     if done is None:
-        raise ConfigError("--yes", Shown("no"), "yes to the question; nothing was changed")
+        raise ConfigError("--yes", Shown("no"), "yes at the prompt; nothing was changed")
     if as_json:
         from dataclasses import asdict
 
@@ -168,7 +166,7 @@ def _confirmed(
     if bit_rate is not None:
         changes.append(f"bit rate → {bit_rate} from the next power-on")
     changes.append("stored" if store else "not stored")
-    return bool(typer.confirm(f"serial {serial}: {', '.join(changes)}. Do it?", err=True))
+    return bool(typer.confirm(f"serial {serial}: {', '.join(changes)}. Proceed?", err=True))
 
 
 def _print(done: Commissioned) -> None:

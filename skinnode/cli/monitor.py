@@ -25,7 +25,7 @@ _SIMULATED = 4
 
 def monitor(
     hand: Annotated[
-        Path | None, typer.Argument(help="The hand to run and show.", metavar="[HAND.toml]")
+        Path | None, typer.Argument(help="Hand file to run and show.", metavar="[HAND.toml]")
     ] = None,
     interface: OtherInterface = None,
     channel: OtherChannel = None,
@@ -48,7 +48,8 @@ def monitor(
         typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
     ] = ".",
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after this many seconds; default: at q.", metavar="S")
+        float | None,
+        typer.Option(min=0.0, help="End after this many seconds; default: on key q.", metavar="S"),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object per second instead of showing a screen.")
@@ -111,7 +112,7 @@ def _require_screen() -> None:
     from skinnode.errors import ConfigError, Shown
 
     if find_spec("textual") is None:
-        allowed = "the screen after sh install.sh tui, or --json"
+        allowed = "the package textual (sh install.sh tui), or --json"
         raise ConfigError("skinnode monitor", Shown("no package textual"), allowed)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("standard input and output", Shown("no terminal"), "a terminal, or --json")

@@ -156,7 +156,7 @@ def _node_text(node_id: int, given: int | None) -> str:
     from skinnode.canopen.lss import NOT_CONFIGURED
 
     who = "node without a node-ID" if node_id == NOT_CONFIGURED else f"node {node_id}"
-    return who if node_id == given or given is None else f"{who} (LSS stored it; not {given})"
+    return who if node_id == given or given is None else f"{who} (stored by LSS; {given} is not used)"
 
 
 @dataclass(frozen=True, slots=True)

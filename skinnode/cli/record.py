@@ -49,10 +49,10 @@ def record(
 ) -> None:
     """Run a hand's patches as `skinnode host` does and record every frame, received and sent.
 
-    Play the recording with `skinnode replay`; candump's tools and python-can can read it too. If the command
+    Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command
     is killed, the recording can be read up to the last second. A recording made with --listen has no
-    baselines and thus no fields; it is for candump's tools. Exit status 1 if frames could not be written, or
-    for a fault of `skinnode host`; 2 if it could not run.
+    baselines and thus no fields; it is for can-utils. Exit status 1 if frames could not be written, or for
+    any fault that `skinnode host` reports; 2 if it could not run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal

@@ -44,8 +44,8 @@ def short_pdo(dut: Dut) -> Frame:
         dut.operational()
         dut.bus.pending(dut.emcy_id)
         dut.bus.send(cob_id & CAN_ID)
-        return expect_emcy(dut, PDO_NOT_PROCESSED, f"to {pdo} without a byte")
-    raise NotApplicable("no RPDO is valid and maps something by default: no error can be provoked")
+        return expect_emcy(dut, PDO_NOT_PROCESSED, f"after {pdo} without data")
+    raise NotApplicable("no RPDO is both valid and mapped by default, so no error can be provoked")
 
 
 def foreign_id(dut: Dut) -> int:

@@ -43,7 +43,7 @@ def no_answer(wrong: str) -> str:
     """Describe a node without a valid SDO answer; ``wrong`` is its newest answer, or empty."""
     if not wrong:
         return "does not answer SDO requests"
-    return f"answers SDO requests with data that is no answer of CiA 301 (newest: {wrong})"
+    return f"answers SDO requests with data that is not a CiA 301 answer (newest: {wrong})"
 
 
 class BusConnection:
@@ -175,7 +175,7 @@ class BusConnection:
             if beat is not None:
                 return State(beat.state, "heartbeat")
             if heartbeat_s:
-                return State(None, f"no heartbeat, though one every {heartbeat_s:g} s is set")
+                return State(None, f"no heartbeat, although its period is set to {heartbeat_s:g} s")
         if not guarding:
             return State(None, "no heartbeat, and a master guards the node")
         for answer_s in GUARD_ANSWERS_S:

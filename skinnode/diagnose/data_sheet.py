@@ -41,7 +41,7 @@ def read_profile(remote: RemoteOd) -> PatchProfile | None:
         bus: BusType = "classic" if pdo_bytes == 8 else "fd"
         return PatchProfile(rows, columns, upper, lower, bits, bus=bus, checked=checked)
     except ConfigError as error:
-        raise NodeError(remote.node_id, f"its descriptor (0x2000) is of no patch: {error}") from None
+        raise NodeError(remote.node_id, f"its descriptor (0x2000) describes no patch: {error}") from None
 
 
 def load_data_sheet(path: Path) -> DataSheet:

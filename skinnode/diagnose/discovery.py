@@ -18,6 +18,7 @@ from skinnode.canopen.sdo import upload_request
 from skinnode.diagnose.bus_connection import BusConnection
 from skinnode.errors import NodeError
 from skinnode.text.printable import printable
+from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
 """Interval between requests; it limits their load to a sixth of a 1 Mbit/s bus, so PDOs are not delayed."""
@@ -125,7 +126,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
             lss = pool.submit(find_unconfigured, connection)
             progress("asking node-IDs 1 to 127")
             answered = _sweep(connection)
-            progress(f"{len(answered)} answer; who are they?")
+            progress(f"{counted(len(answered), 'node answers', 'nodes answer')}; reading identities")
             jobs = [pool.submit(_examine, connection, node_id, count) for node_id, count in answered.items()]
             nodes = [job.result() for job in jobs]
             connection.wait_until(lambda: False, max(0.0, begun_s + LISTEN_S - time.monotonic()))
@@ -254,7 +255,7 @@ def _two_serials(connection: BusConnection, node_id: int) -> str:
         return ""
     serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
     shown = " and ".join(map(str, serials))
-    return f"one question got {len(answers)} answers" + (f": serials {shown}" if shown else "")
+    return f"one request got {len(answers)} answers" + (f": serials {shown}" if shown else "")
 
 
 def _number(connection: BusConnection, node_id: int, index: int, subindex: int) -> int | None:

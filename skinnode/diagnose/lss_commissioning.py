@@ -88,7 +88,7 @@ def commission(
     """
     node_id = wanted.node_id
     if node_id is not None and connection.ask_all(node_id, _ASK_DEVICE_TYPE, _ASKED_S):
-        raise ConfigError("--node-id", node_id, "one that no other node has")
+        raise ConfigError("--node-id", node_id, "a node-ID that no other node has")
     if not connection.lss.select(address):
         raise ConfigError("--serial", address.serial_number, "the serial number of a node on this bus")
     boot_ups = 0 if node_id is None else connection.listener.node(node_id).boot_ups

@@ -108,10 +108,10 @@ def pdo_text(pdo: Pdo, name_of: Callable[[int, int], str]) -> str:
         return f"{name} off"
     parts = [f"{name} 0x{pdo.cob_id:03X}", kind_text(pdo)]
     if pdo.inhibit_100us:
-        parts.append(f"{pdo.inhibit_100us / 10:g} ms apart at least")
+        parts.append(f"at least {pdo.inhibit_100us / 10:g} ms apart")
     if pdo.event_timer_ms:
         limit = "sent" if pdo.direction == "TPDO" else "expected"
-        parts.append(f"{limit} every {pdo.event_timer_ms} ms at least")
+        parts.append(f"{limit} at least every {pdo.event_timer_ms} ms")
     if pdo.sync_start:
         parts.append(f"from SYNC {pdo.sync_start} on")
     names = [name_of(entry >> 16, entry >> 8 & 0xFF) for entry in pdo.mapped]

@@ -48,10 +48,10 @@ _LATE: Final = (*_HOLES, "scans end after the next has begun")
 _OF_SYNC: Final = ("SYNCs are missing", "SYNC is irregular")
 _ERRORS: Final = ("emergency messages during the examination", "the node reports an error")
 _CONFIGURED_BY_OTHERS: Final = (
-    "the (chunk|summary) PDO .* is not where it belongs",
-    "chunks are not sent at events",
-    "another inhibit time than the host sets",
-    "another heartbeat period than configured",
+    "the (chunk|summary) PDO .* is not at its COB-ID",
+    "chunks are not event-driven",
+    "the inhibit time differs from the host's setting",
+    "the heartbeat period differs from the hand file",
     "no heartbeat: a loss of the node goes unnoticed",
     "the patch scans by its own timer",
 )
@@ -70,7 +70,7 @@ RULES: Final = (
     Rule(
         "two nodes have its node-ID",
         (
-            "two different chunks with one number",
+            "two different chunks with the same number",
             "frames that are not chunks of this patch",
             "the serial number differs from the hand file",
             *_LATE,
@@ -85,7 +85,7 @@ RULES: Final = (
             *_CONFIGURED_BY_OTHERS,
             "the node is .* while others run",
             "the node is .* and does not answer",
-            "not all its objects could be read",
+            "some of its objects could not be read",
             *_ERRORS,
         ),
         _RESTARTED,
@@ -99,26 +99,26 @@ RULES: Final = (
     ),
     Rule(
         "the interface failed during the examination",
-        (*_LATE, *_OF_SYNC, "the node is .* and does not answer", "not all its objects could be read"),
+        (*_LATE, *_OF_SYNC, "the node is .* and does not answer", "some of its objects could not be read"),
         _ANYTHING,
     ),
     Rule(
         "two producers of SYNC",
         (
-            "two masters with one heartbeat",
+            "two masters send the same heartbeat",
             "another device sends NMT commands",
             "the SYNC period differs",
-            "another heartbeat period than configured",
+            "the heartbeat period differs from the hand file",
             *_LATE,
             *_OF_SYNC,
             *_ERRORS,
         ),
         _OVERRUN,
     ),
-    Rule("two masters with one heartbeat", ("another device sends NMT commands", *_OF_SYNC), _ANYTHING),
+    Rule("two masters send the same heartbeat", ("another device sends NMT commands", *_OF_SYNC), _ANYTHING),
     Rule(
         "the bus load exceeds the planning limit",
-        (*_LATE, *_OF_SYNC, "this machine dropped frames", "not all its objects could be read", *_ERRORS),
+        (*_LATE, *_OF_SYNC, "this machine dropped frames", "some of its objects could not be read", *_ERRORS),
         _OVERRUN,
     ),
     Rule("this machine dropped frames", (*_HOLES, *_OF_SYNC), _ANYTHING),
@@ -132,7 +132,11 @@ RULES: Final = (
     Rule(
         ".*crossings? have no baseline|.*crossing has no baseline", (".*crossings? out of range",), _ANYTHING
     ),
-    Rule("its layout differs", ("another code width than configured", "the EDS of the hand file"), _ANYTHING),
+    Rule(
+        "its layout differs",
+        ("the code width differs from the hand file", "the EDS of the hand file"),
+        _ANYTHING,
+    ),
     Rule("SYNCs are missing", ("whole scans are missing", "SYNC is irregular"), _ANYTHING),
     Rule(
         "the node reports an error",

@@ -258,7 +258,8 @@ class MonitorApp(App[None]):
         felt = [
             f"{name} {1e6 * (self._view.patch(name).depth_m or 0.0):.0f} µm" for name in names if self._view
         ]
-        text = f"Tare {what}?\n\nWhat is felt now will be zero: {', '.join(felt)}.\nLeave the skin alone.\n\n"
+        text = f"Tare {what}?\n\nThe current reading becomes zero: {', '.join(felt)}.\n"
+        text += "Do not touch the skin.\n\n"
         self.push_screen(
             Dialog(text + "y, enter: tare     any other key: no", question=True),
             lambda sure: self._tare(names) if sure else None,

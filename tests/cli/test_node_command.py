@@ -316,7 +316,7 @@ def test_a_node_id_by_lss(sources: Path, multicast_group: str, master: Master) -
         assert bytes(master.next(0x7E4).data)[:2] == b"\x17\0"
         master.send(0x7E5, "04 00 00 00 00 00 00 00")
         assert bytes(master.next(0x709).data) == b"\0"
-    for given, says in ((None, "node 9 ("), (4, "node 9 (LSS stored it; not 4) (")):
+    for given, says in ((None, "node 9 ("), (4, "node 9 (stored by LSS; 4 is not used) (")):
         with running(multicast_group, *options, node_id=given, cwd=sources) as process:
             assert bytes(master.next(0x709).data) == b"\0"
             assert process.stdout.readline().startswith(says)

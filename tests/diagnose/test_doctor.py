@@ -113,7 +113,7 @@ def _warm(ohm: np.ndarray, t_ns: int) -> np.ndarray:
 
 THUMB_AND_INDEX = [
     (_cut_wire, "upper wires open: 2", "certain", _noisy_wire, "noise on lower wire 4", "likely"),
-    (_short_crossing, "1 crossing shorted", "certain", _warm, "the baseline is no longer", "likely"),
+    (_short_crossing, "1 crossing shorted", "certain", _warm, "the baseline no longer", "likely"),
 ]
 
 
@@ -179,7 +179,7 @@ def test_a_node_that_is_gone_and_a_bus_without_any(hand_file: HandFile, on: On) 
     hand = load_hand(file)
     assert examine(file)[1].keys() == {"can0: no node of the hand answers"}
     on(Fleet(hand.model_copy(update={"patches": hand.patches[1:]})))
-    assert examine(file)[1].keys() == {"thumb: the node is not there"}
+    assert examine(file)[1].keys() == {"thumb: the node is missing"}
 
 
 def test_two_nodes_with_one_node_id(hand_file: HandFile, on: On) -> None:
@@ -208,7 +208,7 @@ def test_chunks_too_far_apart(hand_file: HandFile, on: On) -> None:
     assert run(["od", "5", "1800:3", "--write", "100"], bus).status == 0
     status, found = examine(file)
     assert status == 1
-    assert found["thumb: the chunk PDO (TPDO1) is not where it belongs"][1] == "off, wanted 0x185"
+    assert found["thumb: the chunk PDO (TPDO1) is not at its COB-ID"][1] == "off, wanted 0x185"
     assert "160 ms, the period is 25 ms" in found["thumb: a scan takes longer than a SYNC period"][1]
 
 
@@ -303,7 +303,7 @@ def test_on_every_interface_without_a_hand(any_bus: BusConfig, powered: Callable
     done = run(["doctor", "--active", "--json"], any_bus)
     assert done.status == 1
     found = {f"{f['where']}: {f['what']}": f["sure"] for f in done.json["findings"]}
-    assert found["node 5: the baseline is no longer that of the skin at rest"] == "likely"
+    assert found["node 5: the baseline no longer matches the skin at rest"] == "likely"
     assert done.json["buses"][0]["patches"]["node 5"]["scans"] >= SCANS
     with BusConnection(any_bus) as connection:  # as it was before
         assert str(connection.state(5, 0, guarding=True)) == "pre-operational"

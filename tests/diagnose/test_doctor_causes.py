@@ -69,7 +69,7 @@ def test_an_overload_and_five_faults_are_in_order() -> None:
     assert next(iter(named)) == "can0: the bus load exceeds the planning limit"
     assert {name for name, group in named.items() if group.rank == 0} == {
         "can0: the bus load exceeds the planning limit",
-        "palm: the node is not there",
+        "palm: the node is missing",
         "thumb: the node restarts by itself",
         "index: upper wires open: 2",
         "can0: patch at node 9 is not in the hand file",
@@ -138,6 +138,6 @@ def test_a_host_of_the_hand_is_neither_somebody_nor_unknown(
     time.sleep(0.8)
     done = run(["doctor", file, "--json"])
     told = {row["what"] for row in done.json["findings"]}
-    assert "the node is not there" in told
+    assert "the node is missing" in told
     assert "frames of unknown origin" not in told
     assert "another device sends NMT commands" not in told

@@ -58,7 +58,7 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
         ({"sync_counters": (1, 200, 2, 201, 3, 202) * 4}, "two producers of SYNC", Sure.CERTAIN),
         (
             {"master_node_id": 1, "master_beats_s": 0.125 * np.arange(9)},
-            "two masters with one heartbeat",
+            "two masters send the same heartbeat",
             Sure.LIKELY,
         ),
         ({"nmt_commands": 2}, "another device sends NMT commands", Sure.POSSIBLE),
@@ -126,7 +126,7 @@ def test_a_guest_whose_master_sends_no_sync() -> None:
 def test_a_node_that_is_missing_is_told_from_a_bus_that_is_silent() -> None:
     other = PatchFacts("index", 6, found=node(6))
     gone = PatchFacts("thumb", 5)
-    assert one(bus_of(gone, other)).what == "the node is not there"
+    assert one(bus_of(gone, other)).what == "the node is missing"
     assert one(bus_of(gone, PatchFacts("index", 6))).what == "no node of the hand answers"
 
 
@@ -186,7 +186,7 @@ def test_who_touches_the_skin_is_no_defect(layout: PatchLayout, cycle_s: float, 
         ratio = stroked(layout, seed, period_s, cycle_s=cycle_s, depth=depth)
         assert told_of(ratio) == set()
     facts = bus_of(replace(WELL, scans=scans_of(ratio, stated_noise=3e-6)))
-    assert [line for line in not_judged(facts) if "leave it alone" in line]
+    assert [line for line in not_judged(facts) if "do not touch it" in line]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -217,7 +217,7 @@ def test_noise_of_the_supply_is_alike_in_all_crossings() -> None:
     hum = 1.0 + 20 * NOISE * np.random.default_rng(3).standard_normal((50, 1, 1))
     finding = skin(quiet_ratio() * hum)
     assert finding.what == "the whole patch is noisier than the hand file says"
-    assert finding.evidence.startswith("all crossings together, ")
+    assert finding.evidence.startswith("all crossings together: ")
 
 
 def test_a_jump_that_stays() -> None:
@@ -249,7 +249,7 @@ def test_frozen_values_and_a_frozen_node() -> None:
 
 def test_drift_of_the_baseline() -> None:
     finding = skin(1.012 * quiet_ratio())
-    assert "no longer that of the skin at rest" in finding.what
+    assert "no longer matches the skin at rest" in finding.what
     assert "+1.20 %" in finding.evidence.replace("%", " %")
     part = quiet_ratio()
     part[:, 0, :4] *= 0.97
@@ -279,7 +279,7 @@ def test_crossings_open_always_and_now_and_then() -> None:
         ({"scans_corrupt": 2}, "codes differ from those that the node packed"),
         ({"bad_form": 3}, "frames that are not chunks of this patch"),
         ({"scans_missed": 3}, "whole scans are missing"),
-        ({"conflicts": 4}, "two different chunks with one number"),
+        ({"conflicts": 4}, "two different chunks with the same number"),
         ({"bad_length": 1}, "frames that are not chunks"),
     ],
 )
@@ -295,11 +295,13 @@ def test_few_scans_are_not_judged() -> None:
     ratio = quiet_ratio()[:10] * 1.05 + 100 * STEP
     bus = bus_of(replace(WELL, scans=scans_of(ratio)))
     assert run_checks(bus) == []
-    few = "thumb: noise, steps and drift: 10 scans came, 20 needed"
+    few = "thumb: noise, steps and drift: 10 scans received, 20 needed"
     assert not_judged(bus) == [few]
     assert WELL.found is not None
     stopped = replace(bus.patches[0], found=replace(WELL.found, state="pre-operational"))
-    assert not_judged(replace(bus, patches=(stopped,))) == [f"{few}; it does not run: --active starts it"]
+    assert not_judged(replace(bus, patches=(stopped,))) == [
+        f"{few}; the node is not running: --active starts it"
+    ]
     assert not_judged(replace(bus, patches=(stopped,), active=True)) == [few]
 
 

@@ -45,7 +45,7 @@ def test_tells_what_is_in_the_node(any_bus: BusConfig, powered: Powered, connect
     assert found.storing == "on command; no verified configuration (0x1020)"
     assert found.errors == ("0x8240 SYNC of unexpected length: 1 byte instead of 0",)
     assert found.pdo_texts[0] == (
-        "TPDO1 0x185, on event, 1 ms apart at least, sent every 500 ms at least, 8 bytes: "
+        "TPDO1 0x185, on event, at least 1 ms apart, sent at least every 500 ms, 8 bytes: "
         "Chunk index; Chunk scan counter; Code 1 to 3"
     )
     assert found.pdo_texts[1].startswith("TPDO2 0x285, every SYNC, 8 bytes")
@@ -197,7 +197,7 @@ def test_nonsense_is_not_called_silence(
 ) -> None:
     monkeypatch.setattr(discovery, "LISTEN_S", 0.5)
     monkeypatch.setattr(discovery, "PACE_S", 0.0001)
-    said = f"answers SDO requests with data that is no answer of CiA 301 (newest: {shown})"
+    said = f"answers SDO requests with data that is not a CiA 301 answer (newest: {shown})"
     with _babbler(bus, 9, answer):
         for command in (["info", "9"], ["od", "9", "1000"], ["od", "9"]):
             done = run(command, bus)

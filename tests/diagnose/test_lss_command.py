@@ -74,7 +74,7 @@ def test_a_node_without_memory_says_that_it_forgets(bus: BusConfig, powered: Pow
 def test_what_is_refused(bus: BusConfig, powered: Powered) -> None:
     powered(bus, 5, serial=7)
     for arguments, line in (
-        (["--serial", "7", "--node-id", "5"], "--node-id: got 5, allowed: one that no other node has"),
+        (["--serial", "7", "--node-id", "5"], "--node-id: got 5, allowed: a node-ID that no other node has"),
         (["--serial", "8", "--node-id", "6"], "--serial: got 8, allowed: the serial number of a node"),
         (["--node-id", "6"], "because no node without a node-ID answers"),
         (["--serial", "7"], "--node-id, --bit-rate"),

@@ -69,7 +69,7 @@ def _identity(dut: Dut) -> Iterator[str]:
             except ValueError:
                 same = False
             if not same:
-                yield f"{key}={stated}, the device says 0x{value:08X}"
+                yield f"{key}={stated}, the device reports 0x{value:08X}"
 
 
 def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
@@ -79,14 +79,14 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
         yield f"{entry}: data type 0x{entry.data_type:04X} is not defined"
         return
     if entry.mappable and not (entry.into_rpdo or entry.into_tpdo):
-        yield f"{entry}: mappable, but its access fits neither direction"
+        yield f"{entry}: mappable, but its access suits neither RPDOs nor TPDOs"
     if entry.mappable and entry.data_type == _DOMAIN:
-        yield f"{entry}: mappable, but a DOMAIN"
+        yield f"{entry}: mappable, although a DOMAIN"
     try:
         entry.default_bytes(node_id)
         value = _default(entry, node_id)
     except (ValueError, OverflowError):
-        yield f"{entry}: default {entry.default!r} is not of its type"
+        yield f"{entry}: default {entry.default!r} does not fit its type"
         return
     if value is not None and value >= 1 << 8 * entry.size:
         yield f"{entry}: default {entry.default} exceeds its type"

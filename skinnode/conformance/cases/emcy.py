@@ -46,7 +46,7 @@ def forced(dut: Dut) -> None:
     frame = short_pdo(dut)
     if not frame.data[2] & _GENERIC:
         raise Failed("bit 0 of the error register set in the EMCY", describe(frame))
-    dut.bus.expect_silence(dut.emcy_id, "second emergency message for one error")
+    dut.bus.expect_silence(dut.emcy_id, "second emergency message for the same error")
 
 
 @case("EMCY-05", "0x1001 equals the error register in the last emergency message", "7.5.2.2")
@@ -71,4 +71,4 @@ def history_after(dut: Dut) -> None:
     request = expedited(_HISTORY, 0, b"\x01")
     dut.sdo.aborts(request, _HISTORY, 0, (0x0609_0030, 0x0609_0031), "write of 1 to 0x1003:00")
     dut.sdo.write_integer(_HISTORY, 0, 0, 1)
-    dut.sdo.aborts(b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 once cleared")
+    dut.sdo.aborts(b"\x40" + mux(_HISTORY, 1), _HISTORY, 1, (_NO_DATA,), "read of 0x1003:01 after clearing")

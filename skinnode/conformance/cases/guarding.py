@@ -16,9 +16,9 @@ def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:
-        raise Failed(f"{STATES[state]} and {toggle_text} to a remote frame, {what}", "nothing")
+        raise Failed(f"{STATES[state]} and {toggle_text} in answer to a remote frame, {what}", "nothing")
     if got & 0x7F != state or (toggle is not None and got >> 7 != toggle):
-        raise Failed(f"{STATES[state]} and {toggle_text} to a remote frame, {what}", f"0x{got:02X}")
+        raise Failed(f"{STATES[state]} and {toggle_text} in answer to a remote frame, {what}", f"0x{got:02X}")
 
 
 @case("GUARD-01", "0x100C and 0x100D are 0 by default: no life guarding", "7.5.2.11, 7.5.2.12")
@@ -55,8 +55,8 @@ def others(dut: Dut) -> None:
     for node_id in range(1, 128):
         if node_id != dut.node_id:
             dut.bus.send(0x700 + node_id, remote=True)
-    dut.bus.expect_silence(dut.error_control_id, "answer to remote frames for others")
-    guarded(dut, 127, 0, "after remote frames for others")
+    dut.bus.expect_silence(dut.error_control_id, "answer to remote frames for other nodes")
+    guarded(dut, 127, 0, "after remote frames for other nodes")
 
 
 @case("GUARD-05", "0x100C and 0x100D can be written and read back", "7.5.2.11, 7.5.2.12")
@@ -70,7 +70,7 @@ def written(dut: Dut) -> None:
         raise Failed("0x1234 and 3 read back", f"0x{got[0]:04X} and {got[1]}")
 
 
-@case("GUARD-06", "Life guarding begins with the first remote frame; EMCY 0x8130 follows when they stop",
+@case("GUARD-06", "Life guarding begins with the first remote frame; EMCY 0x8130 follows when those stop",
       "7.2.8.2.2.1, 7.5.2.12")  # fmt: skip
 def life_guarding(dut: Dut) -> None:
     dut.need(GUARD_TIME)
@@ -85,7 +85,7 @@ def life_guarding(dut: Dut) -> None:
         sent_ns = dut.bus.send(dut.error_control_id, remote=True)
         dut.bus.wait(0.5 * _GUARD_MS * 1e-3)
     expect_no_emcy(dut, COMMUNICATION_LOST, "while remote frames arrive")
-    frame = expect_emcy(dut, COMMUNICATION_LOST, "when they stop")
+    frame = expect_emcy(dut, COMMUNICATION_LOST, "when remote frames stop")
     not_before(frame, sent_ns, _GUARD_MS * _FACTOR, "EMCY 0x8130")
     if dut.eds.find(0x1029, 1) is None or dut.sdo.integer(0x1029, 1) == 0:
         guarded(dut, 127, None, "after life guarding failed in OPERATIONAL")

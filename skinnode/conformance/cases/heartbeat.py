@@ -72,8 +72,8 @@ def in_time(dut: Dut) -> None:
     dut.start_heartbeat(_PERIOD_MS)
     dut.operational()
     beat(dut, partner, times=7, each_s=0.1)
-    expect_no_emcy(dut, COMMUNICATION_LOST, "while heartbeats come in time")
-    dut.expect_state(5, "while heartbeats come in time")
+    expect_no_emcy(dut, COMMUNICATION_LOST, "while heartbeats arrive in time")
+    dut.expect_state(5, "while heartbeats arrive in time")
 
 
 @case("HB-06", "Late heartbeats cause EMCY 0x8130, but not before the consumer time", "7.2.8.2.2.2")
@@ -89,7 +89,7 @@ def too_late(dut: Dut) -> None:
 
 @case(
     "HB-07",
-    "After reset node the first heartbeat starts monitoring; 0x1029 applies when one is lost",
+    "After reset node the first heartbeat starts monitoring; 0x1029 applies when they stop",
     "7.2.8.2.2.2, 7.5.2.32",
 )
 def after_reset(dut: Dut) -> None:

@@ -50,7 +50,7 @@ def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
         if number < 4 and not cob_id & INVALID and cob_id & CAN_ID != wanted:
             raise Failed(f"{pdo} on 0x{wanted:03X} by the pre-defined connection set", f"0x{cob_id:08X}")
         if not cob_id & INVALID and (other := valid.setdefault(cob_id & CAN_ID, pdo)) != pdo:
-            raise Failed("a CAN-ID for each PDO", f"0x{cob_id & CAN_ID:03X} for {other} and {pdo}")
+            raise Failed("a different CAN-ID for each PDO", f"0x{cob_id & CAN_ID:03X} for {other} and {pdo}")
         kind = dut.sdo.integer(pdo.parameter, 2)
         if kind in _RESERVED_KINDS:
             raise Failed(f"{pdo} with a transmission type that is not reserved", str(kind))
@@ -143,7 +143,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: types 1 and 3 are sent after each or each third SYNC, and not in between",
+@case("PDO-06", "OPERATIONAL: types 1 and 3 are sent after every and every third SYNC, not in between",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:

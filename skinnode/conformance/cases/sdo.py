@@ -257,7 +257,7 @@ def wrong_toggle(dut: Dut) -> None:
     dut.sdo.served(b"\x40" + mux(entry.index, entry.subindex), what)
     toggled = "a first segment requested with toggle bit 1"
     dut.sdo.aborts(b"\x70", entry.index, entry.subindex, (0x0503_0000,), toggled)
-    answer = dut.sdo.ask(b"\x60", "a segment of a transfer that was aborted")
+    answer = dut.sdo.ask(b"\x60", "a segment of an aborted transfer")
     if answer[0] != 0x80:
         raise Failed("the transfer to have ended", answer.hex(" ").upper())
 

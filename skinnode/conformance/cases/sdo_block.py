@@ -112,7 +112,7 @@ def wrong_sequence(dut: Dut) -> None:
     dut.sdo.served(b"\xa0" + mux(0x1000, 0) + b"\x14", "a block read of 0x1000:00")
     dut.sdo.served(b"\xa3", "the start of a block read")
     codes = (_SEQUENCE, *UNKNOWN_COMMAND)
-    dut.sdo.aborts(b"\xa2\x80\x14", 0x1000, 0, codes, "an acknowledge of segment 128")
+    dut.sdo.aborts(b"\xa2\x80\x14", 0x1000, 0, codes, "an acknowledgement of segment 128")
 
 
 @case("SDO-28", "0x1201 to 0x127F: objects in the EDS can be read, others do not exist", "7.5.2.33")

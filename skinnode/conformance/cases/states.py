@@ -110,11 +110,13 @@ def _emcy(dut: Dut, what: str) -> None:
         lose_partner(dut)
     except NotApplicable:
         return
-    expect_emcy(dut, COMMUNICATION_LOST, f"when a heartbeat fails to come {what}")
+    expect_emcy(dut, COMMUNICATION_LOST, f"when a heartbeat is missing {what}")
 
 
 @case(
-    "STATE-03", "OPERATIONAL: SDO, PDO, EMCY are served; 0x1029 follows a lost partner", "7.3.2.2.3, 7.5.2.32"
+    "STATE-03",
+    "OPERATIONAL: SDO, PDO, EMCY are served; 0x1029 applies to a lost partner",
+    "7.3.2.2.3, 7.5.2.32",
 )
 def operational(dut: Dut) -> None:
     can_ids = _timed(dut)

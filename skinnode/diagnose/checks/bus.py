@@ -63,7 +63,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "the bus load exceeds the planning limit",
             Sure.CERTAIN,
             f"{bus.load:.0%} in the busiest second, {MAX_BUS_LOAD:.0%} allowed",
-            "set a longer sync.period_ms, send mode changed, or fewer patches on this bus",
+            "set a longer sync.period_ms or send mode changed, or put fewer patches on this bus",
         )
     if bus.outages:
         yield found(
@@ -95,7 +95,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
 
-    stop_one = "one hand, one host: stop the other, or give this host the role guest (buses.role)"
+    stop_one = "a hand needs only one host: stop the other, or give this host the role guest (buses.role)"
     counters = [counter for counter in bus.sync_counters if counter]
     steps = list(pairwise(counters))
     astray = sum(after not in (before + 1, 1) for before, after in steps)
@@ -110,7 +110,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
         period_s = float(np.mean(np.diff(bus.master_beats_s)))
         if period_s < _TOO_OFTEN * bus.heartbeat_ms * 1e-3:
             yield found(
-                "two masters with one heartbeat",
+                "two masters send the same heartbeat",
                 Sure.LIKELY,
                 f"node-ID {bus.master_node_id} has a heartbeat every {period_s * 1e3:.0f} ms, "
                 f"hand file: {bus.heartbeat_ms}",

@@ -31,7 +31,7 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
             "the EDS of the hand file describes another patch",
             Sure.CERTAIN,
             patch.eds_problem,
-            "write the right one with skinnode eds",
+            "create the correct EDS with skinnode eds",
         )
     if wanted is None:
         return
@@ -43,13 +43,13 @@ def _check_layout(patch: PatchFacts) -> Iterator[Finding]:
             Sure.CERTAIN,
             f"layout hash 0x{own.layout_hash:08X} ({own.layout}, {own.upper_wires} × {own.lower_wires} "
             f"wires), wanted 0x{patch.layout_hash:08X}",
-            "correct [patches.layout], or the wrong patch is mounted: fields solved with it are wrong",
+            "correct [patches.layout], or mount the right patch: until then its fields are wrong",
         )
     if own.code_bits != wanted.code_bits:
         yield Finding(
             "configuration",
             patch.name,
-            "another code width than configured",
+            "the code width differs from the hand file",
             Sure.CERTAIN,
             f"{own.code_bits} bits, hand file: {wanted.code_bits}",
             "correct code_bits in the hand file",
@@ -77,24 +77,24 @@ def _check_pdos(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         if pdo is None or not pdo.enabled or pdo.cob_id != cob_id:
             has = "missing" if pdo is None else "off" if not pdo.enabled else f"at 0x{pdo.cob_id:03X}"
             yield found(
-                f"the {what} is not where it belongs", Sure.CERTAIN, f"{has}, wanted 0x{cob_id:03X}", again
+                f"the {what} is not at its COB-ID", Sure.CERTAIN, f"{has}, wanted 0x{cob_id:03X}", again
             )
     if chunk is not None and bus.period_s is not None and chunk.inhibit_100us is not None:
         yield from _check_inhibit(bus.period_s, patch, chunk, running, found)
     if chunk is not None and chunk.kind < 254:
-        yield found("chunks are not sent at events", Sure.CERTAIN, f"transmission type {chunk.kind}", again)
+        yield found("chunks are not event-driven", Sure.CERTAIN, f"transmission type {chunk.kind}", again)
     if running and info.patch.period_ms:
         yield found(
             "the patch scans by its own timer, not at SYNC",
             Sure.LIKELY,
             f"period {info.patch.period_ms} ms (0x2021:1)",
-            f"write 0: skinnode od {patch.node_id} 2021:1 --write 0; patches then scan at the same instant",
+            f"write 0: skinnode od {patch.node_id} 2021:1 --write 0; all patches then scan together",
         )
     if running and info.heartbeat_ms == 0:
         yield found("no heartbeat: a loss of the node goes unnoticed", Sure.CERTAIN, "0x1017 is 0", again)
     elif running and bus.heartbeat_ms is not None and info.heartbeat_ms not in (None, bus.heartbeat_ms):
         evidence = f"every {info.heartbeat_ms} ms, hand file: {bus.heartbeat_ms}"
-        yield found("another heartbeat period than configured", Sure.POSSIBLE, evidence, again)
+        yield found("the heartbeat period differs from the hand file", Sure.POSSIBLE, evidence, again)
 
 
 def _check_inhibit(
@@ -112,13 +112,13 @@ def _check_inhibit(
         yield found(
             "a scan takes longer than a SYNC period",
             Sure.CERTAIN,
-            f"{chunks} chunks {inhibit_s * 1e3:g} ms apart are {chunks * inhibit_s * 1e3:.0f} ms, "
+            f"{chunks} chunks {inhibit_s * 1e3:g} ms apart take {chunks * inhibit_s * 1e3:.0f} ms; "
             f"the period is {period_s * 1e3:g} ms",
             "set a shorter inhibit time (0x1800:3) or a longer sync.period_ms",
         )
     elif running and patch.inhibit_100us is not None and chunk.inhibit_100us != patch.inhibit_100us:
         yield found(
-            "another inhibit time than the host sets",
+            "the inhibit time differs from the host's setting",
             Sure.POSSIBLE,
             f"{chunk.inhibit_100us} × 100 µs, the host sets {patch.inhibit_100us}",
             "normal if another master configures the patches",

@@ -22,7 +22,8 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
             bus.name,
             "no node of the hand answers",
             Sure.CERTAIN,
-            f"{len(bus.patches)} asked, {counted(bus.frames, 'frame')} heard in {bus.seconds:.1f} s",
+            f"{counted(len(bus.patches), 'node')} asked, {counted(bus.frames, 'frame')} received "
+            f"in {bus.seconds:.1f} s",
             "check supply of the patches, cable, termination, bit rate, channel",
         )
         return
@@ -56,7 +57,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     node, wanted = patch.found, patch.wanted
     if node is None:
         yield found(
-            "the node is not there",
+            "the node is missing",
             Sure.CERTAIN,
             f"node {patch.node_id} neither answers SDO nor sends heartbeats; other nodes on {bus.name} do",
             "check its supply and connector; skinnode scan shows whether it has another node-ID",
@@ -74,7 +75,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             f"the node is {node.state} and does not answer{standard}",
             Sure.CERTAIN,
-            "its heartbeat is heard" + (f"; it {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
+            "it sends heartbeats" + (f" but {no_answer(node.wrong_answer)}" if node.wrong_answer else ""),
             f"skinnode nmt {patch.node_id} reset-communication",
         )
         return
@@ -91,7 +92,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the serial number differs from the hand file",
             Sure.CERTAIN,
             f"serial {known(node.serial)}, hand file: {wanted.serial}",
-            "if two patches were exchanged, put them back, or correct the hand file and its calibration",
+            "if two patches were swapped, put them back, or correct the hand file and its calibration",
         )
     yield from _check_state(bus, patch, node)
 
@@ -102,7 +103,7 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
 
     info = patch.info
     if patch.failure:
-        yield found("not all its objects could be read", Sure.CERTAIN, patch.failure, "see skinnode info")
+        yield found("some of its objects could not be read", Sure.CERTAIN, patch.failure, "see skinnode info")
     if patch.boot_ups or node.boot_ups:
         yield found(
             "the node restarts by itself",
@@ -115,7 +116,7 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
             f"the node is {node.state} while others run",
             Sure.LIKELY,
             f"NMT state by {node.state_known_by}",
-            "see its errors below; a running host starts it again when they are gone",
+            "see its errors below; a running host restarts it once they are cleared",
         )
     if info is not None and info.error_register:
         yield found(
@@ -123,7 +124,7 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
             Sure.CERTAIN,
             f"error register 0x{info.error_register:02X} ({register_text(info.error_register)}); "
             f"last: {info.errors[0] if info.errors else 'none reported'}",
-            "fix the fault it names; skinnode info shows its history",
+            "fix the fault that it names; skinnode info shows the error history",
         )
     reported = [emergency for emergency in patch.emergencies if emergency.code]
     if reported:

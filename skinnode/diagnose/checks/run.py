@@ -60,25 +60,25 @@ def others(facts: BusFacts) -> list[str]:
 def not_judged(facts: BusFacts) -> list[str]:
     """Return one line for each check that could not be made, with the reason."""
     if facts.failure:
-        return [f"{facts.name}: nothing but the interface"]
+        return [f"{facts.name}: everything except the interface"]
     lines = []
     for patch in facts.patches:
         scans = 0 if patch.scans is None else patch.scans.scans
         if patch.found is not None and scans < LEAST_SCANS:
             came = counted(scans, "scan") if scans else "no scans"
             lines.append(
-                f"{patch.name}: noise, steps and drift: {came} came, {LEAST_SCANS} needed"
-                + ("" if facts.running or facts.active else "; it does not run: --active starts it")
+                f"{patch.name}: noise, steps and drift: {came} received, {LEAST_SCANS} needed"
+                + ("" if facts.running or facts.active else "; the node is not running: --active starts it")
             )
         elif patch.scans is not None and skin.is_touched(patch.scans):
             lines.append(
-                f"{patch.name}: noise of single crossings, and what is not at its baseline: something moves "
-                "on the skin; leave it alone while the doctor listens"
+                f"{patch.name}: noise of single crossings, and drift from the baseline: something moves "
+                "on the skin; do not touch it while the doctor listens"
             )
         elif patch.scans is not None and skin.may_be_frozen(patch.scans):
             lines.append(
                 f"{patch.name}: frozen or only quiet: no code changed in {scans} scans, and the stated "
-                f"noise, {patch.scans.stated_noise:.0e}, is below a code, {patch.scans.step:.0e}: touch the "
-                "patch while the doctor listens; if this line comes again, the converter has stopped"
+                f"noise, {patch.scans.stated_noise:.0e}, is below one code, {patch.scans.step:.0e}: touch "
+                "the patch while the doctor listens; if this line appears again, the converter has stopped"
             )
     return lines

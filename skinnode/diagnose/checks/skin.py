@@ -134,7 +134,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
     figures = ""
     if noisy.any():
         median, worst = float(np.median(analysis.noise[noisy])), float(np.max(factor[noisy]))
-        figures = f"{median:.1e} of R0 in the median, {worst:.0f} times the stated noise at worst, {over}"
+        figures = f"median {median:.1e} of R0, at worst {worst:.0f} times the stated noise, {over}"
     all_alike = noisy.sum() > 0.5 * judged.sum()
     if analysis.is_touched:
         levels = (analysis.floor, np.median(analysis.upper), np.median(analysis.lower))
@@ -145,7 +145,7 @@ def _check_noise(patch: PatchFacts, scans: ScanFacts, analysis: NoiseAnalysis) -
             Sure.LIKELY,
             f"{int(noisy.sum())} of {_crossings(judged)}; {figures}"
             if all_alike
-            else f"all crossings together, {analysis.supply:.0f} times the stated noise, {over}",
+            else f"all crossings together: {analysis.supply:.0f} times the stated noise, {over}",
             "check supply and shield of the patch, and relative_noise in the hand file",
         )
         return
@@ -192,7 +192,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
             "the values are frozen",
             Sure.LIKELY,
             f"{int(still.sum())} of {_crossings(known)} without any change in {scans.scans} scans, "
-            f"though the stated noise is {scans.stated_noise:.0e} and a code is {scans.step:.0e}",
+            f"although the stated noise is {scans.stated_noise:.0e} and one code is {scans.step:.0e}",
             "the converter has stopped: switch the patch off and on",
         )
 
@@ -225,7 +225,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 f"{counted(own.baseline_missing, 'crossing has', 'crossings have')} no baseline",
                 Sure.CERTAIN,
                 "R0 is 0 (0x2301)",
-                f"with nothing touching the skin: skinnode tare {patch.node_id}",
+                f"with nothing touching the skin, run skinnode tare {patch.node_id}",
             )
     for patch, scans, analysis in _judged(bus):
         at_rest = np.isfinite(analysis.level) & ~analysis.touched & ~analysis.steps
@@ -234,16 +234,16 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
         off = analysis.level[at_rest] - 1.0
         share = float(np.mean(np.abs(off) > _DRIFT))
         one_way = max(float(np.mean(off > 0)), float(np.mean(off < 0)))
-        figures = f"R/R0 − 1 is {np.median(off):+.2%} in the median over {scans.scans} scans, {share:.0%} of "
-        figures += f"{off.size} crossings off by more than {_DRIFT:.1%}"
+        figures = f"median R/R0 − 1 is {np.median(off):+.2%} over {scans.scans} scans; {share:.0%} of "
+        figures += f"{off.size} crossings are off by more than {_DRIFT:.1%}"
         if share > _MANY and one_way > 0.9:
             yield Finding(
                 "baseline",
                 patch.name,
-                "the baseline is no longer that of the skin at rest",
+                "the baseline no longer matches the skin at rest",
                 Sure.LIKELY,
                 figures,
-                "temperature or age changed it: skinnode tare with nothing touching the skin",
+                "temperature or age changed it: run skinnode tare with nothing touching the skin",
             )
         elif share > 0.02 and not analysis.is_touched:
             yield Finding(
@@ -252,7 +252,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
                 "part of the skin is not at its baseline",
                 Sure.POSSIBLE,
                 figures,
-                "if nothing presses there, skinnode tare",
+                "if nothing presses there, run skinnode tare",
             )
 
 

@@ -76,7 +76,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 "SYNCs are missing",
                 Sure.CERTAIN,
                 f"{missing} of {len(intervals) + missing}",
-                "check the load of the machine that sends SYNC, and the bus",
+                "check the load on the machine that sends SYNC, and the bus",
             )
         regular = intervals[intervals < 1.5 * period_s]
         jitter_s = float(np.percentile(np.abs(regular - period_s), 99)) if len(regular) else 0.0
@@ -85,8 +85,8 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
                 bus.name,
                 "SYNC is irregular",
                 Sure.LIKELY,
-                f"99 % within {jitter_s * 1e3:.1f} ms of a period of {period_s * 1e3:.1f} ms",
-                "reduce the load of the machine that sends it; give the host a real-time priority",
+                f"99 % of intervals within {jitter_s * 1e3:.1f} ms of the period, {period_s * 1e3:.1f} ms",
+                "reduce the load on the machine that sends SYNC; give the host a real-time priority",
             )
 
 
@@ -128,17 +128,17 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
         if stats.conflicts:
             yield found(
                 patch.name,
-                "two different chunks with one number",
+                "two different chunks with the same number",
                 Sure.LIKELY,
                 counted(stats.conflicts, "time"),
-                "look for two nodes with one node-ID: skinnode scan",
+                "look for two nodes with the same node-ID: skinnode scan",
             )
         if stats.scans_corrupt:
             yield found(
                 patch.name,
                 "codes differ from those that the node packed",
                 Sure.CERTAIN,
-                f"the check of {stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed",
+                f"{stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed the check",
                 "check gateways on the path, memory and software of the node; CAN itself detects bus errors",
             )
         wrong = stats.bad_length + stats.bad_index + stats.bad_counter + stats.bad_form
@@ -147,7 +147,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 patch.name,
                 "frames that are not chunks of this patch",
                 Sure.CERTAIN,
-                f"{stats.bad_length} of wrong length, {stats.bad_index} of wrong index, "
-                f"{stats.bad_counter} of wrong counter, {stats.bad_form} summaries without a check",
+                f"{stats.bad_length} with wrong length, {stats.bad_index} with wrong index, "
+                f"{stats.bad_counter} with wrong counter, {stats.bad_form} summaries without a check",
                 "look for a node that uses its COB-IDs, and check its PDO mapping",
             )

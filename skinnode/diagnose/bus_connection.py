@@ -151,8 +151,8 @@ class BusConnection:
     def guarded(self, node_id: int) -> bool:
         """Return whether a master guards the node.
 
-        A remote frame sent from here would start life guarding in the node, which would later mistake our
-        silence for the loss of its master.
+        A remote frame from this program would start life guarding in the node, which would later mistake the
+        program's silence for the loss of its master.
         """
         remote = self.od(node_id)
         try:

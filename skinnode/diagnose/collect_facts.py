@@ -1,6 +1,6 @@
 """Collects the facts about one bus.
 
-It listens and reads. Unless ``active``, it changes nothing, so that a running hand continues undisturbed.
+It listens and reads. Unless ``active`` is set, nothing is changed, so a running hand continues undisturbed.
 """
 
 from __future__ import annotations

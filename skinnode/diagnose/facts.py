@@ -82,7 +82,7 @@ class PatchFacts:
     node_id: int
     wanted: PatchConfig | None = None
     layout_hash: int | None = None
-    """Layout hash of the hand file."""
+    """Hash of the layout in the hand file."""
     inhibit_100us: int | None = None
     """Inhibit time that the host sets; None if the host does not configure the nodes of this bus."""
     eds_problem: str = ""

@@ -108,14 +108,14 @@ def _maps(scans: ScanFacts) -> str:
     """Plot maps of noise and R/R0."""
     analysis = analyse_noise(scans)
     figure, axes = _figure(2, 1, height_in=5.6)
-    title = "noise / stated noise, grey: none" + (
+    title = "noise / stated noise (grey: no value)" + (
         ", including the effect of a touch" if analysis.is_touched else ""
     )
     _map(figure, axes[0], analysis.noise / analysis.stated, title, "viridis", 0.0, None)
     off = 100 * (analysis.level - 1.0)
     known = off[np.isfinite(off)]
     limit = max(0.05, float(np.abs(known).max())) if known.size else 1.0
-    _map(figure, axes[1], off, "R/R0 − 1, %, grey: none", "RdBu", -limit, limit)
+    _map(figure, axes[1], off, "R/R0 − 1, % (grey: no value)", "RdBu", -limit, limit)
     return _svg(figure)
 
 
@@ -137,7 +137,7 @@ def _timeline(scans: ScanFacts) -> str:
         axes.set_ylabel("ms after SYNC")
     else:
         axes.plot(scans.t_s[1:], 1e3 * np.diff(scans.t_s), ".-", color="#2b6cb0", lw=0.8)
-        axes.set_ylabel("ms since the scan before")
+        axes.set_ylabel("ms since the previous scan")
     for number, t_s in enumerate(scans.t_s[~scans.complete]):
         axes.axvline(t_s, color="#b3261e", lw=1, label=None if number else "scan with holes")
     axes.set(xlabel="s", title="scans")

@@ -107,7 +107,7 @@ def commission(
             connection.link.send(od.NMT_COB_ID, nmt.encode(nmt.NmtCommand.RESET_COMMUNICATION, before))
         booted = connection.wait_until(lambda: connection.listener.node(node_id).boot_ups > boot_ups, BOOT_S)
         if not booted:
-            faults.append(f"no boot-up message of node {node_id} within {BOOT_S:g} s")
+            faults.append(f"no boot-up message from node {node_id} within {BOOT_S:g} s")
     stored = wanted.store and not fault
     return Commissioned(address, before, node_id, wanted.bitrate_bps, stored, booted, tuple(faults))
 

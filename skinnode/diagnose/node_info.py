@@ -1,4 +1,4 @@
-"""Reads everything about one node. Nothing is written."""
+"""Reads all information about one node. Nothing is written."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class Reading:
     def content(self) -> bytes | None:
         """Value as bytes; None if the node refused.
 
-        Many nodes refuse to return an empty string, because there is no data; its content is empty bytes.
+        Many nodes refuse to return an empty string, because it has no data; the value is then ``b""``.
         """
         if self.refused_code == AbortCode.NO_DATA and self.data_type in _STRINGS:
             return b""
@@ -176,7 +176,7 @@ def type_name(entry: EdsEntry) -> str:
 
 
 def abort_text(abort: SdoAbort) -> str:
-    """Return the reason of an abort."""
+    """Return the code and reason of an abort."""
     return f"0x{abort.code:08X} {str(abort).rpartition(': ')[2]}"
 
 

@@ -63,7 +63,7 @@ def check_bus(bus: BusFacts) -> Iterator[Finding]:
             "the bus load exceeds the planning limit",
             Sure.CERTAIN,
             f"{bus.load:.0%} in the busiest second, {MAX_BUS_LOAD:.0%} allowed",
-            "set a longer sync.period_ms or send mode changed, or put fewer patches on this bus",
+            "lengthen sync.period_ms, set the send mode to changed, or put fewer patches on this bus",
         )
     if bus.outages:
         yield found(
@@ -95,7 +95,7 @@ def check_masters(bus: BusFacts) -> Iterator[Finding]:
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)
 
-    stop_one = "a hand needs only one host: stop the other, or give this host the role guest (buses.role)"
+    stop_one = "use one host per hand: stop the other, or give this host the role guest (buses.role)"
     counters = [counter for counter in bus.sync_counters if counter]
     steps = list(pairwise(counters))
     astray = sum(after not in (before + 1, 1) for before, after in steps)

@@ -168,6 +168,8 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
         return found[0][0], node_id
     buses = " or ".join(f"--bus {place.bus.name}" for place in places)
     if not found:
-        raise ConfigError(key, node_id, f"a node-ID of the hand, or any with {buses}")
+        raise ConfigError(key, node_id, f"a node-ID in the hand, or any node-ID with {buses}")
     which = " and ".join(f"{patch.name} on {place.bus.name}" for place, patch in found)
-    raise ConfigError(key, node_id, f"a node-ID on one bus: it is {which}; name the patch, or add {buses}")
+    raise ConfigError(
+        key, node_id, f"a node-ID on only one bus; it is {which}; name the patch, or add {buses}"
+    )

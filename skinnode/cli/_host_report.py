@@ -234,7 +234,7 @@ class TextReport:
         print(text, flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the figures of one second."""
+        """Print the figures for one second."""
         buses = "  ".join(
             f"{name} {facts['frames']} frames, load {facts['load']:.0%}, {facts['dropped']} dropped"
             for name, facts in second.buses.items()
@@ -270,5 +270,5 @@ class JsonReport:
         print(json.dumps({"note": text}), flush=True)
 
     def second(self, second: Second) -> None:
-        """Print the figures of one second."""
+        """Print the figures for one second."""
         print(json.dumps(vars(second)), flush=True)

@@ -32,10 +32,10 @@ def demo(
 ) -> None:
     """Press simulated patches and decode them from real CANopen traffic.
 
-    Each patch is a CANopen node on an embedded virtual bus; a spherical indenter presses and slides, the host
-    collects the PDOs and solves. Exit status 1 if a scan was torn, a frame was lost, or errors exceed the
-    reported uncertainty: the RMS error over the run is above 1.15 times the reported RMS, or the error of a
-    coordinate is above 6 standard deviations.
+    Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
+    collects the PDOs and solves the scans. Exit status 1 if a scan was torn, a frame was lost, or errors
+    exceed the reported uncertainty: the RMS error over the run is above 1.15 times the reported RMS, or the
+    error of a coordinate is above 6 standard deviations.
     """
     import json
 

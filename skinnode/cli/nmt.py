@@ -39,7 +39,7 @@ def nmt(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Start, stop or reset nodes, and print their state before and after, from heartbeat or guarding.
+    """Start, stop or reset nodes, and print their states before and after the command.
 
     `all` means every node on the bus, or on every bus of --hand.
 

@@ -209,7 +209,7 @@ def _faults(end: _Progress) -> list[str]:
             "boot-ups or heartbeats",
             " from another node with this node-ID",
         ),
-        (end.bus_errors, "bus error", "bus errors", f", the last starting with: {end.bus_error}"),
+        (end.bus_errors, "bus error", "bus errors", f"; first error of the latest series: {end.bus_error}"),
     )
     faults = [f"{counted(count, one, several)}{what}" for count, one, several, what in counts if count]
     return [*faults, f"memory: {end.memory_problem}"] if end.memory_problem else faults

@@ -103,7 +103,7 @@ def _require_combination(
     if diff is not None and (where is not None or write is not None or dcf is not None):
         raise ConfigError("--diff", str(diff), "only by itself, because it compares the whole dictionary")
     if dcf is not None and where is not None:
-        raise ConfigError("--dcf", str(dcf), "only without INDEX, because it takes the whole dictionary")
+        raise ConfigError("--dcf", str(dcf), "only without INDEX, because it covers the whole dictionary")
 
 
 def _diff(place: Place, node_id: int, file: Path, as_json: bool) -> None:
@@ -176,7 +176,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. A refusal raises if there is only one object; otherwise it is listed."""
+    """Read the objects. A refusal raises SdoAbort for a single object, and is listed for several."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

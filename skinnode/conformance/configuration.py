@@ -34,7 +34,7 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Put the configuration back, after a case that stored or restored parameters and a reset of the node.
+    """Put back the configuration after a case that stored or restored parameters, once the node is reset.
 
     Restores the defaults, writes each value in ``before`` that differs from them, and stores the result.
 

@@ -78,12 +78,12 @@ class EdsEntry:
 
     @property
     def into_rpdo(self) -> bool:
-        """Whether an RPDO may map the entry: writable, and not declared as process input."""
+        """Whether an RPDO may map the entry, which must be writable and not declared as process input."""
         return self.mappable and self.access in ("wo", "rww", "rw")
 
     @property
     def into_tpdo(self) -> bool:
-        """Whether a TPDO may map the entry: readable, and not declared as process output."""
+        """Whether a TPDO may map the entry, which must be readable and not declared as process output."""
         return self.mappable and self.access in ("ro", "rwr", "rw", "const")
 
     @property
@@ -231,7 +231,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
         found += _listed(sections, {index for index, _ in entries})
         dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
     except ValueError as error:  # text in place of a number
-        allowed = "numbers as in CiA 306 in the lists of objects and dummies"
+        allowed = "numbers as in CiA 306 in the lists of objects and dummy entries"
         raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
         source=source,

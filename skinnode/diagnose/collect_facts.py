@@ -284,7 +284,7 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 
 
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
-    """Count the frames of each COB-ID that neither services, nodes nor ``others`` of the hand file explain.
+    """Count frames, by COB-ID, that neither a service, a node nor ``others`` in the hand file explains.
 
     COB-IDs in the pre-defined connection set of a node that was found are attributed to it, whatever the
     device; those of a patch that does not answer, to a host that polls it.

@@ -44,7 +44,7 @@ HELP: Final = """\
  a                 show or hide shear arrows on the maps
  q, ctrl-c         quit
 
- Bright means deep; the scale beside "touches" says how deep. Arrows
+ Bright means deep; the scale beside "touches" shows how deep. Arrows
  show shear: right is along the upper wires, up is across them. A map
  without colours is out of date: its patch sends nothing."""
 

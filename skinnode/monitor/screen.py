@@ -24,7 +24,7 @@ def screen(view: View, paint: Paint, log: Sequence[LogLine], width: int, height:
     """Draw ``height`` lines of ``width`` characters; the last line of ``log`` is the newest."""
     theme, ui = paint.theme, paint.ui
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
-        text = f"{width} × {height} is too small: {LEAST_WIDTH} × {LEAST_HEIGHT} at least"
+        text = f"{width} × {height} is too small: at least {LEAST_WIDTH} × {LEAST_HEIGHT}"
         return [pad([Segment(text[:width], theme.text)], width, theme)] + [
             pad([], width, theme) for _ in range(height - 1)
         ]

@@ -53,7 +53,7 @@ def test_a_node_id_of_both_buses_is_asked_about(two_buses: Path, command: list[s
     done = run([*command, "--hand", two_buses])
     assert done.status == 2
     assert done.stderr == (
-        "error: NODE: got 5, allowed: a node-ID on one bus: it is palm on left and thumb on right; "
+        "error: NODE: got 5, allowed: a node-ID on only one bus; it is palm on left and thumb on right; "
         "name the patch, or add --bus left or --bus right"
     )
 
@@ -61,7 +61,7 @@ def test_a_node_id_of_both_buses_is_asked_about(two_buses: Path, command: list[s
 def test_a_node_id_of_no_patch_needs_a_bus(two_buses: Path) -> None:
     done = run(["info", "9", "--hand", two_buses])
     assert done.status == 2
-    assert "a node-ID of the hand, or any with --bus left or --bus right" in done.stderr
+    assert "a node-ID in the hand, or any node-ID with --bus left or --bus right" in done.stderr
     done = run(["info", "pinky", "--hand", two_buses])
     assert done.stderr == (
         "error: NODE: got 'pinky', allowed: a node-ID from 1 to 127, or palm, thumb, index"

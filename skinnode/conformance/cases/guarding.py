@@ -70,7 +70,7 @@ def written(dut: Dut) -> None:
         raise Failed("0x1234 and 3 read back", f"0x{got[0]:04X} and {got[1]}")
 
 
-@case("GUARD-06", "Life guarding begins with the first remote frame; EMCY 0x8130 follows when those stop",
+@case("GUARD-06", "Remote frames start life guarding; EMCY 0x8130 follows when they stop",
       "7.2.8.2.2.1, 7.5.2.12")  # fmt: skip
 def life_guarding(dut: Dut) -> None:
     dut.need(GUARD_TIME)

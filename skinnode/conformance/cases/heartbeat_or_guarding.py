@@ -32,11 +32,15 @@ def _heartbeats(dut: Dut, *, remote: bool) -> None:
             dut.bus.send(dut.error_control_id, remote=True)
     for frame in frames:
         if frame.data != b"\x7f":
-            raise Failed("heartbeats alone, 7F without a toggle bit", describe(frame))
+            raise Failed("only heartbeats, 7F without a toggle bit", describe(frame))
     check_period(frames, _PERIOD_MS, "one frame")
 
 
-@case("HBVG-01", "The device has heartbeat or guarding, and after a reset at most one of them runs", _CLAUSE)
+@case(
+    "HBVG-01",
+    "The device has heartbeat or guarding; after a reset at most one is active",
+    _CLAUSE,
+)
 def supported(dut: Dut) -> None:
     heartbeat, guarding = dut.eds.find(HEARTBEAT), dut.eds.find(GUARD_TIME)
     if heartbeat is None and guarding is None:
@@ -47,7 +51,7 @@ def supported(dut: Dut) -> None:
         raise Failed("heartbeat or guarding on after a reset", "both 0x1017 and 0x100C above 0")
 
 
-@case("HBVG-02", "Heartbeat off, guarding off: the device sends nothing unasked", _CLAUSE)
+@case("HBVG-02", "Heartbeat off, guarding off: the device sends nothing unsolicited", _CLAUSE)
 def both_off(dut: Dut) -> None:
     _both(dut, 0, 0)
     dut.bus.expect_silence(dut.error_control_id, "frame of error control", 3 * _PERIOD_MS * 1e-3)

@@ -76,7 +76,7 @@ def _restore(dut: Dut, subindex: int) -> None:
         _store(dut, subindex)
     _, after = _change(dut)
     dut.restore(subindex)
-    _compare(dut, after, "before the reset that makes defaults valid")
+    _compare(dut, after, "before the reset at which defaults take effect")
     dut.reset()
     defaults = {index: dut.need(index).default_bytes(dut.node_id) for index in after}
     _compare(

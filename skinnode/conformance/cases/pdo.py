@@ -143,7 +143,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: types 1 and 3 are sent after every and every third SYNC, not in between",
+@case("PDO-06", "OPERATIONAL: type 1 is sent after every SYNC, type 3 only after every third",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -185,7 +185,7 @@ def _after_sync(  # noqa: PLR0913 - one PDO, one SYNC
 
 @case(
     "PDO-07",
-    "OPERATIONAL: type 0 is sent only after a SYNC, after the third at the latest",
+    "OPERATIONAL: type 0 is sent only after a SYNC, at the latest after the third",
     "7.2.2.2, 7.5.2.37",
 )
 def acyclic(dut: Dut) -> None:

@@ -179,7 +179,7 @@ def too_many(dut: Dut) -> None:
             raise Failed(f"{pdo} still without entries", str(dut.sdo.integer(pdo.mapping, 0)))
 
 
-@case("PDO-26", "Objects with more bits in total than a frame holds are refused", "7.5.2.36, 7.5.2.38")
+@case("PDO-26", "A mapping with more bits than a frame can hold is refused", "7.5.2.36, 7.5.2.38")
 def too_long(dut: Dut) -> None:
     tried = False
     for pdo in _changeable(dut, [*rpdos(dut), *tpdos(dut)]):
@@ -201,7 +201,7 @@ def too_long(dut: Dut) -> None:
         what = f"{pdo}: {count} × {8 * entry.size} bits"
         dut.sdo.aborts(request, pdo.mapping, 0, TOO_MUCH, what)
     if not tried:
-        raise NotApplicable("no PDO has room for more than a frame holds")
+        raise NotApplicable("no PDO can map more objects than fit a frame")
 
 
 def _fits(entry: EdsEntry, pdo: Pdo) -> bool:

@@ -31,7 +31,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that fits. Raises NotApplicable with the text of what is missing."""
+    """Return the first entry that fits. Raises NotApplicable, which names what is lacking."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -69,7 +69,9 @@ def read_expedited(dut: Dut) -> None:
 
 
 @case(
-    "SDO-02", "An object from 0x1000 to 0x1FFF can be written expedited and read back", "7.2.4.3.3, 7.2.4.3.6"
+    "SDO-02",
+    "An object from 0x1000 to 0x1FFF can be written by expedited transfer and read back",
+    "7.2.4.3.3, 7.2.4.3.6",
 )
 def write_expedited(dut: Dut) -> None:
     entries = [found for index in _HARMLESS if (found := dut.eds.find(index)) is not None]
@@ -264,7 +266,7 @@ def wrong_toggle(dut: Dut) -> None:
 
 @case(
     "SDO-18",
-    "Objects of more than four bytes are read in segments with correct toggle and last bits",
+    "Objects of more than four bytes are read in segments with correct toggle and last-segment bits",
     "7.2.4.3.7",
 )
 def read_segments(dut: Dut) -> None:

@@ -42,7 +42,7 @@ def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
 
 @case(
     "TRANS-01",
-    "Reset node and reset communication, from every state; the latter keeps application objects",
+    "Reset node and reset communication from every state; the latter keeps application objects",
     "7.3.2.2.1",
 )
 def resets(dut: Dut) -> None:
@@ -90,18 +90,26 @@ def _transition(dut: Dut, command: int, *others: int) -> None:
 
 @case(
     "TRANS-02",
-    "Enter pre-operational, from OPERATIONAL and STOPPED, by node-ID and for all",
+    "Enter pre-operational from OPERATIONAL and STOPPED, sent to the node-ID and to all nodes",
     "7.2.8.2.1, 7.3.2.2",
 )
 def enter_pre_operational(dut: Dut) -> None:
     _transition(dut, PRE_OPERATIONAL, START, STOP)
 
 
-@case("TRANS-03", "Start, from PRE-OPERATIONAL and STOPPED, by node-ID and for all", "7.2.8.2.1, 7.3.2.2")
+@case(
+    "TRANS-03",
+    "Start from PRE-OPERATIONAL and STOPPED, sent to the node-ID and to all nodes",
+    "7.2.8.2.1, 7.3.2.2",
+)
 def start(dut: Dut) -> None:
     _transition(dut, START, PRE_OPERATIONAL, STOP)
 
 
-@case("TRANS-04", "Stop, from PRE-OPERATIONAL and OPERATIONAL, by node-ID and for all", "7.2.8.2.1, 7.3.2.2")
+@case(
+    "TRANS-04",
+    "Stop from PRE-OPERATIONAL and OPERATIONAL, sent to the node-ID and to all nodes",
+    "7.2.8.2.1, 7.3.2.2",
+)
 def stop(dut: Dut) -> None:
     _transition(dut, STOP, PRE_OPERATIONAL, START)

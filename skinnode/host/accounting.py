@@ -62,7 +62,7 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
         ("scans_torn", "scan torn", "scans torn"),
         ("scans_missed", "scan missed", "scans missed"),
         ("scans_mixed", "scan discarded as mixed", "scans discarded as mixed"),
-        ("scans_corrupt", "scan discarded by its check", "scans discarded by their check"),
+        ("scans_corrupt", "scan discarded by the check", "scans discarded by the check"),
         ("chunks_lost", "chunk lost", "chunks lost"),
         ("summaries_lost", "summary lost", "summaries lost"),
     )
@@ -86,27 +86,27 @@ def frames_counted(assembler: AssemblerStats) -> int:
 
 def _of_bus(bus: BusStats) -> list[str]:
     counted_frames = bus.received + bus.ignored + bus.error_frames + bus.dropped + bus.waiting
-    return _unless_equal("frames read", bus.read, "those counted", counted_frames)
+    return _unless_equal("frames read", bus.read, "counted", counted_frames)
 
 
 def _of_stream(stream: StreamStats) -> list[str]:
     assembler = stream.assembler
     return [
-        *_unless_equal("frames", stream.frames, "those counted", frames_counted(assembler)),
+        *_unless_equal("frames", stream.frames, "counted", frames_counted(assembler)),
         *_unless_equal(
             "scans offered or withheld",
             stream.offered + stream.withheld + stream.partial,
-            "those assembled",
+            "assembled",
             assembler.scans_complete + assembler.scans_torn + assembler.scans_unchecked,
         ),
         *_unless_equal(
             "scans offered",
             stream.offered,
-            "those solved, failed or skipped",
+            "solved, failed or skipped",
             stream.solved + stream.failed + stream.skipped,
         ),
     ]
 
 
 def _unless_equal(what: str, got: int, other: str, must: int) -> list[str]:
-    return [] if got == must else [f"{what}: got {got}, must be the {must} of {other}"]
+    return [] if got == must else [f"{what}: got {got}, must equal the {must} {other}"]

@@ -17,12 +17,12 @@ from skinnode.host.supervised import JOIN_DEADLINE_S, LEAST_NS, Joined, Supervis
 _log = logging.getLogger(__name__)
 
 _DOUBT_NS: Final = 2_000_000_000
-"""Minimum interval between two readings of a baseline that may have changed unnoticed."""
+"""Minimum interval between readings of a baseline that may have changed unnoticed."""
 
 _REGISTER_NS: Final = 500_000_000
-"""Minimum interval between two readings of an error register that is not zero. The emergency message that
-clears an error may be lost, and the patch must be operational within a second of it. These readings cost four
-SDO frames per second."""
+"""Minimum interval between readings of an error register that is not zero. The emergency message that clears
+an error may be lost, and the patch must be operational within a second of it. These readings cost four SDO
+frames per second."""
 
 
 class BaselineWatch:
@@ -107,7 +107,7 @@ def note_baseline(node: Supervised) -> None:
     A bring-up may also find a new baseline: after a failed reading, or if it changed while the node was away.
     """
     facts, before = node.remote.facts, node.baseline_ohm
-    assert facts is not None  # the node was brought up
+    assert facts is not None  # called only after bring-up
     node.baseline_ohm = facts.baseline_ohm
     if node.announced or (before is not None and not np.array_equal(before, facts.baseline_ohm)):
         node.announced = False

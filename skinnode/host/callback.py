@@ -60,7 +60,7 @@ class FieldCallback:
             return
         self._thread.join(LAST_CALL_S)
         if self._thread.is_alive():
-            _log.warning("callback %s has not returned and is left behind", _name(self._function))
+            _log.warning("callback %s has not returned; no longer waiting for it", _name(self._function))
 
     @property
     def ended(self) -> bool:

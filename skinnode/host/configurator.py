@@ -140,8 +140,8 @@ class Configurator:
         for subindex, what, expected in (
             (od.ROWS, "upper wires", profile.rows),
             (od.COLUMNS, "lower wires", profile.columns),
-            (od.UPPER_ELECTRODES, "electrodes of an upper wire", profile.upper_electrodes),
-            (od.LOWER_ELECTRODES, "electrodes of a lower wire", profile.lower_electrodes),
+            (od.UPPER_ELECTRODES, "electrodes per upper wire", profile.upper_electrodes),
+            (od.LOWER_ELECTRODES, "electrodes per lower wire", profile.lower_electrodes),
             (od.CODE_BITS, "code bits", profile.code_bits),
             (od.PDO_BYTES, "bytes of a PDO", profile.pdo_bytes),
         ):
@@ -249,7 +249,7 @@ class Configurator:
 
         Raises:
             NodeError: if the node does not keep the baseline, or a value is not positive.
-            SkinError: as :meth:`configure`.
+            SkinError: as raised by :meth:`configure`.
         """
         expected = None if patch.baseline is None else load_baseline(patch.baseline, profile)
         end_s = time.monotonic() + self.boot_deadline_s
@@ -311,7 +311,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
         Whether the values are those that a master writes.
 
     Raises:
-        NodeError: as :class:`RemoteOd` raises it.
+        NodeError: as raised by :class:`RemoteOd`.
     """
     expected = (
         (od.SYNC_COUNTER_OVERFLOW, 0, "u8", hand.sync.counter_overflow),

@@ -22,7 +22,8 @@ _log = logging.getLogger(__name__)
 
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 1.0
-"""First and longest pause before a failed operation is retried, in s; each pause is twice the one before."""
+"""First and longest pause before a failed operation is retried, in s; each pause is twice the previous
+pause."""
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02

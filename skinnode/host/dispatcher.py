@@ -62,7 +62,7 @@ class BusStats:
     dropped: int
     """Frames dropped because the receive queue was full."""
     malformed: int
-    """Frames of a known COB-ID whose length or form is wrong."""
+    """Frames with a known COB-ID whose length or form is wrong."""
     outages: int
     """Number of times the interface failed and was reopened."""
     bits: int
@@ -74,7 +74,7 @@ class BusStats:
 
 @dataclass(frozen=True, slots=True)
 class PortCounters:
-    """Counters that the feeder of a dispatcher keeps."""
+    """Counters kept by the source of a dispatcher's frames."""
 
     sent: int = 0
     dropped: int = 0
@@ -156,7 +156,7 @@ class Dispatcher:
         self._outgoing.append((can_id, data))
 
     def dispatch(self, batch: Sequence[Frame]) -> None:
-        """Pass frames to their handlers, in order. A handler that raises loses only that frame."""
+        """Pass frames to their handlers, in order. If a handler raises, only that frame is lost."""
         for listener in self._listeners:
             try:
                 listener(batch)
@@ -223,7 +223,7 @@ class Dispatcher:
             self._mark(now_ns)
 
     def reject(self, error: CodecError) -> None:
-        """Count a malformed frame; log the first of its COB-ID. Mainline only."""
+        """Count a malformed frame; log the first with its COB-ID. Mainline only."""
         self._malformed += 1
         if self.first_malformed is None:
             self.first_malformed = error
@@ -265,7 +265,7 @@ class Dispatcher:
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Sum the bits so far. The meter has one owner, so only the mainline calls this."""
+        """Sum the bits so far. The meter has one owner, so only the mainline may call this."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

@@ -21,7 +21,7 @@ _LONGEST_SHOWN = 40
 
 
 def check_files(hand: HandConfig) -> None:
-    """Read the EDS and the baseline of every patch.
+    """Check the EDS and baseline files of every patch.
 
     Raises:
         ConfigError: if a file is not valid, or does not fit its patch.

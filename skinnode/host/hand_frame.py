@@ -27,7 +27,7 @@ class HandFrame:
     """The fields of all patches for one SYNC."""
 
     scan: int
-    """Number of the SYNC since the host started, without wrapping: the scan number of every field."""
+    """Number of the SYNC since the host started, without wrapping; also the scan number of every field."""
     t_sync_ns: int
     """Monotonic time at which SYNC was sent or received on the last bus; 0 if unknown. Each field holds the
     time of its own bus, because SYNC may be staggered (``sync.stagger_ms``)."""
@@ -44,7 +44,7 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Gatherer of fields into hand frames, in ascending order of scan. No thread, no clock; one owner.
+    """Gatherer of fields into hand frames, in order of scan number. No thread, no clock; one owner.
 
     A frame is ready when every awaited patch has delivered its field for the frame or a newer field. A patch
     that missed :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is not awaited until it delivers
@@ -98,7 +98,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """Return the deadline at which :meth:`next` returns the open frame; None if no frame is open."""
+        """Return when :meth:`next` will return the oldest frame at the latest; None if there is no frame."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:

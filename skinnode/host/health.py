@@ -37,7 +37,7 @@ class Condition(enum.StrEnum):
     """The node is sending frames, but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
-    """Operational by its heartbeat, but no scans arrive, or all are withheld."""
+    """Operational according to its heartbeat, but no scans arrive, or all are withheld."""
     RESTARTING = "restarting"
     """The node restarts by itself in a loop: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. A node
     that restarted once, or that is operational again and has not restarted for 0.5 s, gets the condition that
@@ -55,13 +55,13 @@ class Condition(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PatchHealth:
-    """Health of a patch at one instant. An age is None if the event never occurred."""
+    """Health of a patch at one instant. An age is None if the event has never occurred."""
 
     patch: str
     node_id: int
     condition: Condition
     nmt_state: int | None
-    """As in the heartbeat: 5 operational, 127 pre-operational, 4 stopped, 0 just booted."""
+    """NMT state as in the heartbeat: 5 operational, 127 pre-operational, 4 stopped, 0 just booted."""
     heartbeat_age_s: float | None
     scan_age_s: float | None
     boot_ups: int
@@ -110,7 +110,7 @@ class PatchHealth:
                 return self.complaint or f"node {self.node_id} has sent nothing"
             case Condition.LOST:
                 silence_s = self.heartbeat_age_s or 0.0
-                return self._with_complaint(f"no heartbeat of node {self.node_id} for {silence_s:.1f} s")
+                return self._with_complaint(f"no heartbeat from node {self.node_id} for {silence_s:.1f} s")
             case Condition.RESTARTING:
                 return f"node {self.node_id} restarts by itself in a loop; {self.boot_ups} boot-ups so far"
             case Condition.BOOTING:
@@ -131,8 +131,8 @@ class PatchHealth:
             held = "its scans are withheld until its configuration and baseline have been read"
             return self._with_complaint(held)
         if self.scan_age_s is None:
-            return f"no scan of node {self.node_id} received yet"
-        return f"no scan of node {self.node_id} for {self.scan_age_s:.2f} s"
+            return f"no scan from node {self.node_id} received yet"
+        return f"no scan from node {self.node_id} for {self.scan_age_s:.2f} s"
 
     def _error(self) -> str:
         register = f"error register 0x{self.error_register:02X} ({register_text(self.error_register)})"

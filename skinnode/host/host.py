@@ -107,7 +107,7 @@ class Host:
 
         Raises:
             ConfigError: if the file cannot be used.
-            SkinError: as :meth:`from_config`.
+            SkinError: as raised by :meth:`from_config`.
         """
         hand = load_hand(path)
         running = cls.from_config(
@@ -170,7 +170,7 @@ class Host:
     def fields(
         self, *, timeout_s: float | None = None, capacity: int | None = None, patch: str | None = None
     ) -> Subscription:
-        """Subscribe to fields from now until the host closes, for ``for`` or ``async for``.
+        """Subscribe to fields from now until the host closes; iterate with ``for`` or ``async for``.
 
         Args:
             timeout_s: Time without a field after which the loop raises TimeoutError, s; None: no limit.
@@ -185,10 +185,10 @@ class Host:
         return self._publisher.subscribe(kept, timeout_s, patch)
 
     def hands(self, *, timeout_s: float | None = None, capacity: int | None = None) -> HandSubscription:
-        """Subscribe to hand frames: the fields of all patches of one SYNC, for ``for`` or ``async for``.
+        """Subscribe to hand frames, each with all patches' fields for one SYNC.
 
-        A frame waits at most two SYNC periods for a patch's field, and does not wait for a patch that is
-        away.
+        Iterate with ``for`` or ``async for``. A frame waits at most two SYNC periods for a patch's field, and
+        does not wait for a patch that is away.
 
         Args:
             timeout_s: Time without a hand frame after which the loop raises TimeoutError, s; None: no limit.
@@ -297,7 +297,7 @@ class Host:
         return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
-        """Record the traffic with ``tap`` from now until the host closes. One tap at a time.
+        """Record the traffic with ``tap`` from now until the host closes. Only one tap at a time.
 
         Returns:
             A function that ends the recording.

@@ -58,7 +58,7 @@ class StartOptions:
     cancelled: Callable[[], bool] = never
     """Called repeatedly during bring-up; once it returns True, bring-up raises BringUpCancelled."""
     tap: HostTap | None = None
-    """Records the traffic, bring-up included."""
+    """Records the traffic, including bring-up."""
     open_port: Callable[[BusConfig], CanPort] = CanPort
     """Opens the interface of a bus."""
 

@@ -134,7 +134,7 @@ class BusLink(Dispatcher):
             listener(Frame(can_id, b"", t_ns, remote=True))
 
     def listen_to_sent(self, listener: Callable[[Frame], None]) -> None:
-        """Pass every sent frame and its time of sending to ``listener``, on the sending thread."""
+        """Pass every sent frame, with its send time, to ``listener`` on the sending thread."""
         self._sent_listeners = (*self._sent_listeners, listener)
 
     def unlisten_to_sent(self, listener: Callable[[Frame], None]) -> None:

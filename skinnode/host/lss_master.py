@@ -44,7 +44,7 @@ _TRIES: Final = 2
 """Number of requests without a response after which no node is assumed; a busy machine may miss one."""
 
 _SETTLE: Final = 0.2
-"""Spread in time of several slaves' responses to one request, as a fraction of the timeout."""
+"""Maximum spread in time of several slaves' responses to one request, as a fraction of the timeout."""
 
 _UNDER_WAY_S: Final = 0.4
 """Time after which a missing response can no longer arrive, s."""
@@ -72,7 +72,7 @@ class LssMaster:
         self._dialogue = threading.Lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """Process a slave's response. A response without 8 bytes is ignored, as the standard requires."""
+        """Process a slave's response. Ignored, as the standard requires, unless 8 bytes long."""
         if len(data) == 8:
             self._answers.put(data)
 

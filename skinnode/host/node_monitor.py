@@ -32,7 +32,7 @@ again, ns."""
 
 LOOP_RESTARTS: Final = 3
 LOOP_NS: Final = 10_000_000_000
-"""Number of restarts by the node itself, and the time within which they count as a loop."""
+"""Number of spontaneous restarts of a node, and the time within which they count as a loop."""
 
 BEATS: Final = 12
 BEATS_TOO_OFTEN: Final = 0.7
@@ -150,7 +150,7 @@ class NodeMonitor:
         self._registers_said += 1
 
     def said_since(self, state: int, t_ns: int) -> bool:
-        """Return whether the newest heartbeat came after ``t_ns`` and reported ``state``."""
+        """Return whether the newest heartbeat arrived after ``t_ns`` and reported ``state``."""
         heard_ns = self._t_heartbeat_ns
         return heard_ns is not None and heard_ns > t_ns and self.nmt_state == state
 

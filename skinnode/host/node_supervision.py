@@ -23,11 +23,11 @@ START_DEADLINE_S: Final = 1.0
 """Maximum time from the start command to a heartbeat that reports operational, s: four heartbeats."""
 
 _PROBE_NS: Final = 250_000_000
-"""Interval of requests to an absent node: its boot-up message may have been lost, and a node that sends no
-heartbeat would never be noticed. For four nodes, the requests take 0.1 % of a bus."""
+"""Interval between requests to an absent node: its boot-up message may have been lost, and a node that sends
+no heartbeat would never be noticed. For four nodes, the requests take 0.1 % of a bus."""
 
 _SEARCH_NS: Final = 1_000_000_000
-"""Interval of LSS searches for an absent node."""
+"""Interval between LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
 """Silence after which a node is no longer reported as refused or faulty."""

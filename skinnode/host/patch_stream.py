@@ -102,7 +102,7 @@ class StreamOptions:
     tick: Callable[[int], Tick | None]
     """Returns the newest SYNC with the given counter."""
     on_scan: Callable[[Scan], None] = _ignore
-    """Called with each assembled scan at once."""
+    """Called immediately with each assembled scan."""
     watch: Callable[[Scan], None] = _ignore
     """Called with each assembled scan :data:`WATCH_AFTER_NS` later."""
     partial: Partial = "pass"
@@ -186,11 +186,11 @@ class PatchStream:
 
     @property
     def withholding(self) -> bool:
-        """Whether no scan is passed on."""
+        """Whether scans are being withheld."""
         return self._solver is None
 
     def resume(self, solver: ScanSolver, withholdings: int, *, anew: bool) -> None:
-        """Pass scans on from now on, decoded and solved by ``solver``.
+        """Start passing scans on, decoded and solved by ``solver``.
 
         Args:
             solver: Decodes and solves the scans.

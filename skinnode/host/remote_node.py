@@ -103,7 +103,7 @@ class RemoteNode:
 
         Raises:
             NodeError: if its electrode layout cannot be solved, or two nodes have the same node-ID.
-            SkinError: as :meth:`Configurator.configure`.
+            SkinError: as raised by :meth:`Configurator.configure`.
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
@@ -156,7 +156,7 @@ class RemoteNode:
             A solver with this baseline; None if the baseline is unchanged and scans are being passed on.
 
         Raises:
-            SkinError: as :meth:`Configurator.settle_baseline`.
+            SkinError: as raised by :meth:`Configurator.settle_baseline`.
         """
         facts = self.facts
         assert facts is not None  # only called for running nodes
@@ -174,7 +174,7 @@ class RemoteNode:
         """Read the error register: the emergency that clears an error may have been lost.
 
         Raises:
-            NodeError: as :class:`RemoteOd` raises it.
+            NodeError: as raised by :class:`RemoteOd`.
         """
         said = self.monitor.registers_said
         register = self._remote.read(od.ERROR_REGISTER, 0, "u8")
@@ -200,7 +200,7 @@ class RemoteNode:
         """Command the node to use its current resistances as its baseline. Any thread.
 
         Raises:
-            SkinError: as :meth:`Host.tare`.
+            SkinError: as raised by :meth:`Host.tare`.
         """
         node_id, said = self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: not tared"
         if self.has_other_master:

@@ -62,8 +62,8 @@ def configure_all(
 
     Raises:
         NodeTimeout: if a node is silent and ``missing`` is ``refuse``.
-        BusError: if all nodes of a bus are silent and ``missing`` is ``refuse``, or as
-            :meth:`RemoteNode.configure` raises.
+        BusError: if all nodes of a bus are silent and ``missing`` is ``refuse``, or as raised by
+            :meth:`RemoteNode.configure`.
         BringUpCancelled: if ``cancelled`` returned True.
     """
     return _Start(nodes, missing, deadline_s, cancelled).run()

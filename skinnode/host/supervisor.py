@@ -1,9 +1,9 @@
 """Keep the nodes of a running hand running.
 
 A node that comes back, or appears late, is configured and started; a changed baseline is read again. Nodes do
-not affect each other. One thread decides fifty times a second what to do, from the facts that the mainline
-collected. Operations that wait for a node (configuration, reading a baseline) run on a pool, one job per node
-at a time; the thread takes the result when the job is done, so all state has one owner.
+not affect each other. One thread decides fifty times a second what to do, based on the facts that the
+mainline collected. Operations that wait for a node (configuration, reading a baseline) run on a pool, one job
+per node at a time; the thread takes the result when the job is done, so all state has one owner.
 
 =========  ========================================  =========================================
 phase      means                                     left when

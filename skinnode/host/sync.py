@@ -23,7 +23,7 @@ class Tick(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SyncStats:
-    """Counters of SYNC, sent and received."""
+    """Counters of sent and received SYNC messages."""
 
     sent: int
     missed: int
@@ -148,7 +148,7 @@ class SyncProducer:
         keep_on(self._turn, self._defects[0], "sending SYNC")
 
     def _turn(self) -> bool:
-        """Wait until the next SYNC is due and send it. Returns False at the end."""
+        """Wait until the next SYNC is due and send it. Returns False when the thread must end."""
         if self._wait(self._due_ns):
             return False
         self._number += 1

@@ -33,7 +33,7 @@ def tare(
 
     Raises:
         NodeTimeout: after ``deadline_s``.
-        SkinError: as :meth:`RemoteNode.tare`.
+        SkinError: as raised by :meth:`RemoteNode.tare`.
     """
     before, emergencies = baselines(), health().emergencies
     node.tare()

@@ -58,7 +58,7 @@ class Workers:
         keep_on(self._turn, self._defects, "taking a job")
 
     def _turn(self) -> bool:
-        """Wait for the next job and run it. Returns False at the end."""
+        """Wait for the next job and run it. Returns False when the thread must end."""
         task = self._jobs.get()
         if task is None:
             return False

@@ -46,7 +46,7 @@ def test_sums_that_agree() -> None:
 @pytest.mark.parametrize("change", [-1, 1])
 def test_each_counter_of_a_bus_is_in_its_sum(counter: str, change: int) -> None:
     got, must = 31 + change * (counter == "read"), 31 + change * (counter != "read")
-    line = f"can0: frames read: got {got}, must be the {must} of those counted"
+    line = f"can0: frames read: got {got}, must equal the {must} counted"
     assert found({counter: BUS[counter] + change}, {}, {}) == [line]
 
 
@@ -54,9 +54,9 @@ def test_each_counter_of_a_bus_is_in_its_sum(counter: str, change: int) -> None:
 def test_each_counter_of_an_assembler_is_in_its_sum(counter: str) -> None:
     of_scans = counter.startswith("scans")
     name, got = ("scans offered or withheld", 8) if of_scans else ("frames", 13)
-    must = f"{got + 1} of those {'assembled' if of_scans else 'counted'}"
+    must = f"{got + 1} {'assembled' if of_scans else 'counted'}"
     lines = found({"malformed": 4}, {}, {counter: ASSEMBLED[counter] + 1})
-    assert lines == [f"palm: {name}: got {got}, must be the {must}"]
+    assert lines == [f"palm: {name}: got {got}, must equal the {must}"]
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_each_wire_is_reported_when_it_breaks_and_when_it_is_mended(hand: HandHe
 
 def test_a_condition_is_reported_with_its_reason(hand: HandHealth) -> None:
     silent = {"condition": Condition.LOST, "heartbeat_age_s": 0.8}
-    text = "operational, now lost (no heartbeat of node 11 for 0.8 s)"
+    text = "operational, now lost (no heartbeat from node 11 for 0.8 s)"
     assert after(hand, patch=silent) == [("thumb", "lost", text)]
     assert after(hand, patch={"heartbeat_age_s": 0.9}) == []  # it still is
     assert after(hand, patch={"condition": Condition.OPERATIONAL}) == [

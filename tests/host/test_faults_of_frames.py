@@ -227,7 +227,7 @@ def test_codes_changed_after_they_were_packed(running: Hand) -> None:
     assert injected.corrupted > 5
     assert counted.scans_corrupt == injected.scans_spoilt
     assert counted.scans_torn == counted.chunks_lost == counted.conflicts == counted.scans_unchecked == 0
-    assert losses_of_stream(running.stream())["scans_corrupt"].endswith("discarded by their check")
+    assert losses_of_stream(running.stream())["scans_corrupt"].endswith("discarded by the check")
 
 
 def test_chunks_with_the_counter_of_the_next_scan_that_loses_its_own(running: Hand) -> None:

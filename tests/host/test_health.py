@@ -157,14 +157,14 @@ def test_the_reason_names_what_holds_a_patch_back(monitor: NodeMonitor) -> None:
     monitor.complaint = "read of object 0x1018:1: got no answer"
     assert reason(monitor, 1).endswith("; read of object 0x1018:1: got no answer")
     assert (
-        reason(monitor, 2000) == "no heartbeat of node 11 for 2.0 s; read of object 0x1018:1: got no answer"
+        reason(monitor, 2000) == "no heartbeat from node 11 for 2.0 s; read of object 0x1018:1: got no answer"
     )
     monitor.complaint = None
     monitor.on_heartbeat(b"\x05", 2000 * MS)
-    assert reason(monitor, 2001) == "no scan of node 11 received yet"
+    assert reason(monitor, 2001) == "no scan from node 11 received yet"
     monitor.on_scan(2010 * MS)
     assert reason(monitor, 2011) == ""
-    assert reason(monitor, 2510) == "no scan of node 11 for 0.50 s"
+    assert reason(monitor, 2510) == "no scan from node 11 for 0.50 s"
     monitor.on_emergency(bytes.fromhex("10 81 11 02 00 00 00 00"), 2511 * MS)
     assert reason(monitor, 2512) == (
         "error register 0x11 (generic, communication); newest emergency 0x8110 overrun: messages or scans "

@@ -194,7 +194,7 @@ def test_patches_that_vanish_are_named_and_status_1(shared: tuple[Path, BusConfi
     with process([*SIMULATOR, str(path)]) as simulator, process([*HOST, str(path)]) as host:
         assert host.says("thumb operational")
         simulator.end(signal.SIGKILL)
-        assert host.says("thumb lost (no heartbeat of node 11 for ")  # the reason, whatever the condition
+        assert host.says("thumb lost (no heartbeat from node 11 for ")  # the reason, whatever the condition
         status, errors = host.end(signal.SIGINT)
     assert status == 1
     lost = {f"node {node} is lost: no heartbeat" for node in ("11 (thumb)", "12 (index)")}

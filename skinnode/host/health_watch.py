@@ -27,8 +27,8 @@ _PATCH_COUNTERS: Final = {
     "baselines": ("new baseline in use", "new baselines in use"),
     "conflicts": ("conflict", ""),
 }
-"""Counters of :class:`PatchHealth`, each with the noun for what it counts: the singular, and the plural if it
-is irregular."""
+"""Counters of :class:`PatchHealth`, each with the singular noun for what it counts, and the plural if it is
+irregular."""
 _BUS_COUNTERS: Final = {
     "bus_offs": ("bus-off", ""),
     "error_frames": ("error frame", ""),

@@ -139,7 +139,7 @@ def read_journal(path: Path) -> tuple[Header, list[dict[str, Any]], list[str]]:
         path: The journal.
 
     Returns:
-        Header, events, and one line of text per line that cannot be read.
+        Header, events, and one line of text per unreadable line.
 
     Raises:
         ConfigError: The journal cannot be read, or its first line is not a header.

@@ -1,4 +1,4 @@
-"""Records the frames of a running host.
+"""Record the frames of a running host.
 
 The host's threads queue entries and the recorder's own thread writes them, so that a slow disk delays only
 the recording.
@@ -97,7 +97,7 @@ class Recorder:
         with Recorder(hand, "runs/") as recorder, Host.from_config(hand, tap=recorder) as host:
             ...
 
-    A recording that begins before the host starts is replayed bit by bit. A recording that begins while the
+    A recording that begins before the host starts is replayed bit for bit. A recording that begins while the
     host runs (:meth:`Host.tap`) lacks the state of the solvers. A ``with`` block that fails before the first
     frame leaves no file. If the disk fails, the recording ends, one log line reports it, and the host
     continues. An entry that raises any other exception is lost and counted in ``dropped``.
@@ -105,7 +105,7 @@ class Recorder:
     Args:
         hand: The hand.
         path: A file ending in .log or .blf, or a folder, created if needed, in which the file is named after
-            hand, date and time. The journal is written beside it.
+            hand, date and time. The journal is written next to it.
         kind: Format of a file in a folder.
 
     Raises:
@@ -175,7 +175,7 @@ class Recorder:
         self._event(patch, "polled", t_ns=t_ns)
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Record that a scan was skipped for a newer one."""
+        """Record that a scan was skipped in favour of a newer scan."""
         self._event(patch, "overtaken", scan=scan, received_ns=t_receive_ns)
 
     def close(self) -> None:
@@ -246,7 +246,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal before the log, so that the journal is never behind."""
+        """Flush the journal before the log, so that it never lags behind the log."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", time.monotonic_ns(), "dropped", frames=lost)
@@ -254,7 +254,7 @@ class Recorder:
         self._log.flush(to_disk=to_disk)
 
     def _begin(self, header: Header) -> None:
-        """Write the header at once, so that a recording killed at any moment can be read."""
+        """Write the header at once, so that the recording can be read even if the process is killed."""
         self._write_line(header.line())
         self._journal.flush()
 

@@ -1,12 +1,12 @@
 """Replay a recording as fields, using the code that decodes live frames.
 
-Dispatcher, assembler, decoder, stream, solver and publisher are the host's. No threads are used: each scan is
-solved when its last frame is dispatched.
+The dispatcher, assembler, decoder, stream, solver and publisher are those of the host. No threads are used:
+each scan is solved when its last frame is dispatched.
 
 **Same as live.** Scans that were solved live give bit-identical fields if the recording began before the host
-started and is complete, build and processor are the same, and no deadline cut a solve short. Times are on the
-recording host's clock, to 1 µs, the resolution of log files. If frames are missing or damaged, journal events
-are placed by time instead of by frame count, and the times of later frames end incomplete scans.
+started and is complete, if build and processor are the same, and if no deadline cut a solve short. Times are
+on the recording host's clock, to 1 µs, the resolution of log files. If frames are missing or damaged, journal
+events are placed by time instead of by frame count, and the times of later frames end incomplete scans.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
         for field in skinnode.record.replay("runs/hand-20260102-030405.log"):
             ...
 
-    No scan that was solved live is skipped, at any speed.
+    A replay skips no scan that was solved live, whatever the speed.
 
     Args:
         path: File ending in .log or .blf.
@@ -79,7 +79,7 @@ class Replay:
         if not path.name:
             raise ConfigError("recording", str(path), "a file ending in .log or .blf")
         header, events, self.complaints = read_journal(path.with_suffix(SUFFIX))
-        """One line per part of the journal that cannot be read."""
+        """One line per unreadable part of the journal."""
         self.hand, self.started = header.hand, header.started
         self._speed, self._offset_ns = speed, header.wall_minus_mono_ns
         self.log = FrameLogReader(path)
@@ -92,7 +92,7 @@ class Replay:
         self._first_ns: int | None = None
         self._journal = path.with_suffix(SUFFIX).name
         self.incomplete: str | None = None
-        """After a complete iteration: one line on what the log lacks; None if the log is complete."""
+        """After a complete iteration, one line that says what the log lacks; None if the log is complete."""
         self.dropped = sum(e["frames"] for e in events if e["event"] == "dropped")
         """Frames that the recorder could not write."""
         self._now_ns = 0
@@ -209,7 +209,7 @@ class Replay:
 
 
 class _Pace:
-    """Waits until a frame is due."""
+    """Pacer that waits until a frame is due."""
 
     def __init__(self, speed: float | None, wait: Callable[[float], None]) -> None:
         self._speed, self._wait = speed, wait

@@ -1,4 +1,4 @@
-"""Writes frames to a file with python-can's writers: candump text (``.log``) or Vector BLF.
+"""Write frames to a file with python-can's writers: candump text (``.log``) or Vector BLF.
 
 Both formats keep all frames written before the last :meth:`FrameLog.flush`, even if the process is killed
 later. A ``.log`` file is only appended to. python-can's BLF writer buffers up to 128 kB of frames and

@@ -1,5 +1,5 @@
-"""Gauss-Newton, Levenberg-Marquardt and dogleg, a file each: the step of each from the same ``work`` space.
+"""Operators Gauss-Newton, Levenberg-Marquardt and dogleg: one file each, with a common ``work`` space.
 
-``trust_region`` decides whether a step is taken, ``loop`` goes from step to step and knows no method but by
-its number in ``codes``. ``system`` solves any square or tall system, ``result`` is what that returns.
+``trust_region`` decides whether to accept a step, and ``loop`` iterates the operator selected by its number
+in ``codes``. ``system`` solves any square or tall system, and ``result`` holds its outcome.
 """

@@ -1,4 +1,4 @@
-"""Numbers by which compiled code knows operators and statuses, and the limits of rounding."""
+"""Numbers that identify operators and statuses in compiled code, and limits set by rounding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ OPERATORS: Final = {"gauss_newton": 0, "levenberg_marquardt": 1, "dogleg": 2}
 GAUSS_NEWTON: Final = OPERATORS["gauss_newton"]
 LEVENBERG_MARQUARDT: Final = OPERATORS["levenberg_marquardt"]
 
-# Results of a step besides a terminal Status, which is ≥ 0
+# Results of a step other than a terminal Status, which is ≥ 0
 TRY: Final = -1
 ACCEPTED: Final = -2
 REJECTED: Final = -3
@@ -28,10 +28,10 @@ INVALID_START: Final = int(Status.INVALID_START)
 
 EPS: Final = float(np.finfo(np.float64).eps)
 ROOT_SHARE: Final = EPS ** (1 / 2)
-"""Maximum error estimate of a root as a share of max(1, ‖x‖∞): half of the digits are given."""
+"""Maximum error estimate of a root, relative to max(1, ‖x‖∞): half of the digits are determined."""
 MINIMUM_SHARE: Final = EPS ** (1 / 3)
-"""Maximum error estimate of a minimum as a share of max(1, ‖x‖∞): ‖r‖² does not fix x to better than √eps."""
+"""Maximum error estimate of a minimum, relative to max(1, ‖x‖∞): ‖r‖² determines x no better than to √eps."""
 STATIONARY: Final = 1e-6
-"""Maximum gradient, as a share of ‖J_j‖ ‖r‖, that counts as zero: r² is then flat to rounding, about √eps."""
+"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that counts as zero: r² is then flat to rounding, about √eps."""
 STALL_LIMIT: Final = 30
-"""Maximum steps below the rounding of ‖r‖² that a tall system may take to settle its x."""
+"""Maximum number of steps that a tall system may take to settle x while ‖r‖² changes only by rounding."""

@@ -1,4 +1,4 @@
-"""The step of the dogleg: Powell, A hybrid method for nonlinear equations, 1970."""
+"""Dogleg step (Powell, A hybrid method for nonlinear equations, 1970)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skinnode.solve.operators.work import RADIUS, SINGULAR, Work, times_jacobian
 
 @njit_part
 def dogleg_step(w: Work) -> None:
-    """Set Powell's step: along −D⁻²g to the Cauchy point, from there towards Newton's, to the radius."""
+    """Set Powell's step: along −D⁻²g to the Cauchy point, then towards Newton's step, up to the radius."""
     n, radius = w.x.size, w.s[RADIUS]
     square = 0.0
     for j in range(n):

@@ -1,6 +1,6 @@
-"""Newton's step −J⁺ r, which Gauss-Newton takes in full, as the paper does, and the other operators shorten.
+"""Newton step −J⁺ r, which Gauss-Newton takes in full, as in the paper, and the other operators shorten.
 
-The correction −J⁺ r₊ by the factors at hand is also the error estimate (Deuflhard, Newton methods for
+The correction −J⁺ r₊ with the current factors is also the error estimate (Deuflhard, Newton methods for
 nonlinear problems, 2004). Source: Xu et al. 2018, eq. 8.
 """
 
@@ -29,7 +29,7 @@ from skinnode.solve.operators.work import (
 
 @njit_part
 def factor(w: Work) -> bool:
-    """Factor J, LU if it is square and QR if it is tall; set FACTORED, SINGULAR, SIGN, ERROR and ``newton``.
+    """Factor J, by LU if square and by QR if tall; set FACTORED, SINGULAR, SIGN, ERROR and ``newton``.
 
     Returns whether J has full rank.
     """
@@ -63,7 +63,7 @@ def finite_jacobian(w: Work) -> bool:
 
 @njit_part
 def settled(w: Work, tol_f: float, tol_x: float) -> bool:
-    """Return whether x is a root or minimum, by the factors at hand; sets ANGLE of a tall system."""
+    """Return whether x is a root or minimum according to the current factors; set ANGLE of a tall system."""
     s = w.s
     small = largest(w.r) <= tol_f
     if w.r.size != w.x.size:
@@ -75,7 +75,7 @@ def settled(w: Work, tol_f: float, tol_x: float) -> bool:
 
 @njit_part
 def correction(w: Work, r: Float, out: Float) -> float:
-    """Write −J⁺ r into ``out`` (n,), by the factors at hand; return its largest element."""
+    """Write −J⁺ r, with the current factors, into ``out`` (n,); return its largest absolute value."""
     n = out.size
     if w.r.size == n:
         for j in range(n):
@@ -93,7 +93,7 @@ def correction(w: Work, r: Float, out: Float) -> float:
 
 @njit_part
 def rounding(w: Work, x: Float) -> float:
-    """Write into ``e`` what rounding of x does to r, eps Σ_j |J_kj x_j|; return max |x|."""
+    """Write the effect of rounding of x on r, eps Σ_j |J_kj x_j|, into ``e``; return max |x|."""
     top = 0.0
     for k in range(w.e.size):
         w.e[k] = 0.0
@@ -110,8 +110,8 @@ def rounding(w: Work, x: Float) -> float:
 def estimate_error(w: Work, inverse: Float) -> float:
     """Write J⁺ of the last factors into ``inverse`` (n, m); return the error estimate of a converged solve.
 
-    The estimate is the correction still to come plus what rounding of x leaves open through the condition of
-    J, as a share of max(1, ‖x‖∞); inf if J is singular.
+    The estimate is the remaining correction plus the effect of rounding of x, amplified by the condition of
+    J, relative to max(1, ‖x‖∞); inf if J is singular.
     """
     n, m = w.jt.shape
     if w.flag[SINGULAR] == 1:

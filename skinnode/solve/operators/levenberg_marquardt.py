@@ -1,4 +1,4 @@
-"""The step of Levenberg-Marquardt, by Moré, The Levenberg-Marquardt algorithm, 1978 (section 5)."""
+"""Levenberg-Marquardt step (Moré, The Levenberg-Marquardt algorithm, 1978, section 5)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from skinnode.solve.operators.work import LAM, NEWTON_LENGTH, RADIUS, REDUCED, S
 
 @njit_part
 def marquardt_step(w: Work) -> None:  # noqa: C901 - Moré's iteration in one piece
-    """Set the step with ‖D s‖ within a tenth of the radius, by Newton's method on lam (Moré 1978, section 5).
+    """Set the step with ‖D s‖ within a tenth of the radius, by Newton's method for lam (Moré 1978, section 5).
 
-    In the bidiagonal form of J D⁻¹, made once a Jacobian, s = D⁻¹ P t and ‖D s‖ = ‖t‖: each lam then costs of
-    the order of n.
+    In the bidiagonal form of J D⁻¹, computed once per Jacobian, s = D⁻¹ P t and ‖D s‖ = ‖t‖, so each lam
+    costs O(n) operations.
     """
     (n, m), s, t = w.jt.shape, w.s, w.step
     radius = s[RADIUS]
@@ -78,7 +78,7 @@ def marquardt_step(w: Work) -> None:  # noqa: C901 - Moré's iteration in one pi
 
 @njit_part
 def _decrease(inverse: Float, upper: Float, t: Float, length: float, v: Float) -> float:
-    """Return ‖R⁻ᵀ t / ‖t‖‖², the share of ‖t‖ that a unit of lam takes away; ``v`` (n,) is scratch."""
+    """Return ‖R⁻ᵀ t / ‖t‖‖², the relative decrease of ‖t‖ per unit of lam; ``v`` (n,) is scratch."""
     share = 1.0 / length
     for j in range(t.size):
         v[j] = t[j] * share

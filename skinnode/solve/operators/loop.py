@@ -1,18 +1,18 @@
-"""The loop of every operator, as reverse communication: the caller evaluates the functions.
+"""Iteration loop of all operators, with reverse communication: the caller evaluates the functions.
 
-    begin      r and J at x are in the workspace
-    propose    factor J; x is a root, or Newton's step is the next ``trial``
-    shorten    the trial of the trust region if Newton's step leaves it
-    assess     r at ``trial`` is in ``r_trial``: take the step or not, update the radius, return what is next
+    begin      start from x, r and J in the workspace
+    propose    factor J; unless x is a root, make Newton's step the next ``trial``
+    shorten    if Newton's step leaves the trust region, replace the trial by one inside it
+    assess     given r at ``trial`` in ``r_trial``, accept the step or not and update the radius
 
-So the same compiled steps serve the compiled solver of a skin wire and any pair of Python callables.
-Gauss-Newton takes every step in full; Levenberg-Marquardt and dogleg take a step only if r gets smaller.
+The same compiled steps therefore serve the compiled solver of a skin wire and any pair of Python callables.
+Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if it reduces r.
 
-What CONVERGED means. Square systems: a root, that is max|r| ≤ tol_f *and* a simplified Newton correction
-‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞), by the factors at hand. Where rounding keeps r above tol_f, r within the
-rounding of J·x counts as zero. Tall systems: a minimum, ‖P r‖ ≤ tol_f ‖r‖ with P the projection on the
-range of J, and the same correction. A stationary point of a square system with r ≠ 0 is ILL_CONDITIONED: J
-is singular there.
+For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
+‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, an r within the
+rounding of J·x counts as zero. For a tall system, it means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P the
+projection onto the range of J, and the same condition on the correction. A stationary point of a square
+system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def begin(w: Work) -> int:
     s, flag = w.s, w.flag
     for k in range(flag.size):
         flag[k] = 0
-    s[RADIUS] = -1.0  # set by the first propose, which knows D
+    s[RADIUS] = -1.0  # set by the first call of propose, once D is known
     s[LAM] = 0.0
     s[ERROR] = math.inf
     s[ANGLE] = 1.0
@@ -82,7 +82,7 @@ def begin(w: Work) -> int:
 
 @njit_part
 def set_trial(operator: int, w: Work) -> None:
-    """Set ``trial`` to x + step; LENGTH and ``js`` too if there is a trust region."""
+    """Set ``trial`` to x + step and, if there is a trust region, LENGTH and ``js``."""
     for j in range(w.x.size):
         w.trial[j] = w.x[j] + w.step[j]
     if operator != GAUSS_NEWTON:
@@ -95,7 +95,7 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
     """Set Newton's step as the next trial point.
 
     Returns TRY with ``trial``, ``step`` and ``js`` set, OUTSIDE if the step is longer than the radius or
-    there is none (call :func:`shorten`), or a Status.
+    does not exist (call :func:`shorten`), or a Status.
     """
     s, flag = w.s, w.flag
     if flag[FACTORED] == 0:
@@ -121,7 +121,7 @@ def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit_part
 def shorten(operator: int, w: Work) -> int:
-    """Set the step within the trust region if Newton's leaves it: TRY, or a Status at a stationary point."""
+    """Set a step within the trust region; return TRY, or a Status at a stationary point."""
     if slope_of(w) <= EPS:
         return CONVERGED if w.flag[SINGULAR] == 0 and w.r.size > w.x.size else ILL_CONDITIONED
     if operator == LEVENBERG_MARQUARDT:
@@ -134,7 +134,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Whether rounding of x hides whatever is left of ``r_trial``, whose norm is ``norm``."""
+    """Return whether ``r_trial``, with the norm ``norm``, is explained by rounding of x."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)
@@ -147,7 +147,7 @@ def _within_rounding(w: Work, norm: float) -> bool:
 
 @njit_part
 def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
-    """Take the trial point or not: return ACCEPTED (evaluate J at x next), REJECTED or a Status."""
+    """Accept or reject the trial point; return ACCEPTED (evaluate J at x next), REJECTED or a Status."""
     s = w.s
     norm = math.sqrt(dot(w.r_trial, w.r_trial))
     exhausted = _within_rounding(w, norm)
@@ -173,15 +173,15 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """Do :func:`begin` for callers in Python."""
+    """Call :func:`begin` on behalf of Python code."""
     return begin(w)
 
 
 @njit
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
-    """Do :func:`assess` for the trial of the last call, then :func:`propose`, for callers in Python.
+    """Call :func:`assess` for the last trial, then :func:`propose`, on behalf of Python code.
 
-    ``went`` is the result of the last call, ``REJECTED`` at first. Returns TRY (evaluate r at ``trial`` into
+    ``went`` is the result of the last call, initially ``REJECTED``. Returns TRY (evaluate r at ``trial`` into
     ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
     """
     if went == TRY:
@@ -194,5 +194,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """Do :func:`estimate_error` for callers in Python."""
+    """Call :func:`estimate_error` on behalf of Python code."""
     return estimate_error(w, inverse)

@@ -1,4 +1,4 @@
-"""The result of solving any system. Statuses are those of the model."""
+"""Result of solving a system of equations, with the statuses of the model."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["Solution", "SolveStats", "Status"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """How ``solve_system`` ended, with the best iterate found, whatever the status."""
+    """Outcome of ``solve_system``, with the best iterate found, whatever the status."""
 
     x: Float
-    """(n,) the best iterate."""
+    """(n,) best iterate."""
     status: Status
     residual_norm: float
     """‖r‖₂ at ``x``."""
     optimality: float
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
-    """Estimate of max |x − x*|: the Newton correction still to come plus what rounding of F leaves open
-    through the condition of J. Inf if no root or minimum was found."""
+    """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding of F, amplified
+    by the condition of J; inf if no root or minimum was found."""
     stats: SolveStats

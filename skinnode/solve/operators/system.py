@@ -1,4 +1,4 @@
-"""Solve any square or tall system F(x) = 0 by the operators of the skin."""
+"""Solver for any square or tall system F(x) = 0, with the same operators as for the skin."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skinnode.solve.operators.work import workspace
 
 
 def operator_code(name: str) -> int:
-    """Return the number of an operator in compiled code. Raises ValueError for an unknown name."""
+    """Return the number of an operator in compiled code. Raises ValueError if the name is unknown."""
     if not isinstance(name, str) or name not in op.OPERATORS:
         raise ValueError(f"operator: got {name!r}, must be one of {', '.join(op.OPERATORS)}")
     return op.OPERATORS[name]
@@ -45,24 +45,25 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
     tol_x: float = 1e-12,
     max_steps: int = 1000,
 ) -> Solution:
-    """Solve residual(x) = 0, or minimise ‖residual(x)‖₂ where there are more equations than unknowns.
+    """Solve residual(x) = 0, or minimise ‖residual(x)‖₂ if there are more equations than unknowns.
 
     Args:
-        residual: x (n,) to r (m,), m ≥ n.
-        jacobian: x (n,) to ∂r/∂x (m, n).
-        x0: (n,) start.
+        residual: Function that returns r (m,), m ≥ n, for x (n,).
+        jacobian: Function that returns ∂r/∂x (m, n) for x (n,).
+        x0: (n,) starting point.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
-        tol_f: largest |r| of a root; share of r in the range of J at a minimum.
-        tol_x: largest remaining correction, relative to max(1, max|x|).
-        max_steps: trial steps, rejected ones included.
+        tol_f: Largest |r| at a root; at a minimum, largest fraction of r in the range of J.
+        tol_x: Largest remaining correction, relative to max(1, max|x|).
+        max_steps: Maximum number of trial steps, including rejected steps.
 
     Returns:
-        The best iterate with its status. Fewer equations than unknowns, or a residual or Jacobian that is not
-        finite at ``x0``, end as ``INVALID_START``. See :mod:`skinnode.solve.operators.loop` for what
-        CONVERGED promises.
+        The best iterate with its status, which is ``INVALID_START`` if there are fewer equations than
+        unknowns, or if the residual or Jacobian is not finite at ``x0``. For the meaning of CONVERGED, see
+        :mod:`skinnode.solve.operators.loop`.
 
     Raises:
-        ValueError: if an argument or a returned array has the wrong shape or range. Numbers never raise.
+        ValueError: If an argument is out of range, or an argument or returned array has the wrong shape. A
+            residual or Jacobian that is not finite never raises.
     """
     code = operator_code(operator)
     require_tolerances(tol_f, tol_x, max_steps)

@@ -1,6 +1,6 @@
-"""The trust region ‖D s‖ ≤ radius: its size, and whether a step is taken.
+"""Trust region ‖D s‖ ≤ radius: its size, and the decision whether to accept a step.
 
-A step is taken only if it makes r smaller. Source: Moré, The Levenberg-Marquardt algorithm, 1978.
+A step is accepted only if it reduces r. Source: Moré, The Levenberg-Marquardt algorithm, 1978.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from skinnode.solve.operators.work import (
 SHRINK_BELOW: Final = 0.25
 ENLARGE_ABOVE: Final = 0.75
 REJECT_BELOW: Final = 1e-4
-"""Ratios of actual to predicted decrease at which the radius changes and a step is rejected (Moré 1978)."""
+"""Ratios of actual to predicted decrease at which the radius changes or a step is rejected (Moré 1978)."""
 
 
 @njit_part
@@ -53,7 +53,7 @@ def slope_of(w: Work) -> float:
 
 @njit_part
 def measure_newton(w: Work) -> None:
-    """Update D and the length of Newton's step; set the first radius."""
+    """Update D and the length of Newton's step; set the initial radius."""
     n, s = w.x.size, w.s
     for j in range(n):
         w.scale[j] = max(w.scale[j], math.sqrt(dot(w.jt[j], w.jt[j])))
@@ -69,7 +69,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Rounding error of the relative decrease of ‖r‖² at a step that is predicted to change little."""
+    """Return the rounding error of the relative decrease of ‖r‖² for a step predicted to change it little."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -79,7 +79,7 @@ def _gain_noise(w: Work) -> float:
 
 @njit_part
 def _stalled(w: Work) -> int:
-    """Return what to do where ‖r‖ cannot tell any more whether a step is better: ACCEPTED, or a Status."""
+    """Return ACCEPTED or a Status for a step whose effect on ‖r‖ is lost in rounding."""
     square = w.r.size == w.x.size
     w.flag[STALLED] += 1
     if square or w.flag[STALLED] > STALL_LIMIT:

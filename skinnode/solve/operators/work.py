@@ -1,8 +1,8 @@
-"""The workspace of a solve, which every step reads and writes, and products with its Jacobian.
+"""Workspace that every step of a solve reads and writes, and products with its Jacobian.
 
-Symbols are the paper's: r residual (m,), J its Jacobian (m, n), stored transposed, lam the
-Levenberg-Marquardt parameter, radius that of the trust region ‖D s‖ ≤ radius, D the running maximum of the
-column norms of J (Moré 1978), so that the unit of an unknown does not matter.
+The symbols are those of the paper: r is the residual (m,), J its Jacobian (m, n), stored transposed, and lam
+the Levenberg-Marquardt parameter. The trust region is ‖D s‖ ≤ radius, where D is the running maximum of the
+column norms of J (Moré 1978), so that the units of the unknowns do not matter.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FACTORED, SINGULAR, SIGN, REDUCED, STALLED, FLAGS = range(6)
 
 
 class Work(NamedTuple):
-    """Everything that solving m equations in n unknowns writes to."""
+    """Arrays written while solving m equations in n unknowns."""
 
     x: Annotated[Float, "n"]
     trial: Annotated[Float, "n"]
@@ -38,13 +38,13 @@ class Work(NamedTuple):
     """β of the reflectors of Q."""
     v: Annotated[Float, "n"]
     bd: Annotated[Float, "n"]
-    """Diagonal of the bidiagonal form of J D⁻¹; ``bu`` is above it."""
+    """Diagonal of the bidiagonal form of J D⁻¹; ``bu`` is its superdiagonal."""
     bu: Annotated[Float, "n"]
     across: Annotated[Float, "n"]
     down: Annotated[Float, "n"]
-    """β of its reflectors."""
+    """β of the reflectors of the bidiagonal form, as in ``across``."""
     inverse: Annotated[Float, "n"]
-    """1 / diagonal of the damped form; ``ru`` is above it."""
+    """1 / diagonal of the damped form; ``ru`` is its superdiagonal."""
     ru: Annotated[Float, "n"]
     r: Annotated[Float, "m"]
     r_trial: Annotated[Float, "m"]

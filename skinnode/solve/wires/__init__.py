@@ -1,7 +1,7 @@
-"""One upper wire after the other, compiled: shared by the exact tracker and path following.
+"""Compiled solver for the upper wires of a patch, shared by the exact tracker and path following.
 
-``problem`` scales a patch to dimensionless systems, ``arrays`` declares what kernels read and write,
-``decode`` takes in a frame, ``solve_wires`` goes through the wires and tries ``hold``, ``follow`` and
-``correct``; ``stages`` does the rest of the work on a frame, ``patch_solver`` makes all of it one call.
-``root_check`` says which roots may be wrong.
+``problem`` scales a patch to dimensionless systems, ``arrays`` declares the arrays that kernels read and
+write, ``decode`` converts the codes of a frame, ``solve_wires`` solves the wires one by one with ``hold``,
+``follow`` and ``correct``, ``stages`` does the remaining work on a frame, and ``patch_solver`` combines all
+of this in one call. ``root_check`` finds roots that may be wrong.
 """

@@ -1,7 +1,7 @@
-"""The arrays of a patch that kernels read and write, declared once: name, element type and axes.
+"""Arrays of a patch that kernels read and write, declared once with name, element type and axes.
 
-U upper wires, N electrodes an upper wire, K lower wires, M electrodes a lower wire; n unknowns a wire, E
-electrodes with unknowns. Lengths are in pitches (see ``problem``).
+A patch has U upper wires with N electrodes each and K lower wires with M electrodes each. An upper wire has n
+unknowns, which belong to E of its electrodes. Lengths are in pitches (see ``problem``).
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ Mask = NDArray[np.bool_]
 
 # Columns of a wire's integer report
 STATUS, EVALUATIONS, STEPS, BRANCH, HELD, SPARE, TURN, REPORT = range(8)
-# Columns of a wire's real report. RESIDUAL is the weighted RMS over the equations in use; CHI2 is the χ² of
-# the residual at the end of a solve, with SPARE (equations less unknowns) degrees of freedom.
+# Columns of a wire's floating-point report. RESIDUAL is the weighted RMS over the equations in use; CHI2 is
+# the χ² of the residual at the end of a solve, with SPARE (equations minus unknowns) degrees of freedom.
 RESIDUAL, OPTIMALITY, ERROR_ESTIMATE, CHI2, MEASURES = range(5)
 
-# What to do with a wire
+# Actions for a wire
 LEAVE: Final = 0
 SOLVE: Final = 1
 PREDICT: Final = 2
-"""Solve, starting at x + (∂x/∂a) (a − a of the last solve)."""
+"""Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
 HOLD: Final = 3
-"""As PREDICT, but keep x if the residual there is within noise."""
+"""As PREDICT, but keep x if its residual is within noise."""
 
-# What a solve may do besides solving, or-ed together
+# Additional tasks of a solve, combined with bitwise or
 COVARIANCE: Final = 1
-"""Compute J⁻¹, and from it the standard deviation of x and what rounding leaves open."""
+"""Compute J⁻¹, and from it the standard deviation and the rounding error of x."""
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""Follow a wire that moved a little with the inverse at hand, and keep that inverse."""
+"""Follow a wire that moved only a little with its stored inverse, and keep that inverse."""
 
 
 class SolveOptions(ArrayTable):
-    """How to solve wires.
+    """Options of a solve.
 
     Args:
-        operator: number of the operator, see :data:`skinnode.solve.operators.codes.OPERATORS`.
-        tasks: COVARIANCE, SKIP and REUSE, or-ed together.
-        tol_f: largest |r| at a root.
-        tol_x: largest remaining correction, relative to max(1, max|x|).
-        max_steps: maximum trial steps of a wire.
+        operator: Operator code, from :data:`skinnode.solve.operators.codes.OPERATORS`.
+        tasks: COVARIANCE, SKIP and REUSE, combined with bitwise or.
+        tol_f: Largest |r| at a root.
+        tol_x: Largest remaining correction, relative to max(1, max|x|).
+        max_steps: Maximum number of trial steps per wire.
 
     Raises TypeError if a value has the wrong type, ValueError if a tolerance or ``max_steps`` is not
     positive.
@@ -77,38 +77,38 @@ class SolveOptions(ArrayTable):
 def solve_options(
     operator: int, tasks: int = 0, tol_f: float = 1e-9, tol_x: float = 1e-9, max_steps: int = 12
 ) -> SolveOptions:
-    """Return :class:`SolveOptions` with these values; equal ones are made once."""
+    """Return cached :class:`SolveOptions` with these values."""
     return SolveOptions(int(operator), int(tasks), float(tol_f), float(tol_x), int(max_steps))
 
 
 class SolverArrays(ArrayTable):
-    """State, results and workspace of the solver of one patch, for wires with E electrodes with unknowns."""
+    """State, results and workspace of a patch's solver, for wires with unknowns on E electrodes."""
 
     x: Annotated[Float, "U 3N"]
-    """Start, then solution."""
+    """Starting point, then solution."""
     inverse: Annotated[Float, "U 3N K"]
     """∂x/∂r of the last converged solve of each wire."""
     a_solved: Annotated[Float, "U K"]
-    """1/F there; 1 where there was no equation."""
+    """1/F at that solution; 1 if the equation was missing."""
     noise: Annotated[Float, "U K"]
-    """Variance of a there; inf where there was no equation."""
+    """Variance of a at that solution; inf if the equation was missing."""
     std: Annotated[Float, "U 3N"]
-    """Standard deviation of x; inf where not known."""
+    """Standard deviation of x; inf if unknown."""
     report: Annotated[Index, "U report"]
     measure: Annotated[Float, "U measures"]
     tally: Annotated[Index, "3"]
     """Evaluations of F, evaluations of J, and steps, summed over calls."""
     lower: Annotated[Float, "3 M K", READONLY]
     electrodes: Annotated[Index, "U N"]
-    """In each row, first the electrodes with unknowns."""
+    """Electrodes of each wire; those with unknowns come first."""
     still: Annotated[Float, "U K"]
     """Potential of the electrodes without unknowns."""
     still_std: Annotated[Float, "U 3N"]
     """Standard deviation of the coordinates that are not unknowns."""
     turn: Annotated[Index, "1"]
-    """Number of the frame; says which wire gets a new inverse where inverses are reused."""
+    """Frame number; determines which wires get a new inverse if inverses are reused."""
     step_limit: float
-    """First trust radius, pitches a coordinate."""
+    """Initial trust radius, pitches per coordinate."""
     point: Annotated[Float, "3E"]
     """Coordinates of the electrodes with unknowns."""
     raw: Annotated[Float, "3E K"]
@@ -117,43 +117,43 @@ class SolverArrays(ArrayTable):
 
 
 class FrameArrays(ArrayTable):
-    """The stream of a patch and the frame at hand."""
+    """Arrays of a patch's stream and of its current frame."""
 
     codes: Annotated[NDArray[np.uint32], "U K"]
     baseline_ohm: Annotated[Float, "U K"]
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """R/R0 of code 0, that of a step, the highest code, and the converter's relative noise."""
+    """R/R0 of code 0, change of R/R0 per code, largest valid code, relative noise before the converter."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
-    """Standard deviation of the resistance, relative to it."""
+    """Relative standard deviation of the resistance."""
     valid: Annotated[Mask, "U K"]
     gain: Annotated[Float, "U K"]
     """a / R."""
     a: Annotated[Float, "U K"]
     """Resistance in the units of the problem."""
     weight: Annotated[Float, "U K"]
-    """σ over the standard deviation; 0 where that is not known or the resistance is not valid."""
+    """σ divided by the standard deviation; 0 if that is unknown or the resistance is invalid."""
     used: Annotated[Float, "U K"]
-    """``weight``, but 0 also where a is out of range."""
+    """As ``weight``, but also 0 if a is out of range."""
     todo: Annotated[Bytes, "U"]
     """LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]
-    """The wires in the order in which they have their turn."""
+    """Wires in processing order."""
     first: int
-    """HOLD or PREDICT: what to do with a wire that can be predicted."""
+    """HOLD or PREDICT, the action for a wire that can be predicted."""
     pitch_m: float
     x: Annotated[Float, "U 3N"]
     """Last trusted position."""
     a_solved: Annotated[Float, "U K"]
-    """The a of that position."""
+    """Value of a at that position."""
     weight_solved: Annotated[Float, "U K"]
-    """Weights for which the inverse of each wire was made."""
+    """Weights for which the inverse of each wire was computed."""
     predictable: Annotated[Mask, "U"]
     """Wires whose inverse in the solver belongs to their x."""
     unknowns: Annotated[Index, "U"]
-    """Unknowns of each wire."""
+    """Number of unknowns of each wire."""
     rest: Annotated[Float, "U 3N"]
     rest_branch: Annotated[Index, "U"]
     """Sign of det J at rest."""
@@ -164,7 +164,7 @@ class FrameArrays(ArrayTable):
     moved_m: Annotated[Float, "U 3N"]
     """Displacement."""
     std_m: Annotated[Float, "U 3N"]
-    """Its standard deviation."""
+    """Standard deviation of the displacement."""
     held: Annotated[Mask, "U"]
 
     def __init__(self, problem: PatchProblem, rest_branch: Index, unknowns: Index, first: int) -> None:
@@ -208,11 +208,11 @@ class FrameArrays(ArrayTable):
         )
 
     def set_codes(self, codes: CodeMap) -> None:
-        """Set what codes mean from now on."""
+        """Set the mapping from codes to resistances."""
         self.baseline_ohm[:], self.rounding_ohm[:] = codes.baseline_ohm, codes.rounding_ohm
         self.code_gain[:] = 1.0 if codes.gain is None else codes.gain
         self.code_map[:] = codes.lo, codes.step, codes.steps, codes.relative_noise
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""In kernels: the fields of a table."""
+"""Functions by which kernels read the fields of a table."""

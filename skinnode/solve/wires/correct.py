@@ -1,10 +1,10 @@
-"""The corrector: bring one wire to a root of r = w (a F − 1) with an operator, compiled.
+"""Compiled corrector: brings one wire to a root of r = w (a F − 1) with an operator.
 
-A wire is solved for all coordinates of its electrodes, or for fewer: some electrodes only, the others at
-rest, and z only (``normal_only``). Fewer unknowns than equations make a tall system, whose χ² = Σ (ρ_k/σ_k)²
-at the minimum is a test: above its 1 − 1e-9 quantile no position explains the frame, and the wire is
-ILL_CONDITIONED; from the 95 % quantile on the standard deviations grow by √(χ²/dof) (Birge, Phys. Rev. 40,
-207, 1932). This replaces the sign of det J, which only a square system has.
+A wire is solved for all coordinates of its electrodes or for fewer: some electrodes may stay at rest, and z
+may be the only unknown (``normal_only``). With fewer unknowns than equations, the system is tall, and χ² =
+Σ (ρ_k/σ_k)² at its minimum tests the fit. Above the 1 − 1e-9 quantile no position explains the frame, and the
+wire is ILL_CONDITIONED; above the 95 % quantile the standard deviations are multiplied by √(χ²/dof) (Birge,
+Phys. Rev. 40, 207, 1932). This test replaces the sign of det J, which only a square system has.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ from skinnode.solve.wires.arrays import (
 from skinnode.solve.wires.hold import chi2_quantile_part
 
 DATA_ROUNDING: Final = 2.0
-"""Relative error of an a F, in eps: R, the gain, their product and F are rounded to half an eps each."""
+"""Relative rounding error of a F, in eps: R, gain, their product and F are each rounded to half an eps."""
 
 Z_95_ONE_SIDED: Final = 1.645
-"""Normal deviate below which 95 % of a normal distribution lie."""
+"""Normal quantile for a probability of 95 %."""
 
 
 @njit_part
 def _data_rounding(inverse: Float, weight: Float) -> float:
-    """What rounding of the resistances leaves open of the largest coordinate: ``inverse`` (n, K) ∂x/∂r."""
+    """Return the largest coordinate error due to rounding of the resistances; ``inverse`` (n, K) is ∂x/∂r."""
     top = 0.0
     for j in range(inverse.shape[0]):
         row, total = inverse[j], 0.0
@@ -66,7 +66,7 @@ def _data_rounding(inverse: Float, weight: Float) -> float:
 def _evaluate(  # noqa: PLR0913 - arrays of one wire
     x: Float, point: Float, still: Float, lower: Float, a: Float, weight: Float, r: Float, raw: Float
 ) -> None:
-    """Evaluate r = w (a F − 1) and the Jacobian of F at the unknowns ``x``, put into ``point``.
+    """Copy the unknowns ``x`` into ``point``, and evaluate r = w (a F − 1) and the Jacobian of F there.
 
     ``still`` (K,) is the potential of the electrodes that are not in ``point``.
     """
@@ -93,7 +93,7 @@ def _take_jacobian(raw: Float, a: Float, weight: Float, jt: Float) -> None:
 
 @njit_part
 def coordinate(electrodes: Index, j: int, each: int) -> int:
-    """Return the coordinate (of 3N) that is unknown ``j``, with three or one (z) unknowns an electrode."""
+    """Return the coordinate, below 3N, of unknown ``j`` for ``each`` = 3 or 1 (z) unknowns per electrode."""
     if each == 3:
         return int(3 * electrodes[j // 3] + j % 3)
     return int(3 * electrodes[j] + 2)
@@ -111,10 +111,10 @@ def _optimality(jt: Float, r: Float) -> float:
 def correct(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, steps: int,
 ) -> tuple[int, int, int, int, bool]:  # fmt: skip
-    """Iterate from the x of the workspace until wire ``u`` converges or fails.
+    """Iterate from ``x`` in the workspace until wire ``u`` converges or fails.
 
-    ``steps`` is the number of steps taken before. Returns status, evaluations of F, evaluations of J, steps
-    in all, and whether the wire was skipped (see SKIP).
+    ``steps`` is the number of steps already taken. Returns the status, the number of evaluations of F, the
+    number of evaluations of J, the total number of steps, and whether the wire was skipped (see SKIP).
     """
     w: Any = solver.work
     operator, tasks, tol_f, tol_x = options.operator, options.tasks, options.tol_f, options.tol_x
@@ -129,7 +129,7 @@ def correct(  # noqa: PLR0913 - one wire of a call
         w.s[ERROR] = 0.0
         return CONVERGED, evaluations, jacobians, steps, True
     while status < 0:
-        # with the noise known, a minimum is near when less than tol_f is left in the range of J
+        # with known noise, x is at the minimum if the part of r in the range of J is below tol_f
         tol_r = tol_f
         if tall and sigma > 0.0:
             tol_r = min(0.1, tol_f / max(tol_f, w.s[NORM]))
@@ -156,10 +156,10 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     u: int, solver: SolverArrays, options: SolveOptions, a_u: Float, w_u: Float, sigma: float, count: int,
     status: int, skipped: bool,
 ) -> int:  # fmt: skip
-    """Write x, report and measures of wire ``u``, which :func:`correct` left with ``status``.
+    """Write x, report and measures of wire ``u``, for which :func:`correct` returned ``status``.
 
-    ``count`` is its number of equations. Also writes the inverse and what belongs to it if COVARIANCE is
-    among the tasks. Returns the status, ILL_CONDITIONED if the root is too badly determined.
+    ``count`` is the number of equations. If COVARIANCE is among the tasks, also writes the inverse and the
+    arrays that belong to it. Returns ``status``, or ILL_CONDITIONED if the root is too poorly determined.
     """
     w: Any = solver.work
     unknowns, tol_f = w.x.size, options.tol_f
@@ -168,7 +168,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # the correction that proved convergence, for nothing
+        if status == CONVERGED and not skipped:  # the correction that proved convergence is free
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

@@ -1,7 +1,7 @@
-"""From the codes of a scan to the numbers the solver works on, compiled.
+"""Compiled conversion of the codes of a scan to the numbers that the solver uses.
 
-``decode`` turns codes into resistances and their standard deviations, ``scale`` turns resistances into a and
-weights (see ``problem``).
+``decode`` converts codes to resistances and their standard deviations, and ``scale`` converts resistances to
+a and weights (see ``problem``).
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ from skinnode.solve.wires.arrays import FrameArrays
 
 A_MIN: Final = 1e-12
 A_MAX: Final = 1e12
-"""Range of a: at rest a is about 1 / N M, and no resistance is outside."""
+"""Range of usable a; at rest a is about 1 / N M, and no resistance lies outside the range."""
 
 
 @njit_part
 def decode(frame: FrameArrays) -> int:
-    """Write ``ohm``, ``noise`` and ``valid`` from ``codes``; NaN for a code that is no measurement.
+    """Write ``ohm``, ``noise`` and ``valid`` from ``codes``; NaN for an invalid code.
 
-    The noise is that of the front end and of the rounding to codes together. Returns the number of codes
-    that are no measurement.
+    The noise combines that of the front end with the rounding to codes. Returns the number of invalid codes.
     """
     codes, baseline, gain = frame.codes, frame.baseline_ohm, frame.code_gain
     rounding, code_map = frame.rounding_ohm, frame.code_map
@@ -48,7 +47,7 @@ def decode(frame: FrameArrays) -> int:
 def scale(frame: FrameArrays, sigma: float) -> float:
     """Write ``a``, ``weight`` and ``used`` from ``ohm``, ``noise`` and ``valid``.
 
-    Returns σ, the least standard deviation known, or ``sigma`` if none is known.
+    Returns σ, the smallest known standard deviation, or ``sigma`` if none is known.
     """
     frame_ohm, gain, noise, valid = frame.ohm, frame.gain, frame.noise, frame.valid
     a, weight, used = frame.a, frame.weight, frame.used

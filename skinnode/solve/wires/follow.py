@@ -1,8 +1,8 @@
-"""Where a wire went if it did not go far, by the inverse of an earlier position, compiled.
+"""Compiled solver for a wire that moved only a little, using the inverse of an earlier position.
 
-Simplified Newton steps with the old inverse need F alone, and end by the same test as Newton's (Deuflhard,
-Newton methods for nonlinear problems, 2004, 2.1). How fast they contract is how much the inverse has changed
-since, along the way gone; while that is little, the inverse is kept for the standard deviations too.
+Simplified Newton steps with the old inverse need only F, and use the same convergence test as Newton's method
+(Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). Their contraction shows how much the inverse
+has changed along the path; while the change is small, the inverse is also kept for the standard deviations.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
-"""Maximum simplified steps; each costs a fifth of a new inverse."""
+"""Maximum number of simplified steps; each costs a fifth of a new inverse."""
 CONTRACTION: Final = 0.1
-"""Maximum size of a step relative to the one before; a larger one needs a new Jacobian."""
+"""Maximum size of a step relative to the previous step; a larger step needs a new Jacobian."""
 FRESH: Final = 0.01
-"""Maximum size of the first step relative to the prediction for the inverse to be kept."""
+"""Maximum size of the first step, relative to the prediction, at which the inverse is kept."""
 
 
 @njit_part
 def newton_step(inverse: Float, rho: Float, step: Float) -> float:
-    """Write −Σ_k (∂x_j/∂r_k) ρ_k into ``step`` (n,); return its largest element."""
+    """Write −Σ_k (∂x_j/∂r_k) ρ_k into ``step`` (n,); return its largest absolute value."""
     for j in range(step.size):
         row, along = inverse[j], splat(0.0)
         for k in range(0, rho.size, LANES):
@@ -53,9 +53,10 @@ def follow(  # noqa: PLR0913 - arrays of one wire
 ) -> tuple[int, int, float]:  # fmt: skip
     """Take simplified Newton steps of a square system whose unknowns are all coordinates ``x`` (3N,).
 
-    The prediction has ``moved`` x so far. Returns the number of evaluations of F, negative if they led to no
-    root, the number of steps that ``x`` took, and the first step relative to the prediction. A root is
-    ``x`` + ``step``, and ``rho`` (K,) is that of ``x``; without a root ``x`` is the best iterate.
+    ``moved`` is the size of the prediction that led to ``x``. Returns the number of evaluations of F,
+    negative if no root was found, the number of steps added to ``x``, and the size of the first step relative
+    to the prediction. If a root was found, it is ``x`` + ``step``, and ``rho`` (K,) is the residual at ``x``;
+    otherwise ``x`` is the best iterate.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):

@@ -1,16 +1,18 @@
-"""Whether a wire can be left where it is: whether its resistances changed beyond their noise, compiled.
+"""Compiled test of whether a wire can be held because its resistances changed no more than their noise.
 
-ρ_k = a_k F_k(x) − 1 at the last position is known without evaluating F, which the last solve did, and is
-within noise when Σ (ρ_k/σ_k)² is below its 99 % quantile. In ρ the noise of the new frame, variance σ², meets
-the error of x, which is s² = the noise solved into it and lies in the n directions of the range of J. With t
-= s²/σ² the sum has mean K + n t and half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K
-at rest, t = 0), and the quantile is that of the c χ²_ν with the same mean and variance (Satterthwaite 1946).
+The residual ρ_k = a_k F_k(x) − 1 at the last position is known from the last solve, without evaluating F
+again. It is within noise if Σ (ρ_k/σ_k)² is below its 99 % quantile. ρ contains the noise of the new frame,
+with variance σ², and the error of x, which is due to the noise of the frame that x was solved from, with
+variance s², and lies in the n directions of the range of J. With t = s²/σ², the sum has the mean K + n t, and
+half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, t = 0). The quantile is that
+of the c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
-A slow move can hide in that sum, most of all in the direction a wire knows least, one of K. So a held
-coordinate admits it: its correction c = Σ_k (∂x_j/∂r_k) ρ_k is the move and twice its standard deviation, and
-where c² is more than noise, the rest is added. Coverage of the 95 % intervals, staggered h = 0.5, noise 1e-5:
-98 % unmoved (99 % of the frames held), 97 % on a press growing by 5 % of h in 100 to 1600 frames, 96 % on a
-move along the direction known least by 40 standard deviations in 200 or 800 frames; there 86 % without.
+A slow move can hide in that sum, especially if it follows the direction that a wire determines worst, one of
+K. The variance of a held coordinate allows for such a move: its correction c = Σ_k (∂x_j/∂r_k) ρ_k contains
+the move and the noise of both frames, and the excess of c² over that noise is a lower limit of the variance.
+Measured coverage of the 95 % intervals, staggered, h = 0.5, noise 1e-5: 98 % for unmoved wires (99 % of the
+frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96 % for a move by 40
+standard deviations along the worst-determined direction in 200 or 800 frames (86 % without the allowance).
 """
 
 from __future__ import annotations
@@ -23,15 +25,17 @@ from skinnode.compiled.simd import LANES, fma, load, splat, total
 from skinnode.model.layout import Float
 
 Z_HOLD: Final = 2.326
-"""Normal deviate of the 99 % quantile: an unmoved wire is solved for nothing once in a hundred frames."""
+"""Normal quantile for 99 %: an unmoved wire is solved needlessly once in a hundred frames."""
 FRESHER: Final = 2.0
-"""Maximum ratio of the variance solved into x to that of the frame, for a wire to be held."""
+"""Maximum ratio of the noise variance of the frame that x was solved from to that of the current frame, for a
+wire to be held."""
 
 
 def chi2_quantile(dof: float, z: float) -> float:
-    """Return the quantile of χ² at normal deviate ``z`` (Wilson & Hilferty 1931).
+    """Return the χ² quantile that corresponds to the normal quantile ``z`` (Wilson & Hilferty 1931).
 
-    Within 1 % at 99 % from 3 degrees of freedom on, never too small far out.
+    The error is below 1 % at 99 % from 3 degrees of freedom on; the result is never too small in the far
+    tail.
     """
     spread = 2.0 / (9.0 * dof)
     root = 1.0 - spread + z * math.sqrt(spread)
@@ -48,9 +52,10 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
 ) -> float:  # fmt: skip
     """Return the RMS of w ρ if the wire can be held, else −1; write ``std`` (n,) of a held wire's unknowns.
 
-    ``noise`` (K,) is the variance solved into x; ``rho``, ``variance`` and ``before`` (K,) are scratch. The
-    variance of a held coordinate is the largest of three: the noise solved into it, that of the frame which
-    saw it unmoved, and what its correction has beyond both.
+    ``noise`` (K,) is the noise variance of the frame that x was solved from; ``rho``, ``variance`` and
+    ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
+    variance due to that noise, the variance due to the noise of the current frame, and the excess of its
+    squared correction over both.
     """
     count, square, weighted, ratios, squares = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(a.size):

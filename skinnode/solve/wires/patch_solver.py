@@ -1,8 +1,8 @@
-"""The buffers of one patch and the one compiled call that reads and writes them.
+"""Buffers of one patch, and the single compiled call that reads and writes them.
 
-Around the solve of a patch there is work on each frame, before and after (see ``decode`` and ``stages``). One
-call does all of it: a call from Python, its arguments checked and unpacked, costs more than any of these
-steps, most of all with cold caches.
+Each frame needs work before and after its solve (see ``decode`` and ``stages``). One call does all of it,
+because a call from Python, with arguments to check and unpack, costs more than any of these steps, especially
+with cold caches.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.solve_wires import solve_wires
 from skinnode.solve.wires.stages import accept_roots, choose, start, store
 
-# Stages of a call, or-ed together; they run in this order
+# Stages of a call, combined with bitwise or; they run in this order
 DECODE: Final = 1
-"""Codes to resistances."""
+"""Convert codes to resistances."""
 SCALE: Final = 2
-"""Resistances to the units of the problem; the solver starts at the last trusted positions."""
+"""Convert resistances to the units of the problem, and start the solver at the last trusted positions."""
 CHOOSE: Final = 4
-"""What to do with each wire."""
+"""Choose the action for each wire."""
 SOLVE: Final = 8
 ACCEPT: Final = 16
-"""Which wires came to an acceptable root."""
+"""Determine which wires reached an acceptable root."""
 STORE: Final = 32
-"""The outcome; after ACCEPT only if all wires are good."""
+"""Store the outcome; after ACCEPT, only if all wires are good."""
 
-# What a call found, or-ed together
+# Findings of a call, combined with bitwise or
 ALL_GOOD: Final = 1
 INCOMPLETE: Final = 2
 """See :func:`skinnode.solve.wires.stages.store`."""
 
 REST_TOLERANCE: Final = 1e-9
-"""Tolerance at the rest position, which is a root by construction, to rounding."""
+"""Tolerance at the rest position, which is a root by construction, apart from rounding."""
 _NO_FRAME: Final = np.zeros((1, 4), np.int64)
 
 
@@ -68,9 +68,9 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
     sigma: float,
     units: float,
 ) -> tuple[float, float, int, int]:
-    """Run ``stages`` of a frame; arguments as in :func:`solve_wires`.
+    """Run ``stages`` of a frame; the arguments are as in :func:`solve_wires`.
 
-    Returns what the solve cost, σ, how many codes were no measurement, and what was found.
+    Returns the cost of the solve, σ, the number of invalid codes, and the findings.
     """
     solver: SolverArrays = read_solver(solver_table)
     spent, invalid, found = 0.0, 0, 0
@@ -96,12 +96,12 @@ def solve_patch(  # noqa: PLR0913 - numba unpacks a tuple of arguments eight tim
 
 
 class PatchSolver:
-    """The buffers of one patch around :func:`solve_patch`. One owner, no threads.
+    """Buffers of one patch for :func:`solve_patch`. Do not share an instance between owners or threads.
 
     Args:
-        problem: the patch in the units of the solver.
-        operator: number of the operator that solves the rest position and frames.
-        normal_only: only z is unknown.
+        problem: The patch in solver units.
+        operator: Operator code, for the rest position and for frames.
+        normal_only: Whether only z is unknown.
     """
 
     def __init__(self, problem: PatchProblem, operator: int, normal_only: bool = False) -> None:
@@ -110,7 +110,7 @@ class PatchSolver:
         self.problem = problem
         self.operator = operator
         self.x = problem.rest.copy()
-        """(U, 3N) the iterate of each wire, pitches."""
+        """(U, 3N) iterate of each wire, pitches."""
         self.inverse = np.zeros((upper, unknowns, lower))
         self.a_solved = np.ones((upper, lower))
         self.noise = np.zeros((upper, lower))
@@ -119,32 +119,32 @@ class PatchSolver:
         self.report = np.zeros((upper, wires.REPORT), np.int64)
         self.measure = np.zeros((upper, wires.MEASURES))
         self.tally = np.zeros(3, np.int64)
-        """Evaluations of F, of J and steps of all calls since its owner set it to zero."""
+        """Evaluations of F, evaluations of J, and steps since the owner last set this array to zero."""
         self.turn = np.zeros(1, np.int64)
-        """(1,) number of the frame, counted by SCALE: says which wire gets a new inverse, if any is
+        """(1,) frame number, incremented by SCALE; determines which wires get a new inverse if inverses are
         reused."""
         self.still_std = np.full((upper, unknowns), np.inf)
         """(U, 3N) standard deviation of the coordinates that are not unknowns, pitches."""
         self.each = 1 if normal_only else 3
-        """Unknowns an electrode."""
+        """Number of unknowns per electrode."""
         most = unknowns // 3
         self.free = np.full(upper, most)
         """(U,) number of electrodes with unknowns."""
-        self._sizes: list[int] | None = [most]  # of ``free``, None if they have to be looked for
+        self._sizes: list[int] | None = [most]  # distinct values of ``free``; None if outdated
         self._in_turn = np.arange(upper)
         self._electrodes = np.tile(np.arange(most), (upper, 1))
         self._still = np.zeros((upper, lower))
         self._lower = problem.lower.copy()
-        self._arrays: dict[int, SolverArrays] = {}  # by the number of electrodes with unknowns
+        self._arrays: dict[int, SolverArrays] = {}  # keyed by the number of electrodes with unknowns
 
     def electrodes(self, u: int) -> Index:
         """Return the electrodes of wire u that have unknowns."""
         return self._electrodes[u, : self.free[u]]
 
     def set_electrodes(self, u: int, electrodes: Index) -> None:
-        """Give unknowns to these electrodes of wire u only; move the others to rest.
+        """Make only these electrodes of wire u unknowns, and move the others to rest.
 
-        Voids ``inverse`` and all that belongs to it until the next converged solve.
+        This invalidates ``inverse`` and the arrays that belong to it until the next converged solve.
         """
         n = self.problem.layout.unknowns // 3
         rest = np.setdiff1d(np.arange(n), electrodes)
@@ -154,7 +154,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Solve the rest position, for its inverse; return the sign of det J (U,) there, 0 for none."""
+        """Solve the rest position to get its inverse; return the sign of det J (U,), 0 if there is none."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)
@@ -173,19 +173,19 @@ class PatchSolver:
         order: Index | None = None,
         units: float = math.inf,
     ) -> None:
-        """Solve the wires in ``todo`` from :attr:`x` on; write x, std, report and measure.
+        """Solve the wires in ``todo``, starting at :attr:`x`; write x, std, report and measure.
 
         Args:
-            todo: (U,) uint8, LEAVE, SOLVE, PREDICT or HOLD.
+            todo: (U,) uint8, action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
             a: (U, K) resistances in the units of the problem; may be overwritten.
             weight: (U, K) weights of the equations; may be overwritten.
-            options: operator, tasks and tolerances.
-            sigma: standard deviation of a residual of weight 1, 0 if not known.
-            order: (U,) wires in the order in which they have their turn; default 0, 1, 2, …
-            units: time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. A wire that had a
-                turn has TURN 1 in its report.
+            options: Operator, tasks and tolerances.
+            sigma: Standard deviation of a residual of weight 1; 0 if unknown.
+            order: (U,) wires in processing order; the default is 0, 1, 2, …
+            units: Time allowed, as in :func:`skinnode.solve.wires.solve_wires.solve_wires`. A wire that was
+                processed has TURN 1 in its report.
 
-        Raises TypeError if ``todo``, ``a`` or ``weight`` has another element type or shape.
+        Raises TypeError if ``todo``, ``a`` or ``weight`` has the wrong element type or shape.
         """
         shape = self.a_solved.shape
         given = (
@@ -200,7 +200,7 @@ class PatchSolver:
                     f"{np.dtype(dtype)} array of shape {due}"
                 )
         sizes = self._sizes or sorted(set(self.free[todo != wires.LEAVE].tolist()))
-        for size in sizes:  # all the same, unless electrodes are left out
+        for size in sizes:  # only one size, unless electrodes are omitted
             chosen = todo if len(sizes) == 1 else np.where(self.free == size, todo, wires.LEAVE)
             spent, _, _, _ = solve_patch(
                 SOLVE,
@@ -219,9 +219,9 @@ class PatchSolver:
     def advance(
         self, stages: int, frame: FrameArrays, options: SolveOptions, sigma: float, units: float
     ) -> tuple[float, int, int]:
-        """Run ``stages`` of a frame in one call; to solve, all wires must have as many unknowns.
+        """Run ``stages`` of a frame in one call; SOLVE requires equal numbers of unknowns on all wires.
 
-        Returns σ, how many codes were no measurement, and what was found (ALL_GOOD, INCOMPLETE).
+        Returns σ, the number of invalid codes, and the findings (ALL_GOOD, INCOMPLETE).
         """
         _, sigma, invalid, found = solve_patch(
             stages,
@@ -238,7 +238,7 @@ class PatchSolver:
         return sigma, invalid, found
 
     def _table(self, size: int) -> NDArray[np.int64]:
-        """All arrays, with a workspace for wires with so many electrodes with unknowns."""
+        """Return the table of all arrays, with a workspace for wires with unknowns on ``size`` electrodes."""
         if size not in self._arrays:
             lower = self.problem.layout.shape[1]
             self._arrays[size] = SolverArrays(

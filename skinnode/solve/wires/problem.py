@@ -1,10 +1,10 @@
-"""One patch as a set of dimensionless systems, one an upper wire.
+"""Dimensionless form of a patch: one system of equations per upper wire.
 
-Lengths are in pitches and the residual is relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k, so
-that one residual is one share of a resistance, whatever the rubber and the size of the patch. With measured
-rest resistances R₀ the resistivity and the gain of the front end cancel; without, R₀ F₀ is the layout's
-resistivity. w_k = σ_min / σ_k weighs equations of unequal noise (a tall system minimises χ²); 0 drops an
-equation.
+Lengths are in pitches, and residuals are relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k. A
+residual is therefore a fraction of a resistance, regardless of the rubber and the size of the patch. If the
+rest resistances R₀ were measured, the resistivity and the gain of the front end cancel; otherwise R₀ F₀ is
+the layout's resistivity. w_k = σ_min / σ_k weights equations of unequal noise (a tall system minimises χ²); a
+weight of 0 drops an equation.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from skinnode.model.kernels import lower_rows
 from skinnode.model.layout import Float, PatchLayout, require_array
 
 TRUST_SHARE: Final = 0.25
-"""First trust radius as a share of the rest clearance of the electrodes: F is smooth on the scale of the
-distance to the nearest charge, and no live scan moves the skin by more between two frames."""
+"""Initial trust radius as a fraction of the electrodes' clearance at rest: F is smooth on the scale of the
+distance to the nearest charge, and in live scans the skin does not move farther between two frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class PatchProblem:
-    """The constants of a patch in the units of the solver."""
+    """Constants of a patch in solver units."""
 
     layout: PatchLayout
     rest: Float
@@ -41,13 +41,13 @@ class PatchProblem:
     share_at_rest: Float
     """(U, N, K) contribution of each electrode at rest to F."""
     clearance: Float
-    """(U, N) distance of each electrode at rest from the nearest lower one, pitches."""
+    """(U, N) distance of each electrode at rest from the nearest lower electrode, pitches."""
 
     @classmethod
     def of(cls, layout: PatchLayout, baseline_ohm: ArrayLike | None = None) -> PatchProblem:
-        """Scale a patch; ``baseline_ohm`` (U, K) are measured rest resistances, ohm.
+        """Convert a patch to solver units; ``baseline_ohm`` (U, K) are measured rest resistances, ohm.
 
-        Raises ValueError unless the rest resistances are positive.
+        Raises ValueError if a rest resistance is not positive.
         """
         pitch = layout.pitch_m
         rest, lower, potential, share, clearance = _at_rest(layout)
@@ -62,7 +62,7 @@ class PatchProblem:
 
     @property
     def step_limit(self) -> float:
-        """First trust radius, pitches a coordinate."""
+        """Initial trust radius, pitches per coordinate."""
         return TRUST_SHARE * float(self.clearance.min())
 
     def displacement_m(self, x: Float) -> Float:
@@ -72,17 +72,18 @@ class PatchProblem:
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
         """Return the wires (U,) with an electrode farther from rest than its clearance at rest.
 
-        F is the same for electrodes mirrored at the lower layer and for two that changed places; both roots
-        lie that far away, and rubber pressed from outside does not move by more than its own thickness.
+        F does not change if electrodes are mirrored at the lower layer or if two electrodes swap places. Such
+        roots lie out of reach, because rubber pressed from outside does not move by more than its own
+        thickness.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)
         with np.errstate(over="ignore"):
             return np.asarray(((moved**2).sum(axis=-1) > self.clearance**2).any(axis=1))
 
 
-@functools.lru_cache(maxsize=64)  # 2 ms a layout, as long as ten paths of a wire
+@functools.lru_cache(maxsize=64)  # takes 2 ms per layout, as long as ten paths of a wire
 def _at_rest(layout: PatchLayout) -> tuple[Float, Float, Float, Float, Float]:
-    """Return rest, lower, F at rest, shares of F and clearance of a :class:`PatchProblem`, all read-only."""
+    """Return rest, lower, F, share_at_rest and clearance for a :class:`PatchProblem`, all read-only."""
     pitch = layout.pitch_m
     rest = layout.upper_m.reshape(layout.shape[0], -1) / pitch
     gaps = layout.upper_m[:, :, None, :] - layout.lower_m.reshape(1, 1, -1, 3)

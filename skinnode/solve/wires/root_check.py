@@ -1,4 +1,4 @@
-"""Check which of the roots just found may be wrong, compiled."""
+"""Compiled check of a new field for roots that may be wrong."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from skinnode.solve.wires.stages import DEADLINE
 
 Mask = NDArray[np.bool_]
 
-# What the check may find, or-ed together
+# Findings of the check, combined with bitwise or
 SOME_SUSPECT: Final = 1
 SOME_ROUGH: Final = 2
 
 
 class RootCheck(ArrayTable):
-    """The field just solved, the limits it is checked against, and what the check finds."""
+    """Field to check, limits of the check, and findings."""
 
     moved_m: Annotated[Float, "U N 3"]
     """Displacement."""
     last_m: Annotated[Float, "U N 3"]
-    """Displacement of the frame before."""
+    """Displacement in the previous frame."""
     status: Annotated[Index, "U"]
     held: Annotated[Mask, "U"]
     folded: Annotated[Mask, "U"]
     """Wires on which presses run into folds of F."""
     whitening: Annotated[Float, "U N N"]
-    """Inverse of the Cholesky factor of C of one coordinate (see ``Smoothness``)."""
+    """Inverse of the Cholesky factor of one coordinate's C (see ``Smoothness``)."""
     lost: Annotated[Mask, "U"]
-    """Found: wires without a root."""
+    """Output: wires without a root."""
     unsure: Annotated[Mask, "U"]
-    """Found: solved wires that are folded or moved by more than ``jump_m``."""
+    """Output: solved wires that are folded or moved by more than ``jump_m``."""
     rough: Annotated[Mask, "U"]
-    """Found: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
+    """Output: solved wires farther than ``far_m`` from rest and rougher than ``rough_limit``."""
     jump_m: float
     far_m: float
     pitch_m: float
     rough_limit: float
-    """Roughness over the length of the displacement."""
+    """Largest ratio of the roughness of a displacement to its length."""
 
 
 _read = reader(RootCheck)
@@ -52,7 +52,7 @@ _read = reader(RootCheck)
 
 @njit_part
 def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> bool:
-    """Whether √(uᵀ C⁻¹ u) of a displacement (N, 3) is above ``limit`` times its length."""
+    """Return whether √(uᵀ C⁻¹ u) of a displacement (N, 3) exceeds ``limit`` times its length."""
     rough, size = 0.0, 0.0
     for j in range(3):
         for i in range(moved_m.shape[0]):
@@ -68,7 +68,7 @@ def _rougher(moved_m: Float, pitch_m: float, whitening: Float, limit: float) -> 
 def check_roots(table: Index) -> int:
     """Write ``lost``, ``unsure`` and ``rough`` of a :class:`RootCheck` from its other fields.
 
-    Returns SOME_SUSPECT if any wire is lost or unsure and SOME_ROUGH if any is rough, or-ed together.
+    Returns SOME_SUSPECT if any wire is lost or unsure, combined with SOME_ROUGH if any wire is rough.
     """
     check = _read(table)
     moved_m, last_m, status = check.moved_m, check.last_m, check.status

@@ -1,7 +1,7 @@
-"""All upper wires of a patch in one compiled call that holds no GIL and allocates nothing.
+"""Solver for all upper wires of a patch in one compiled call, without the GIL or memory allocation.
 
-Each wire is held where it is (``hold``), followed with the inverse at hand (``follow``), or corrected with an
-operator (``correct``), in that order, until one of the three ends at a root.
+Each wire is held in place (``hold``), followed with its stored inverse (``follow``), or corrected with an
+operator (``correct``); the three methods are tried in this order until one of them yields a root.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of frames in a row for which a followed wire keeps its inverse; wires take turns to renew
+"""Maximum number of consecutive frames for which a followed wire keeps its inverse; wires take turns to renew
 it."""
 COVARIANCE_UNITS: Final = 3.0
-"""Cost of a covariance, in evaluations of F and J with their step, of a square system of 30 unknowns."""
+"""Cost of the covariance of a square system of 30 unknowns, in evaluations of F and J with their step."""
 HELD_UNITS: Final = 0.25
-"""Cost of finding that a wire can be held."""
+"""Cost of determining that a wire can be held, in the same units."""
 
 
 @njit_part
@@ -69,7 +69,7 @@ def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, t
 
 @njit_part
 def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
-    """Move the x of the workspace by (∂x/∂a) (a − a of the last solve); return the largest move."""
+    """Move ``x`` in the workspace by (∂x/∂a) (a − a of the last solve); return the largest move."""
     w: Any = solver.work
     a_solved = solver.a_solved[u]
     for k in range(a.size):
@@ -86,7 +86,7 @@ def _follow(  # noqa: PLR0913 - one wire of a call
 ) -> tuple[int, int, bool]:
     """Follow wire ``u`` after a prediction by ``moved``.
 
-    Returns evaluations of F, steps, and whether the inverse still holds.
+    Returns the number of evaluations of F, the number of steps, and whether the wire keeps its inverse.
     """
     w: Any = solver.work
     evaluations, steps, first = follow(
@@ -121,7 +121,7 @@ def _report_followed(u: int, solver: SolverArrays, a: Float, weight: Float, sigm
 def _solve_wire(  # noqa: C901, PLR0913 - one wire of a call, from start to report
     u: int, todo: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, sigma: float
 ) -> float:
-    """Solve wire ``u``; return what that cost, in evaluations of F and J with their step."""
+    """Solve wire ``u``; return the cost, in evaluations of F and J with their step."""
     w: Any = solver.work
     point, x_u, electrodes = solver.point, solver.x[u], solver.electrodes[u]
     report, measure, std = solver.report[u], solver.measure[u], solver.std[u]
@@ -191,18 +191,18 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
     """Solve r_k = w_k (a_k F_k(x) − 1) = 0 for every upper wire in ``todo``, each from its x in ``solver``.
 
     Args:
-        solver: start and results; ``x`` and ``inverse`` are those of the last converged solve.
-        options: operator, tasks and tolerances.
-        todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
-        a: (U, K); an a out of range is overwritten by 1 and its weight by 0.
-        weight: (U, K); 0 drops an equation.
-        order: (U,) wires in the order in which they have their turn.
-        sigma: standard deviation of a residual of weight 1, 0 if not known.
-        units: time allowed, in evaluations of F and J with their step. A wire that may need more than what is
-            left ends the call.
+        solver: Starting points and results; ``x`` and ``inverse`` come from the last converged solve.
+        options: Operator, tasks and tolerances.
+        todo: (U,) action for each wire: LEAVE, SOLVE, PREDICT or HOLD.
+        a: (U, K) resistances; a value out of range is replaced with 1 and its weight with 0.
+        weight: (U, K) weights; 0 drops an equation.
+        order: (U,) wires in processing order.
+        sigma: Standard deviation of a residual of weight 1; 0 if unknown.
+        units: Time allowed, in evaluations of F and J with their step. The call ends before the first wire
+            that may need more than the remaining time.
 
     Returns the estimated time spent, in the same units. A wire with fewer equations than unknowns keeps its x
-    and is ILL_CONDITIONED, or NON_FINITE if an ``a`` lost its weight.
+    and is ILL_CONDITIONED, or NON_FINITE if a weight was set to 0.
     """
     spent, worst = 0.0, options.max_steps + 1 + COVARIANCE_UNITS
     for u in order:

@@ -1,7 +1,7 @@
-"""The work on a frame before and after its solve, compiled.
+"""Compiled stages of a frame before and after its solve.
 
-``start`` and ``choose`` come before the solve, ``accept_roots`` and ``store`` after it. About thirty NumPy
-calls on 300 numbers each took longer than the solve of a patch at rest.
+``start`` and ``choose`` run before the solve, ``accept_roots`` and ``store`` after it. They replace about
+thirty NumPy calls on 300 numbers each, which took longer than solving a patch at rest.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Maximum ratio between an equation's weight and its weight in the J⁺ of a tall system, for that J⁺ to be
-used again."""
+"""Maximum factor between the weight of an equation and its weight in the J⁺ of a tall system for which that
+J⁺ is reused."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 
 @njit_part
 def start(solver: SolverArrays, frame: FrameArrays) -> None:
-    """Start the solver at the last trusted positions, with every wire reported as not having had its turn."""
+    """Start the solver at the last trusted positions, with every wire reported as unprocessed."""
     x, start_x, std = frame.x, solver.x, solver.std
     report, measure = solver.report, solver.measure
     for u in range(x.shape[0]):
@@ -52,9 +52,10 @@ def _stale(weight: Float, before: Float) -> bool:
 
 @njit_part
 def choose(frame: FrameArrays) -> None:
-    """Write what to do with each wire into ``todo``: ``first`` if the wire can be predicted, else SOLVE.
+    """Write the action for each wire into ``todo``: ``first`` if the wire can be predicted, else SOLVE.
 
-    SOLVE also if J⁺ of a tall system was made for other weights: what it trusted may be noise by now.
+    The action is also SOLVE if the J⁺ of a tall system was computed for different weights, because
+    resistances that it relies on may be noisy by now.
     """
     predictable, unknowns, todo = frame.predictable, frame.unknowns, frame.todo
     used, weight, first = frame.used, frame.weight_solved, frame.first
@@ -66,7 +67,7 @@ def choose(frame: FrameArrays) -> None:
 
 @njit_part
 def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
-    """Whether no electrode is farther from rest than its ``clearance`` (N,)."""
+    """Return whether no electrode is farther from rest than its ``clearance`` (N,)."""
     for i in range(clearance.size):
         square = 0.0
         for j in range(3 * i, 3 * i + 3):
@@ -80,7 +81,7 @@ def _within_reach(x: Float, rest: Float, clearance: Float) -> bool:
 def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
     """Write into ``good`` which wires are at a root on the branch of the rest position and within reach.
 
-    Writes the solver's status of each wire into ``status``. Returns whether all wires are good.
+    Also copies the solver's status of each wire to ``status``. Returns whether all wires are good.
     """
     report, x, rest = solver.report, solver.x, frame.rest
     branch, clearance = frame.rest_branch, frame.clearance
@@ -100,10 +101,10 @@ def accept_roots(solver: SolverArrays, frame: FrameArrays) -> bool:
 
 @njit_part
 def store(solver: SolverArrays, frame: FrameArrays) -> bool:
-    """Store position, a and weights of the wires that were solved; write the outcome of all.
+    """Store position, a and weights of the solved wires; write the outcome of all wires.
 
-    The outcome is displacement, standard deviation and whether the wire was held. Returns whether a solved
-    wire had an equation without weight: its a there is not known yet.
+    The outcome is the displacement, its standard deviation and whether the wire was held. Returns whether a
+    solved wire had an equation without weight, whose ``a`` is therefore still unknown.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

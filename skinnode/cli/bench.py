@@ -36,7 +36,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
         typer.echo(f"{row['what']:28}{row['who']:22}{row['us']:10.1f}{row['ratio']:8.1f}")
     typer.echo(
         "F + J and steps are timed per wire. A step includes its evaluations; the trust radius is so short\n"
-        "that the operator must search for a step within it. LAPACK and BLAS use one thread, as skinnode."
+        "that the operator must search for a step within it. LAPACK and BLAS use one thread, like skinnode."
     )
     _write(json, figures)
     if plot is not None:
@@ -184,7 +184,8 @@ def node(
     for row in figures["handling"]:
         typer.echo(f"{row['what']:30}{row['us']:8.1f}")
     typer.echo(
-        "\nexact pacing is for a board; thrifty pacing, in bursts at the same mean pace, for many nodes.\n"
+        "\nexact pacing is for a board; thrifty pacing is for many nodes on one machine, and sends bursts at\n"
+        "the same mean pace. "
         "The figures include the effect of other work on this machine."
     )
     _write(json, figures)

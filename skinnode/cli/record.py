@@ -51,8 +51,8 @@ def record(
 
     Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command
     is killed, the recording can be read up to the last second. A recording made with --listen has no
-    baselines and thus no fields; it is for can-utils. Exit status 1 if frames could not be written, or for
-    any fault that `skinnode host` reports; 2 if it could not run.
+    baselines and thus no fields; it is for use with can-utils. Exit status 1 if frames could not be written,
+    or for any fault that `skinnode host` reports; 2 if it could not run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal

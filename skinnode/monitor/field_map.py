@@ -193,7 +193,7 @@ def paint_map(
 
 
 def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> dict[tuple[int, int], str]:
-    """Return arrows by column and line, spaced so that a press covers several arrows."""
+    """Return arrows keyed by column and line, spaced so that a press covers several arrows."""
     down = 1 if height < 7 else 2 if height < 18 else 3
     across = 2 * down
     rows, columns = (

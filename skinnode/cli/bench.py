@@ -184,9 +184,8 @@ def node(
     for row in figures["handling"]:
         typer.echo(f"{row['what']:30}{row['us']:8.1f}")
     typer.echo(
-        "\nexact pacing is for a board; thrifty pacing is for many nodes on one machine, and sends bursts at\n"
-        "the same mean pace. "
-        "The figures include the effect of other work on this machine."
+        "\nexact pacing is for a board; thrifty pacing is for many nodes on one machine, with bursts\n"
+        "at the same mean pace. The figures include the effect of other work on this machine."
     )
     _write(json, figures)
 

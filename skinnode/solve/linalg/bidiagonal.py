@@ -1,7 +1,7 @@
 """Bidiagonal form of a small matrix, in which damped steps are cheap for any damping.
 
-Levenberg-Marquardt tries several dampings per Jacobian. Each costs O(n) operations here, but O(n³) with J
-itself.
+Levenberg-Marquardt tries several dampings per Jacobian. Each damping costs O(n) operations here, but O(n³)
+with J itself.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of
     ``a`` (n + 3, whole lanes of m) is A padded with zeros, so that loops over four rows and whole vectors
     need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the
     reflectors I − β v vᵀ of Q to the rows of ``a`` with β in ``across`` (n,); and those of P to the rows of
-    ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch as long as a row of ``a``.
-    Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows for columns).
+    ``left`` (n, whole lanes of n + 3) with β in ``down`` (n,). ``w`` is scratch with the length of a row
+    of ``a``. Squares of the elements must not overflow (Golub & Van Loan, 5.4.8, with rows and columns
+    swapped).
     """
     n, end = diagonal.size, a.shape[1]
     for k in range(n):
@@ -101,15 +102,15 @@ def reflect(rows: Float, beta: Float, k: int, b: Float) -> None:
 def damped_solve(  # noqa: PLR0913 - every result of the decomposition
     diagonal: Float, upper: Float, b: Float, lam: float, inverse: Float, ru: Float, x: Float
 ) -> None:
-    """Solve [B; √lam I] x = [``b``; 0] in the least-squares sense, B from :func:`bidiagonalise`.
+    """Solve [B; √lam I] x = [``b``; 0] in the least-squares sense, with B from :func:`bidiagonalise`.
 
     Uses Givens rotations (Eldén, Algorithms for the regularization of ill-conditioned least squares problems,
     1977).
 
-    R of BᵀB + lam = RᵀR is bidiagonal too. Writes 1 / its diagonal to ``inverse`` (n,) and its superdiagonal
-    to ``ru`` (n,). The squares of lam and B must not both underflow.
+    The factor R in BᵀB + lam I = RᵀR is bidiagonal too. Writes 1 / its diagonal to ``inverse`` (n,) and its
+    superdiagonal to ``ru`` (n,). The squares of lam and B must not both underflow.
     """
-    below, rest = lam, 0.0  # row below row i of B: square of its only element, and its right-hand side
+    below, rest = lam, 0.0  # row below row i of B: square of its single element, and its right-hand side
     for i in range(x.size):
         radius = 1.0 / (diagonal[i] * diagonal[i] + below)
         inverse[i] = math.sqrt(radius)
@@ -125,7 +126,7 @@ def damped_solve(  # noqa: PLR0913 - every result of the decomposition
 
 @njit_part
 def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
-    """Replace ``x`` (n,) with R⁻¹ x; R has 1 / ``inverse`` on and ``upper`` above the diagonal."""
+    """Replace ``x`` (n,) with R⁻¹ x; R has the diagonal 1 / ``inverse`` and the superdiagonal ``upper``."""
     last = 0.0
     for i in range(x.size - 1, -1, -1):
         last = (x[i] - upper[i] * last) * inverse[i]
@@ -134,7 +135,7 @@ def bidiagonal_solve(inverse: Float, upper: Float, x: Float) -> None:
 
 @njit_part
 def bidiagonal_solve_transposed(inverse: Float, upper: Float, x: Float) -> None:
-    """Replace ``x`` (n,) with R⁻ᵀ x, R as in :func:`bidiagonal_solve`."""
+    """Replace ``x`` (n,) with R⁻ᵀ x, with R as in :func:`bidiagonal_solve`."""
     carried = 0.0
     for i in range(x.size):
         value = (x[i] - carried) * inverse[i]

@@ -1,8 +1,8 @@
-"""Dense kernels for a few hundred unknowns: Cholesky, triangular solves, products.
+"""Dense kernels for a few hundred unknowns: Cholesky factorisation, triangular solves, products.
 
 LAPACK is not used because the last bits of OpenBLAS results depend on its number of threads, and equal frames
-must give equal fields. Here each element of a result is one sum in index order, so neither the number of
-threads nor a split of the columns changes it.
+must give equal fields. Here each element of a result is a single sum in index order, which neither the number
+of threads nor a split of the columns changes.
 
 All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs,
 which takes 8 loads per 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix
@@ -22,7 +22,7 @@ from skinnode.compiled.simd import LANES, fma, load, splat, store, total
 from skinnode.model.layout import Float
 
 ROWS: Final = 6
-"""Rows of a tile; with 2 vectors per row, 12 sums, 2 loads and a factor fit the 16 registers of AVX2."""
+"""Rows of a tile; with 2 vectors per row, 12 sums, 2 loads and a factor fit in the 16 registers of AVX2."""
 TILE: Final = 2 * LANES
 """Columns of a tile."""
 
@@ -33,7 +33,7 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 ) -> None:
     """Set ``c``[r:r+rows, tile] to Σ_k ``a``[r:r+rows, k] ``b``[k, tile], low ≤ k < high, or subtract it.
 
-    The tile consists of ``count`` ≤ TILE columns from ``col`` on; rows ≤ ROWS.
+    The tile consists of ``count`` ≤ TILE columns, starting at ``col``; rows ≤ ROWS.
     """
     zero = splat(0.0)
     right = col + LANES
@@ -92,7 +92,7 @@ def _tile(  # noqa: PLR0913 - the bounds of a tile
 def _forward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, low: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻¹ B, after rows low to r."""
+    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻¹ B, given rows low to r."""
     _tile(b, r, rows, l, b, low, r, col, count, True)
     right = col + LANES
     more = count - LANES
@@ -115,7 +115,7 @@ def cholesky(a: Float, n: int) -> int:
 
     Reads only the diagonal and the upper triangle. Returns 1, or 0 if ``a`` is not positive definite.
     """
-    first: Any = np.int64(0)  # a literal 0 would compile the callee once more
+    first: Any = np.int64(0)  # a literal 0 would compile the callee a second time
     for r in range(0, n, ROWS):
         rows = min(ROWS, n - r)
         end = r + rows
@@ -156,7 +156,7 @@ def solve_lower(l: Float, b: Float, n: int, cols: int) -> None:
 def _backward(  # noqa: PLR0913 - the bounds of a tile
     l: Float, b: Float, r: int, rows: int, n: int, col: int, count: int
 ) -> None:
-    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻ᵀ B, after rows r + rows to n."""
+    """Replace rows r to r + rows of a tile of ``b`` with those of L⁻ᵀ B, given rows r + rows to n."""
     _tile(b, r, rows, l, b, r + rows, n, col, count, True)
     right = col + LANES
     more = count - LANES

@@ -1,8 +1,8 @@
 """LU factorisation of a small square matrix, for the Jacobian of one wire.
 
-Hand-written because at 30 unknowns a LAPACK call costs more than the arithmetic, and ``numpy.linalg``
-inside compiled code costs seconds of compile time. Kernels store J as Jᵀ, and Jᵀ is what is factored:
-every inner loop then runs along a contiguous row, and vectorising reorders no sum (Golub & Van
+LAPACK is not used because at 30 unknowns a call costs more than the arithmetic, and ``numpy.linalg`` inside
+compiled code costs seconds of compile time. Kernels store Jᵀ and factor it, so that every inner loop runs
+along a contiguous row and vectorisation reorders no sum (Golub & Van
 Loan, Matrix Computations, 4th ed., 3.4).
 """
 
@@ -18,7 +18,7 @@ from skinnode.solve.linalg.vectors import Index
 
 @njit_part
 def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a time
-    """Factor A (n, n) in place with row exchanges in ``pivot`` (n,); return sign of det A, 0 if singular.
+    """Factor A (n, n) in place with row exchanges in ``pivot`` (n,); return the sign of det A, 0 if singular.
 
     ``a`` (n + 3, whole lanes of n) is A padded with zeros, so that four rows at a time can share loads of the
     pivot row and whole vectors need no special cases at the ends.
@@ -74,7 +74,7 @@ def lu_factor(a: Float, pivot: Index) -> int:  # noqa: C901 - four rows at a tim
 
 @njit_part
 def lu_solve_transposed(lu: Float, pivot: Index, b: Float) -> None:
-    """Solve aᵀ s = b for the ``a`` of :func:`lu_factor`; s replaces ``b`` (n,)."""
+    """Solve Aᵀ s = b for the A of :func:`lu_factor`; s replaces ``b`` (n,)."""
     n = b.size
     for i in range(n):
         row = lu[i]

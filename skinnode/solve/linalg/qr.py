@@ -18,7 +18,8 @@ def qr_factor(jt: Float, a: Float, diagonal: Float, beta: Float, w: Float) -> in
     """Factor J = ``jt``ᵀ (m, n), m ≥ n, by reflectors; return 0 if R has a zero on its diagonal, else 1.
 
     Writes R above the diagonal of ``a`` (m, n), with the diagonal of R in ``diagonal`` (n,), and the
-    reflectors I − β v vᵀ on and below the diagonal, with β in ``beta`` (n,). ``w`` (n,) is scratch.
+    vectors v of the reflectors I − β v vᵀ on and below the diagonal, with β in ``beta`` (n,). ``w`` (n,) is
+    scratch.
     """
     n, m = jt.shape
     for j in range(n):

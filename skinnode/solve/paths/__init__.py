@@ -1,4 +1,4 @@
-"""Offline path following, after Xu et al. 2018: solves the last sample of a press by way of those before.
+"""Offline path following, after Xu et al. 2018: solves the last sample of a press via the earlier samples.
 
 The entry point is ``path``, which solves a recorded press. ``step_control`` chooses the points to solve,
 ``path_tracker`` stores the position of every wire, and ``predictor`` and ``corrector`` move the wires.

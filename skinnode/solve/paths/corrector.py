@@ -1,8 +1,8 @@
 """Corrector of a path tracker: solves wires at positions on a path and logs the cost of each call.
 
 Positions count samples from 0; the rest position is −1. Between two samples ``a`` is interpolated linearly.
-(Interpolating 1/a or log a makes no difference: with layers 0.3 to 1 pitch apart and presses to 70 %, the
-numbers of lost wires differ only by their scatter.)
+(Interpolating 1/a or log a makes no difference: with layers 0.3 to 1 pitch apart and presses of up to 70 %,
+the numbers of lost wires differ only within their scatter.)
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLog:
-    """Cost of each call of a corrector, in S rows; NaN or 0 for a wire that the call skipped."""
+    """Cost of each call of a corrector, in S rows; NaN or 0 if the call skipped the wire."""
 
     position: Float
-    """(S, U) position solved for."""
+    """(S, U) position on the path."""
     steps: Index
     """(S, U) operator steps."""
     evaluations: Index
-    """(S, U) evaluations of F with J."""
+    """(S, U) evaluations of F and J."""
     optimality: Float
     """(S, U) first-order optimality ‖Jᵀr‖∞ at the end of the call."""
 
 
 class Corrector:
-    """Solves the wires of one patch at positions on its path. Not shared between owners.
+    """Solver of one patch's wires at positions on its path. Do not share an instance between owners.
 
     Args:
         problem: The patch.
@@ -87,11 +87,11 @@ class Corrector:
         return PathLog(np.array(position), np.array(steps), np.array(evaluations), np.array(optimality))
 
     def sample_a(self, sample: int) -> Float:
-        """Return R · gain (U, K) of a sample, not to be written."""
+        """Return R · gain (U, K) of a sample; do not write to the array."""
         return np.asarray(self._knots[sample + 1])
 
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
-        """Log the ``evaluations`` (U,) spent on computing starts at the last sample for these wires (U,)."""
+        """Log the ``evaluations`` (U,) used to find starting points of these wires (U,)."""
         nothing = np.full(len(evaluations), math.nan)
         self._rows.append((np.where(wires_, self.last, nothing), evaluations, evaluations, nothing))
 
@@ -120,8 +120,8 @@ class Corrector:
             todo: (U,) LEAVE, SOLVE or PREDICT per wire (:mod:`skinnode.solve.wires.arrays`).
             position: (U,) position of each wire, or one sample for all wires.
             accuracy: Stopping criteria.
-            tasks: Driver tasks, combined with bitwise or.
-            operator: Operator code; default: the operator of the corrector.
+            tasks: Additional tasks, combined with bitwise or.
+            operator: Operator code; the default is the corrector's operator.
         """
         solver = self.solver
         solver.solve(

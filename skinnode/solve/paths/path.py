@@ -1,8 +1,9 @@
-"""Path following as in the paper: solves the last sample of a press by way of the earlier samples.
+"""Path following as in the paper: solves the last sample of a press via the earlier samples.
 
 H(X, t) = F(X) − ρ / R(t); X(0) is the grid at rest, and each sample is solved from the solution of the
 previous sample (Lahaye; Xu et al. 2018, section 3.2). Step control
-(:mod:`skinnode.solve.paths.step_control`) chooses the samples, their tolerance and points between samples.
+(:mod:`skinnode.solve.paths.step_control`) chooses the samples, their tolerance and any points between
+samples.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
 """Accuracy of a solve started from the posterior: the paper's final tolerance, with its maximum number of
 steps for an intermediate sample."""
 STARTS: Final = 12
-"""Number of random starts for the search for other roots if a layout has folds. The starts are drawn from the
-posterior with a fixed seed."""
+"""Number of random starting points in the search for other roots if a layout has folds. They are drawn from
+the posterior with a fixed seed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +46,7 @@ class PathResult:
     """Result at the end of a path, and the cost of each point on it.
 
     Row s of the last four arrays describes solver call s. A wire that the call skipped has a position and an
-    optimality of NaN. Rows after the first one at the last sample are second attempts and checks.
+    optimality of NaN. Rows after the first row at the last sample are second attempts and checks.
     """
 
     upper_m: Float
@@ -60,7 +61,7 @@ class PathResult:
     residual: Float
     """(U,) RMS of F/b − 1 at the end."""
     cycle: int | None
-    """Samples from one solve to the next, if step control found a cycle or was given one."""
+    """Number of samples from one solve to the next, if step control found or was given a cycle."""
     searched: int
     """Number of leading rows spent on the search for the cycle; the path itself follows."""
     position: Float
@@ -68,7 +69,7 @@ class PathResult:
     steps: NDArray[np.int64]
     """(S, U) operator steps; 0 if the sample was skipped."""
     evaluations: NDArray[np.int64]
-    """(S, U) evaluations of F with J."""
+    """(S, U) evaluations of F and J."""
     optimality: Float
     """(S, U) first-order optimality ‖Jᵀr‖∞ of the dimensionless problem at the end of the call."""
     stats: SolveStats
@@ -85,9 +86,9 @@ def solve_path(
 ) -> PathResult:
     """Follow a press from the rest position to its last sample.
 
-    A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b that the skin is
-    not on: the determinant of its Jacobian changed sign on the way, its electrodes crossed to the other side
-    of the lower layer, or an equally smooth root lies across a nearby fold. The skin itself can pass a fold.
+    A wire is ILL_CONDITIONED instead of CONVERGED if it may have ended on a branch of F = b other than the
+    skin's: the determinant of its Jacobian changed sign on the way, its electrodes crossed to the other side
+    of the lower layer, or an equally smooth root lies across a nearby fold. The skin itself can cross a fold.
     A root across a fold is accepted if the path led there and the posterior of the patch finds the same root.
 
     Args:
@@ -147,7 +148,7 @@ def solve_path(
 def _ask_posterior(
     tracker: PathTracker, layout: PatchLayout, last_ohm: Float, baseline_ohm: ArrayLike | None
 ) -> PatchEstimate | None:
-    """Select the roots of the last sample by the posterior; return its estimate, None if untrusted."""
+    """Select the roots of the last sample with the posterior; return its estimate, or None if untrusted."""
     patch = Posterior(layout, relative_noise=roots.REFEREE_NOISE, baseline_ohm=baseline_ohm, hold=False)
     field = patch.update(last_ohm)
     if not field.trusted:

@@ -1,4 +1,4 @@
-"""Path tracker: stores each wire's position along a press and moves it by predictor and corrector.
+"""Path tracker: stores each wire's position along a press and moves it with a predictor and a corrector.
 
 Lahaye's method solves all wires sample by sample (:meth:`PathTracker.solve`); adaptive step control advances
 each wire separately (:meth:`PathTracker.step`). The schedule chooses between them
@@ -65,7 +65,7 @@ class PathEnd:
 
 
 class PathTracker:
-    """Follows the samples of one press. Not shared between owners.
+    """Tracker of the wires along the samples of one press. Do not share an instance between owners.
 
     Args:
         problem: The patch.
@@ -74,10 +74,10 @@ class PathTracker:
 
     Attributes:
         end: Outcome at the last sample, after :meth:`finish`.
-        cycle: Samples from one solve to the next, if step control found a cycle or was given one.
+        cycle: Number of samples from one solve to the next, if step control found or was given a cycle.
         searched: Number of leading log rows spent on the search for the cycle.
-        second_tries: Whether a wire may be moved off the end of its path; if not, only its status changes.
-        stumbled: (U,) wires of which at least one step was undone.
+        second_tries: Whether a wire may move away from the end of its path; if not, only its status changes.
+        stumbled: (U,) wires with at least one undone step.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -146,7 +146,7 @@ class PathTracker:
         return np.asarray(self.solver.report[:, wires.STEPS].copy())
 
     def finish(self, accuracy: Accuracy, todo: Mask | None = None) -> None:
-        """Solve the last sample to the final accuracy, on the wires in ``todo`` (U,); default all wires."""
+        """Solve the last sample to the final accuracy, for the wires in ``todo`` (U,), by default all."""
         todo = np.ones(self.wires, bool) if todo is None else todo
         self.take(todo, accuracy)
         self._path_end = self.solver.x.copy()
@@ -186,7 +186,7 @@ class PathTracker:
         operator: int | None = None,
         also: Callable[[], Mask] | None = None,
     ) -> None:
-        """Solve the last sample on the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
+        """Solve the last sample for the wires in ``todo`` (U,), and store the outcome in :attr:`end`.
 
         A root across a fold is ILL_CONDITIONED unless ``also`` returns True for its wire.
         """
@@ -202,7 +202,7 @@ class PathTracker:
         end.inverse[todo] = solver.inverse[todo]
 
     def try_root(self, todo: Mask, accuracy: Accuracy) -> None:
-        """Solve the last sample on the wires in ``todo`` (U,) without changing :attr:`end`."""
+        """Solve the last sample for the wires in ``todo`` (U,) without changing :attr:`end`."""
         call = np.where(todo, wires.SOLVE, wires.LEAVE).astype(np.uint8)
         self.corrector.correct(call, self.corrector.last, accuracy, operator=op.LEVENBERG_MARQUARDT)
 

@@ -34,7 +34,7 @@ def euler(x: Float, inverse: Float, a_solved: Float, a: Float) -> Float:
 def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the limit and the output
     x_before: Float, a_before: Float, x: Float, a: Float, a_next: Float, reach: float, out: Float
 ) -> None:
-    """Predict positions on the secant through the last two solved points.
+    """Predict positions along the secant through the last two solved points.
 
     The last move is scaled by the projection of the next relative change of ``a`` onto the last one. A wire
     whose prediction is not finite stays at ``x``.

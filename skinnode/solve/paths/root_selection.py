@@ -23,9 +23,9 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum steps from a guided start: a start near a root takes 1 to 20 steps, other starts never arrive."""
+"""Maximum steps from a guided start: a start near a root takes 1 to 20 steps, others never converge."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of a root that is only compared with another: below √eps two roots differ by far more."""
+"""Accuracy of a root that is only compared with another root: distinct roots differ by far more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,15 +43,15 @@ class PatchEstimate:
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return the wires (U,) that have no root, have a root too rough for a press, or had a step undone."""
+    """Return the wires (U,) that have no root, a root too rough for a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again from the smoothest displacement that explains it; keep the smoother root.
 
-    If that leads to a root across a fold, the twin of that root on the near side is solved for. A wire for
-    which neither solve finds a root is not CONVERGED afterwards.
+    If that leads to a root across a fold, the function solves for the twin of that root on the near side. A
+    wire for which neither solve finds a root is not CONVERGED afterwards.
 
     Args:
         tracker: Tracker at the end of its path.
@@ -129,12 +129,13 @@ def keep_likeliest(
 ) -> None:
     """Search for other roots from the twins and from ``starts``, and keep the likeliest root.
 
-    A root is CONVERGED only if no other comes within ``unlikely`` of its energy.
+    A root is CONVERGED only if no other root comes within ``unlikely`` of its energy.
 
     Args:
-        tracker: At the end of its path.
-        starts: (S, U, n) positions, pitches.
-        energy: −2 log of the density of a displacement field (U, n), pitches, up to a constant.
+        tracker: Tracker at the end of its path.
+        starts: (S, U, n) starting positions, pitches.
+        energy: Function that returns −2 log of the density of a displacement field (U, n), pitches, up to a
+            constant.
         unlikely: (U,) energy difference above which a less likely root is ruled out.
         accuracy: Accuracy of the root that is kept.
     """

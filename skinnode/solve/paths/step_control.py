@@ -25,12 +25,12 @@ MISS: Final = 0.2
 """Target distance between the corrected and the predicted point, in initial trust radii."""
 SHRINK: Final = 0.5
 GROW: Final = 4.0
-"""Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1: factor 2 to 4)."""
+"""Largest growth factor of the step length per step (Allgower & Georg 1990, section 6.1, use 2 to 4)."""
 SHORTEST: Final = 1 / 64
-"""Shortest step as a fraction of the path; at a fold, halving would never end."""
+"""Shortest step as a fraction of the path; at a fold, halving would otherwise never end."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
-"""Accuracy of an intermediate point: below √eps a root is accurate enough to keep its ∂X/∂R, and Newton takes
-5 steps from a contraction of 1/2 to 1e-9."""
+"""Accuracy of an intermediate point: below √eps a root is accurate enough to keep its ∂X/∂R, and Newton's
+method takes 5 steps from a contraction of 1/2 to 1e-9."""
 
 
 class Schedule(Protocol):
@@ -48,13 +48,13 @@ class Uniform:
     The other defaults follow the paper's protocol (section 4).
 
     Args:
-        steps: Number of samples to solve; default all. All samples are solved if there are fewer.
+        steps: Number of samples to solve; by default, or if there are fewer samples, all are solved.
         plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
             each wire where the last sample put it. Otherwise each sample starts on the secant through the
             last two solutions, and a wire with no root or a rough root is solved again from the smoothest
-            displacement that explains the last sample. On staggered, h = 1, with 10 samples of 21 presses of
-            50 %, the secant alone loses no wire of 197 instead of 7, with 2.9 evaluations per sample
-            instead of 4.
+            displacement that explains the last sample. On staggered, h = 1, with 10 samples of each of 21
+            presses of 50 %, the secant alone loses none of 197 wires instead of 7, with 2.9 evaluations per
+            sample instead of 4.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -93,14 +93,14 @@ class Periodic:
     """Schedule that solves one sample per cycle T (section 5.2).
 
     Between two solves the tracked point stays within the relaxed tolerance, so the samples in between add
-    nothing.
+    no information.
 
-    The cycle is found on the samples themselves. The samples are followed from the rest position at 1e-6,
-    1e-5, …, skipping each sample whose first-order optimality is below the tolerance. When the solves have a
-    period, T is the median number of samples from one solve to the next, on the wire that needs the most
-    solves. The path then starts again and solves every T-th sample at that tolerance, and always the last
-    sample. If no tolerance shows a cycle of at least two samples that occurs at least twice, every sample is
-    solved at 1e-6.
+    The cycle is determined from the samples themselves. The samples are followed from the rest position at
+    1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If the solves
+    have a period, T is the median number of samples from one solve to the next, on the wire that needs the
+    most solves. The path then starts again and solves every T-th sample at that tolerance, and always the
+    last sample. If no tolerance shows a cycle of at least two samples that occurs at least twice, every
+    sample is solved at 1e-6.
 
     The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value here,
     where r = a F − 1 in pitches. F depends on the unit of length, which the paper does not state.
@@ -108,8 +108,8 @@ class Periodic:
     Args:
         cycle: T, if known from an earlier press of the same size and rate; skips the search.
         plain: As in :class:`Uniform`. The search is always plain, since the cycle is a property of Lahaye's
-            start.
-        intermediate_tolerance: Tolerance if ``cycle`` is given; default the paper's 1e-4.
+            starting points.
+        intermediate_tolerance: Tolerance if ``cycle`` is given; the default is the paper's 1e-4.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
         final_steps: Maximum operator steps at the last sample.
@@ -131,7 +131,7 @@ class Periodic:
         _require(self, "intermediate_tolerance", "final_tolerance", "intermediate_steps", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Find the cycle, return to the rest position, and solve at the end of each cycle."""
+        """Find the cycle, return to the rest position, and solve the sample at the end of each cycle."""
         tracker.cycle, tolerance = self.cycle, self.intermediate_tolerance
         if tracker.cycle is None:
             tracker.cycle, tolerance = self._search(tracker)
@@ -146,7 +146,7 @@ class Periodic:
         _finish(tracker, self)
 
     def _search(self, tracker: PathTracker) -> tuple[int | None, float]:
-        """Return the cycle, None if not found, and the tolerance that shows it."""
+        """Return the cycle, or None if there is none, and the tolerance at which it occurs."""
         for tolerance in RELAXED_TOLERANCES:
             tracker.restart()
             accuracy = Accuracy(tolerance, self.intermediate_steps)
@@ -163,7 +163,7 @@ def shortest_cycle(solved: NDArray[np.bool_]) -> int | None:
     """Return the median number of samples between solves of the wire that is solved most often.
 
     Args:
-        solved: (T, U) whether a sample was solved on a wire.
+        solved: (T, U) whether a wire was solved at a sample.
 
     Returns:
         The cycle, in samples; None if no wire has two cycles.
@@ -179,15 +179,15 @@ class Adaptive:
     """Schedule that solves as few points per wire as it can, interpolating R between samples.
 
     Each wire has its own step length and takes an Euler step along ∂X/∂R from the factors of the last
-    Jacobian, then operator steps. The next step length is chosen to keep Newton's contraction: Euler's error
-    grows with its square (Deuflhard 2004, section 5.1.3), and F is smooth on the scale of the clearance
-    between the layers. A step that does not reach a root on the branch of the rest position is undone and
-    halved.
+    Jacobian, then operator steps. The next step length is chosen to maintain Newton's contraction: Euler's
+    error grows with the square of the step length (Deuflhard 2004, section 5.1.3), and F is smooth on the
+    scale of the clearance between the layers. A step that does not reach a root on the branch of the rest
+    position is undone and halved.
 
     A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
     meet. A wire that gets stuck there, or arrives at a root too rough for a press, is solved by
-    Levenberg-Marquardt, whatever the operator, from the smoothest displacement that explains the last sample
-    (:func:`skinnode.solve.starts.guided_start`), and keeps the smoother of the two roots.
+    Levenberg-Marquardt, regardless of the operator, from the smoothest displacement that explains the last
+    sample (:func:`skinnode.solve.starts.guided_start`), and keeps the smoother of the two roots.
 
     Two samples are enough: the patch at rest and the frame to solve.
 

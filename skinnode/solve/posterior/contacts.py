@@ -25,16 +25,16 @@ from skinnode.solve.posterior.map_estimate import PRIOR_DOUBT
 from skinnode.solve.posterior.prior import ElasticPrior
 
 SIGNIFICANT: Final = 5.0
-"""Significance, in standard deviations, that a sum needs to be part of a contact: with 200 sums per frame,
+"""Significance, in standard deviations, above which a sum is part of a contact; with 200 sums per frame,
 noise reaches it about once in ten thousand frames."""
 RELEVANT: Final = 0.25
-"""Fraction of the largest sum that another sum must exceed; ringing beside a contact reaches a tenth."""
+"""Fraction of the largest sum that another sum must exceed; ringing next to a contact reaches a tenth."""
 HERTZ_SPREAD: Final = 2.5
 """Ratio of a² to the mean of r² under Hertz's pressure √(1 − r²/a²)."""
 
 
 class ContactFinder:
-    """Finds the contacts of one patch, frame by frame.
+    """Finder of the contacts of one patch, frame by frame.
 
     Args:
         prior: Elasticity of the patch.
@@ -50,7 +50,7 @@ class ContactFinder:
         near = np.pad(np.arange(cells).reshape(prior.shape), 1, constant_values=-1)
         rows, columns = prior.shape
         box = np.stack([near[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=-1)
-        self._near: Index = box.reshape(cells, 9)  # a cell and its neighbours, −1 beyond the lattice
+        self._near: Index = box.reshape(cells, 9)  # each cell with its neighbours; −1 outside the lattice
         self._region, self._label, self._stack = np.empty((3, cells), np.int64)
         self._made_by = -1
         self._box_std = np.full(cells, np.nan)
@@ -79,11 +79,11 @@ class ContactFinder:
         return force.reshape(self._electrodes), tuple(found)
 
     def warm_up(self, posterior: LoadPosterior) -> None:
-        """Compile the kernels that contacts need."""
+        """Compile the kernels that contact finding needs."""
         self._contact(np.arange(1), np.full((len(self._near), 3), -1.0), posterior)
 
     def _deviations(self, boxes: Index, posterior: LoadPosterior) -> Float:
-        """Return the standard deviations (B,) of these sums, cached per set of factors."""
+        """Return the standard deviations (B,) of the sums at ``boxes`` (B,), cached per set of factors."""
         if self._made_by != posterior.factors:
             self._made_by = posterior.factors
             self._box_std[:] = np.nan
@@ -94,7 +94,7 @@ class ContactFinder:
         return self._box_std[boxes]
 
     def _contact(self, region: Index, q: Float, posterior: LoadPosterior) -> Contact | None:
-        """Return the contact on the cells ``region``, None if they do not press."""
+        """Return the contact on the cells ``region``, or None if their total normal force does not press."""
         loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
         centroid, shear = np.empty((2, 3))
         force, spread = _sum_region(
@@ -102,9 +102,9 @@ class ContactFinder:
         )
         if not force > 0:
             return None
-        # mostly the prior decides how a contact's load is spread over its cells
+        # the prior largely determines how a contact's load is distributed over its cells
         std = math.sqrt(PRIOR_DOUBT) * posterior.std(loads, weights)
-        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load spread evenly over its cell
+        spread += self._prior.cell_area_m2 / 6.0  # mean r² of a load that is uniform over its cell
         return Contact(
             centroid_m=centroid,
             centroid_std_m=std[1:4],

@@ -1,7 +1,7 @@
-"""Gating: χ² tests for wires that moved and for wires that no deformation explains.
+"""Gating: χ² tests for wires that moved and for wires whose resistances no deformation explains.
 
-A wire is tested on the χ² of its residuals and on each of its coordinates separately, because χ² alone
-overlooks an electrode that moved by 7 standard deviations.
+Each wire is tested by the χ² of its residuals and also by each of its coordinates separately, because χ²
+alone overlooks an electrode that moved by 7 standard deviations.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
 """Apparent move of a single coordinate, in standard deviations, at which its wire counts as moved; noise
-alone causes it in one of 15 unmoved frames of 300 coordinates."""
+alone causes such a move in one of 15 unmoved frames with 300 coordinates."""
 KEPT: Final = 50
-"""Number of frames for which the equations of a wire stay in use after a move that the others missed."""
+"""Number of frames for which a wire's equations stay in use after a move that the other wires missed."""
 
 
 class Fit(NamedTuple):
@@ -30,13 +30,13 @@ class Fit(NamedTuple):
     chi_squared: Float
     """(U,) χ² of each wire."""
     sharpest: Float
-    """(U,) largest error of a single coordinate, in its standard deviations."""
+    """(U,) largest apparent error of a single coordinate, in standard deviations."""
     move: Float
     """(U, f) size of the move that fits the wire best if only this coordinate moves, pitches."""
 
 
 class Gate:
-    """χ² tests of one patch, with the list of wires that they keep in the estimate.
+    """χ² tests of one patch, with the list of wires kept in the estimate.
 
     Args:
         wires: Number of upper wires.
@@ -62,7 +62,7 @@ class Gate:
         self._kept[wires] = KEPT
 
     def moved(self, fit: Fit, count: Index, noises: float | Float = 1.0) -> NDArray[np.bool_]:
-        """Return the wires (U,) whose residuals are beyond noise.
+        """Return the wires (U,) whose residuals exceed their noise.
 
         Args:
             fit: Misfit of the tested displacement.
@@ -91,7 +91,7 @@ class Gate:
         return np.flatnonzero(touched)
 
     def excess(self, fit: Fit, count: Index) -> Float:
-        """Return χ² of each wire (U,), relative to the χ² above which the model cannot hold."""
+        """Return χ² of each wire (U,), relative to the limit above which the model is rejected."""
         return np.asarray(fit.chi_squared / self._impossible[count])
 
 

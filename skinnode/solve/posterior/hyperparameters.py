@@ -1,4 +1,4 @@
-"""Hyperparameters of the posterior: scale s of the prior, expected places of loads, and noise.
+"""Hyperparameters of the posterior: scale s of the prior, expected load locations, and noise.
 
 All are set from the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
 """
@@ -18,9 +18,9 @@ from skinnode.solve.posterior.map_estimate import MapEstimator
 from skinnode.solve.posterior.observation import Observation
 
 SCALE_WORTH: Final = 2.0
-"""Weight of the prior of s², in directions; the data determine 100 to 200 directions."""
+"""Weight of the prior of s², as a number of directions; the data determine 100 to 200 directions."""
 SCALE_REST: Final = 0.005
-"""Scale that the prior of s² expects, in clearances: typical of presses to a tenth of the layer."""
+"""Scale that the prior of s² expects, in clearances: typical of presses by a tenth of the layer."""
 SCALE_MOST: Final = 1.0
 """Largest scale, in clearances; above it the surface would lie below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)
@@ -29,11 +29,11 @@ SCALE_LEAST: Final = 1.0
 """Smallest scale, relative to that of a field that on average changes the resistances by their noise. A
 smaller field would go unnoticed, so the standard deviations of an untouched patch must allow for it."""
 ADAPTIONS: Final = 5
-"""Maximum updates of the prior or the noise per frame."""
+"""Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3
-"""Maximum updates of the expected places of loads per frame; each costs as much as two solves."""
+"""Maximum number of updates of the expected load locations per frame; each costs as much as two solves."""
 NOISE_WORTH: Final = 20.0
-"""Weight of the configured noise when the noise is estimated, in resistances."""
+"""Weight of the configured noise in the noise estimate, as a number of resistances."""
 NOISE_STEP: Final = math.log(1.1)
 """Logarithm of the noise change that triggers an update."""
 
@@ -42,12 +42,12 @@ Observe = Callable[[float], Observation]
 
 
 class Hyperparameters:
-    """Scale, expected places of loads and noise of one patch. Not shared between owners.
+    """Scale, expected load locations and noise of one patch. Do not share an instance between owners.
 
     Args:
         estimator: Estimator of the patch.
         clearance: Median clearance, pitches.
-        scale2: s² if fixed, pitch².
+        scale2: s², pitch², if it is fixed; otherwise None.
         estimate_noise: Whether the noise is estimated.
 
     Attributes:
@@ -68,7 +68,7 @@ class Hyperparameters:
         self.noise_factor = 1.0
 
     def reset(self) -> None:
-        """Forget the stream, and reset the estimator."""
+        """Discard the state of the stream, and reset the estimator."""
         self._estimator.reset(self._fixed or self._expected)
         self.noise_factor = 1.0
         self._least = self._expected
@@ -81,13 +81,13 @@ class Hyperparameters:
         self._least = min(least, self._most)
 
     def spread(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads all over the patch, then set the scale that the frame suggests."""
+        """Expect equal loads all over the patch, then set the scale suggested by the frame."""
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads all over the patch, at the scale that the frame suggests under the old prior."""
+        """Expect equal loads all over the patch, at the scale that the frame suggests with the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 
@@ -100,7 +100,7 @@ class Hyperparameters:
             observation: The frame.
             observe: Function that returns the observation of the frame for another noise factor.
             members: Wires of the estimate.
-            local: Whether to set the expected places of loads too.
+            local: Whether to set the expected load locations too.
 
         Returns:
             The observation at the estimated noise.
@@ -135,7 +135,7 @@ class Hyperparameters:
         return observation
 
     def _set_scale(self, *, local: bool, refine: bool) -> bool:
-        """Set scale and places of loads from the evidence; return whether they changed."""
+        """Set the scale and the load locations from the evidence; return whether they changed."""
         prior, changed = self._prior, False
         if local:
             variance = np.minimum(self.loads.expected(self._least), self._most)

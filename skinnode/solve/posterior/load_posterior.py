@@ -19,8 +19,9 @@ LOCAL_SIGNIFICANT: Final = 4.0
 """Squared significance at which a load counts as found, in standard deviations squared."""
 LOCAL_CERTAIN: Final = 100.0
 """Squared significance at which a press is certain, in standard deviations squared. At 25, with high noise,
-the first places found are unreliable and errors are 1 % larger. From 1000 on, half of a press is still
-expected all over the patch on layouts with low sensitivity (`aligned`), which costs 14 %."""
+the first locations found are unreliable and errors are 1 % larger. From 1000 on, on layouts with low
+sensitivity (`aligned`), half of a press is still expected all over the patch, which increases errors by 14
+%."""
 
 
 class LoadPosterior:
@@ -35,7 +36,7 @@ class LoadPosterior:
         loads = self._prior.response.shape[1]
         self._whitened = np.empty((estimator.equations, loads))
         self._stiffness = np.empty(loads)
-        self._factors = -1  # the factors for which the last two were computed
+        self._factors = -1  # the factors from which the last two arrays were computed
 
     @property
     def factors(self) -> int:
@@ -66,9 +67,9 @@ class LoadPosterior:
     def expected(self, least: float) -> Float:
         """Return the load variances (Q,), pitch², implied by the loads found; at least ``least``.
 
-        Without its own prior, a load has the estimate q / s² k and the variance 1/k − s², where k is what a
-        unit of the load adds to χ² (Tipping and Faul, Fast marginal likelihood maximisation for sparse
-        Bayesian models, 2003).
+        Without its own prior, a load has the estimate q / s² k and the variance 1/k − s², where k is the
+        increase of χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for
+        sparse Bayesian models, 2003).
         """
         prior = self._prior
         found = np.empty(len(prior.share))
@@ -78,7 +79,7 @@ class LoadPosterior:
         return prior.expected(found, least, certain=most > LOCAL_CERTAIN)
 
     def _whiten(self) -> Float:
-        """Return L⁻¹ J G (m, 3Q) by the current factors; also updates k of each load."""
+        """Return L⁻¹ J G (m, 3Q) for the current factors; also updates k of each load."""
         rows = self._whitened[: self._estimator.factored_rows]
         if self._factors != self._estimator.factors:
             self._factors = self._estimator.factors
@@ -106,7 +107,7 @@ def _squares(whitened: Float, loads: Index, weights: Float, out: Float) -> None:
 
 @njit
 def _found(q: Float, own: Float, stiffness: Float, significant: float, found: Float) -> float:
-    """Write the largest squared load of each cell, without its own prior, into ``found`` (Q,).
+    """Write the largest squared load of each cell, estimated without its own prior, into ``found`` (Q,).
 
     Loads that are not significant count as 0. ``q`` (Q, 3) are the loads, ``own`` (Q,) their prior variances
     and ``stiffness`` (3Q,) their k. Returns the largest ratio of a squared load to its noise variance.

@@ -1,10 +1,10 @@
-"""Prior of the loads on a patch and of the displacement that they cause.
+"""Prior of the loads on a patch and of the displacement caused by them.
 
 At first, equal loads are expected all over the patch, at one scale s². Once loads are found, the prior
-expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin beside a contact
-moves only as the loads of the contact require. Compared with one scale for the whole patch, this reduces the
-error by a factor of two to three, and the error of a narrow contact no longer exceeds the reported standard
-deviation.
+expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin next to a contact
+moves only as far as the loads of the contact require. Compared with one scale for the whole patch, this
+reduces the error by a factor of two to three, and the error of a narrow contact no longer exceeds the
+reported standard deviation.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from skinnode.solve.posterior.prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation, in cells, of the Gaussian that spreads the squared loads found over neighbouring cells.
-A smaller value trusts single cells, which is better for contacts on rubber that matches the prior and
-overconfident for others; 1 loses a quarter of the gain."""
+A smaller value relies on single cells, which is better for contacts on rubber that matches the prior but
+overconfident for others; a value of 1 loses a quarter of the gain."""
 LOCAL_FLOOR: Final = 0.05
-"""Mean square load expected where none was found, relative to the mean; allows light touches near a press."""
+"""Mean square load expected in cells without a load found, relative to the mean over the patch; allows for
+light touches near a press."""
 LOCAL_CHANGE: Final = 0.35
 """Fraction of the expected loads that must move elsewhere before the prior is rebuilt. At 0.5, errors in a
-slow press reach 6 standard deviations; at 0.25, twice as many frames pay for a rebuild."""
+slow press reach 6 standard deviations; at 0.25, twice as many frames need a rebuild."""
 LOCAL_SURPRISE: Final = 16.0
-"""Ratio of the squared load of a cell to its expected square above which the prior is rebuilt however little
+"""Ratio of the squared load of a cell to its expected square above which the prior is rebuilt even if little
 moved elsewhere. Without this limit, a press twice as deep as in the last frame was 7 standard deviations off
-after an unusual motion that left little to expect. At 16 it is free: slow presses factorise as many frames as
-without it."""
+after an unusual motion that left small expected loads. A value of 16 costs nothing: slow presses need a
+factorisation in as many frames as without the limit."""
 
 
 class LoadPrior:
@@ -53,7 +54,7 @@ class LoadPrior:
         covariance: (U f, U f) C.
         uniform: (U f, U f) C if equal loads are expected all over the patch.
         response: (U f, 3Q) displacement caused by unit loads, pitches.
-        version: Number of times that C was rebuilt.
+        version: Number of times C has been rebuilt.
     """
 
     def __init__(self, elastic: ElasticPrior, free: Index) -> None:
@@ -65,7 +66,7 @@ class LoadPrior:
         self.scale2 = 1.0
         self.share = np.ones(len(self._blur))
         self.version = 0
-        self._loads: tuple[Float, Float] | None = None  # displacement, and loads by the current covariance
+        self._loads: tuple[Float, Float] | None = None  # displacement and its loads
 
     def spread(self, scale2: float) -> None:
         """Expect equal loads all over the patch, at scale s²."""
@@ -81,7 +82,7 @@ class LoadPrior:
             variance: (Q,) variance of the loads of each cell, pitch².
 
         Returns:
-            False, with the prior unchanged, if hardly any load is expected elsewhere.
+            False, with the prior unchanged, if hardly any of the expected load moved elsewhere.
         """
         mean = float(variance.mean())
         share = variance / mean
@@ -98,9 +99,9 @@ class LoadPrior:
     def expected(self, found: Float, least: float, *, certain: bool) -> Float:
         """Return the variances (Q,), pitch², implied by the loads found; at least ``least``.
 
-        The variances move halfway from their current values to the implied values, because with a full step
-        neighbouring cells would alternate. The full step is taken from equal loads all over the patch if a
-        press is certain.
+        The variances move halfway from their current values to the implied values, because with full steps
+        neighbouring cells would alternate. If a press is certain and equal loads were expected all over the
+        patch, the full step is taken.
 
         Args:
             found: (Q,) squared loads found.

@@ -1,11 +1,12 @@
 """MAP estimate of one frame: Gauss-Newton, chord steps, and annealing for large jumps.
 
-chord     starts at the last field with the factors of an older frame; typically two evaluations of F and J
+chord     starts at the last field with the factors of an older frame; typically needs two evaluations of F
+          and J
 newton    computes new factors at the current field, then takes chord steps
 anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
           its true value. At high noise the posterior has a single maximum, near that of the prior, and
-          following it leads to the right one: presses of 70 % of the layer between two frames are solved, on
-          layouts where the exact inversion goes wrong even along the samples of the press.
+          following it leads to the correct maximum. This solves presses of 70 % of the layer between two
+          frames, on layouts where the exact inverse goes wrong even along the samples of the press.
 """
 
 from __future__ import annotations
@@ -30,32 +31,34 @@ from skinnode.solve.wires.problem import PatchProblem
 ANNEAL_NOISE: Final = 0.03
 """Initial relative noise of annealing, at which one Gauss-Newton step from rest gets close to the maximum."""
 ANNEAL_RATIO: Final = 4.0
-"""Ratio of the noise of one annealing step to that of the next. On staggered and aligned, h = 0.5 and 1, with
-presses to 70 % from rest, a ratio of 3 brings 80 of 80 to the right maximum and a ratio of 5 brings 79."""
+"""Ratio of the noise of one annealing step to that of the next. For presses of up to 70 % from rest on
+staggered and aligned, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 of 80 cases, a ratio of
+5 in 79."""
 SETTLED: Final = 0.02
 """RMS of a correction, relative to the RMS standard deviation, at which chord steps stop."""
 CHORDS: Final = 4
 """Maximum number of chord steps per set of factors."""
 CHORD_RATE: Final = 0.35
-"""Contraction of chord steps above which new factors are cheaper; they cost ten chord steps."""
+"""Contraction of chord steps above which new factors are cheaper; they cost as much as ten chord steps."""
 NEWTONS: Final = 12
-"""Maximum factorisations of a solve that starts near the maximum: typically one or two, more if full steps
-would cycle."""
+"""Maximum number of factorisations of a solve that starts near the maximum; it typically needs one or two, or
+more if full steps would cycle."""
 HALVINGS: Final = 6
-"""Maximum halvings of a Gauss-Newton step."""
+"""Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
 """Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
-expected load at a place is only known to within a factor. At 1, the hidden part of a first touch is 5 to 7
-standard deviations off in one wire of 20 000, and so are dents that no half-space makes. At 2, one of 12 000
-coordinates of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
+expected load at a location is known only to within a factor. At 1, the hidden part of a first touch is 5 to 7
+standard deviations off in one of 20 000 wires, and so are dents that a half-space cannot have. At 2, one of
+12 000 coordinates of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds
+5."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than bodies:
-the measured errors contain 0.0 to 0.13 of that variance for spheres and 0.02 to 0.5 for Gaussian dents.
-The tail of the error distribution sets the standard deviation, its centre sets the interval."""
+"""Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than real
+bodies: the measured errors contain 0.0 to 0.13 of that variance for spheres and 0.02 to 0.5 for Gaussian
+dents. The tail of the error distribution determines the standard deviation, and its centre the interval."""
 
 
 class MapEstimator:
-    """Displacement, nuisances and last factors of one patch's MAP estimate. Not shared between owners.
+    """Displacement, nuisances and last factors of one patch's MAP estimate. Do not share between owners.
 
     Args:
         problem: The patch.
@@ -67,14 +70,14 @@ class MapEstimator:
         load_prior: Prior of the loads and of the displacement.
         moved: (U, 3N) displacement, pitches; fixed coordinates stay 0.
         g: (p,) nuisances.
-        std: (U, f) standard deviations by the last factors, pitches.
+        std: (U, f) standard deviations from the last factors, pitches.
         core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
         noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
         members: Wires whose equations are in the factors.
         factors: Number of the current factors.
-        evaluations: Evaluations of F with J since the owner set it to 0.
-        factorisations: Factorisations since the owner set it to 0.
-        until: Time of :func:`time.perf_counter` after which a solve raises TimeoutError.
+        evaluations: Number of evaluations of F and J since the owner set it to 0.
+        factorisations: Number of factorisations since the owner set it to 0.
+        until: Value of :func:`time.perf_counter` after which a solve raises TimeoutError.
     """
 
     def __init__(self, problem: PatchProblem, elastic: ElasticPrior, free: Index, nuisances: int) -> None:
@@ -115,7 +118,7 @@ class MapEstimator:
         return self.members.size * self._rows
 
     def reset(self, scale2: float) -> None:
-        """Return to rest, forget everything, and expect loads everywhere at scale s², pitch²."""
+        """Return to rest, discard the factors, and expect loads everywhere at scale s², pitch²."""
         self.moved[:] = 0.0
         self.g[:] = 0.0
         self.forget_factors()
@@ -150,7 +153,7 @@ class MapEstimator:
         return False
 
     def anneal(self, observation: Observation, members: Index) -> bool:
-        """Solve from rest, with a noise that falls from :data:`ANNEAL_NOISE` to its true value.
+        """Solve from rest, lowering the noise from :data:`ANNEAL_NOISE` to its true value.
 
         Returns:
             False if a step failed.
@@ -174,7 +177,7 @@ class MapEstimator:
         Discards the factors.
         """
         self.until = least = math.inf
-        for _ in range(3):  # the first run may wait for memory
+        for _ in range(3):  # the first run may include memory allocation
             start = perf_counter()
             self._newton(observation, self._every)
             self._measure(observation)
@@ -190,7 +193,7 @@ class MapEstimator:
         return self._b.r.copy()
 
     def fit(self, observation: Observation, moved: Float | None) -> Fit:
-        """Return the misfit of a displacement (U, 3N), pitches, to a frame; None means at rest."""
+        """Return the misfit of a displacement (U, 3N), pitches, to a frame; None means the rest position."""
         if moved is None:
             self._linearise_at_rest(observation)
         else:
@@ -225,7 +228,7 @@ class MapEstimator:
         return np.asarray(self.load_prior.scale2 * self.load_prior.covariance - explained)
 
     def whiten(self, response: Float, out: Float) -> None:
-        """Write L⁻¹ J G into ``out`` (m, C) for a response G (U f, C), by the current factors."""
+        """Write L⁻¹ J G into ``out`` (m, C) for a response G (U f, C), with the current factors."""
         b, f, rows = self._b, self._free.size, self._rows
         for i, u in enumerate(self.members.tolist()):
             block = slice(i * rows, (i + 1) * rows)
@@ -244,7 +247,7 @@ class MapEstimator:
         return np.asarray(np.einsum("uik,uij,ujk->uk", slopes, own, slopes))
 
     def guess_scale(self, observation: Observation, members: Index) -> float:
-        """Return the s², pitch², at which the expected deviation of R from rest matches the measured one."""
+        """Return the s², pitch², at which the expected deviation of R from rest matches the measurement."""
         self._linearise_at_rest(observation)
         trace = self._assemble(observation, members, 1.0, np.zeros_like(self.moved))
         square = float((self._b.r[members] ** 2).sum())
@@ -271,12 +274,12 @@ class MapEstimator:
     # -- steps -----------------------------------------------------------------------------------------
 
     def _square(self, observation: Observation, members: Index, moved: Float, g: Float) -> float:
-        """Σ (r − H g)² of these wires."""
+        """Return Σ (r − H g)² over these wires."""
         x, o = self._problem.rest + moved, observation
         return kernels.residuals(members, x, self._problem.lower, o.a, o.weight, o.h, g, self._b.r)
 
     def _fits(self, observation: Observation, members: Index) -> bool:
-        """Whether the factors at hand were made for these wires, noise and prior."""
+        """Return whether the current factors were computed for these wires, noise and prior."""
         if self._factored is None:
             return False
         weight, scale2, version = self._factored
@@ -284,7 +287,7 @@ class MapEstimator:
         if version != prior.version or scale2 != prior.scale2 or not np.array_equal(members, self.members):
             return False
         new, old = observation.weight[members], weight[members]
-        return bool((np.abs(new - old) <= 0.1 * old).all())  # False for a resistance lost or found
+        return bool((np.abs(new - old) <= 0.1 * old).all())  # False if a resistance was lost or regained
 
     def _linearise(self, observation: Observation, moved: Float, members: Index | None = None) -> None:
         if self.until < math.inf and perf_counter() > self.until:
@@ -296,7 +299,7 @@ class MapEstimator:
         self.evaluations += members.size
 
     def _linearise_at_rest(self, observation: Observation) -> None:
-        """Linearise all wires at rest, where F and J are stored."""
+        """Linearise all wires at rest, using the stored F and J."""
         b = self._b
         b.r[:], b.jt[:] = self._at_rest
         kernels.weigh(self._every, observation.a, observation.weight, b.r, b.jt)

@@ -3,7 +3,7 @@
 The update works in data space, like that of a Kalman filter.
 
 The unknowns are the free coordinates x of all electrodes, with the prior x ~ N(0, s² C), and a few nuisances
-g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, its model
+g ~ N(0, diag(d)). A wire's residual is r = w (a F(x) − 1) with w = 1/σ, and its model is
 
     r(x) − H g = noise of variance 1,      H = effect of a unit of each nuisance on r
 
@@ -14,18 +14,18 @@ With J = ∂r/∂x, block-diagonal over wires, one Gauss-Newton step from x is
 with S the innovation covariance, s² J C the cross-covariance and K = s² C Jᵀ S⁻¹ the Kalman gain,
 
 and the covariance at x⁺ is s² C − Vᵀ V with V = L⁻¹ (s² J C), L Lᵀ = S (Tarantola, Inverse Problem Theory,
-2005, 3.4). No eigenvalue of S is below 1, so rounding errors are at most ε ‖S‖ standard deviations: one
-thousandth for signals of 10⁶ σ, whatever the condition number of J.
+2005, 3.4). No eigenvalue of S is below 1, so rounding errors are at most ε ‖S‖ standard deviations, i.e. one
+thousandth for signals of 10⁶ σ, regardless of the condition number of J.
 
-Steps with the factors of an older J converge to the same point. At the maximum of the posterior
-e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish, and with the old J, H, S
+Steps with the factors of an older J converge to the same point. At the maximum of the posterior,
+e_x = −s² C Jᵀ (r − H g) − x and e_g = d Hᵀ (r − H g) − g vanish. With the old J, H and S,
 
     δ = e − (s² C Jᵀ; −d Hᵀ) S⁻¹ (J e_x − H e_g)
 
 is the Newton correction, here called a chord step, which costs two triangular solves.
 
-A wire with more equations than unknowns is first reduced by a QR of [J H] to one equation per unknown,
-without loss of information.
+A wire with more equations than unknowns is first reduced, by a QR decomposition of [J H], to one equation per
+unknown without loss of information.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from skinnode.solve.linalg.vectors import Index, dot
 
 
 class Buffers(NamedTuple):
-    """Arrays that a step of one patch writes to.
+    """Arrays written by a step of one patch.
 
-    U wires with K equations and f free coordinates each, p nuisances, R = min(K, f + p) rows per wire after
-    reduction.
+    A patch has U wires with K equations and f free coordinates each, p nuisances, and R = min(K, f + p) rows
+    per wire after reduction.
     """
 
     r: Float
@@ -68,7 +68,7 @@ class Buffers(NamedTuple):
     y: Float
     """(U R,) J x − r."""
     cross_covariance: Float
-    """(U R, U f) s² J C, between the data and the displacement."""
+    """(U R, U f) s² J C, the covariance of the data with the displacement."""
     innovation_covariance: Float
     """(U R, U R) S, then its Cholesky factor L."""
     whitened: Float
@@ -115,14 +115,14 @@ def make_buffers(wires: int, equations: int, coordinates: int, free: int, nuisan
 def linearise(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, lower: Float, a: Float, weight: Float, r: Float, jt: Float
 ) -> None:
-    """Write r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) of the wires ``members`` (P,)."""
+    """Write r = w (a F − 1) and its transposed Jacobian at ``x`` (U, 3N) for the wires ``members`` (P,)."""
     potentials(members, x, lower, r, jt)
     weigh(members, a, weight, r, jt)
 
 
 @njit
 def potentials(members: Index, x: Float, lower: Float, f: Float, jt: Float) -> None:
-    """Write F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N) of the wires ``members``."""
+    """Write F (U, K) and its transposed Jacobian (U, 3N, K) at ``x`` (U, 3N) for the wires ``members``."""
     for i in range(members.size):
         u = members[i]
         potential_jacobian(x[u], lower, f[u], jt[u])
@@ -146,7 +146,7 @@ def weigh(members: Index, a: Float, weight: Float, r: Float, jt: Float) -> None:
 def residuals(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, x: Float, lower: Float, a: Float, weight: Float, h: Float, g: Float, r: Float
 ) -> float:
-    """Write r − H g with r = w (a F − 1) of the wires ``members`` (P,) into ``r`` (U, K); return Σ r²."""
+    """Write r − H g, r = w (a F − 1), for the wires ``members`` (P,) into ``r`` (U, K); return its Σ r²."""
     square = 0.0
     for i in range(members.size):
         u = members[i]
@@ -192,7 +192,7 @@ def measure_fit(  # noqa: PLR0913 - a kernel: arrays by name
 def _reduce(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
     u: int, top: int, free: Index, h: Float, x: Float, b: Buffers
 ) -> None:
-    """Write J, H and y of wire ``u`` into the rows from ``top`` on, reduced to at most f + p rows."""
+    """Write J, H and y of wire ``u``, reduced to at most f + p rows, into the rows from ``top`` on."""
     f, p = free.size, h.shape[2]
     equations = h.shape[1]
     y = b.e
@@ -276,7 +276,7 @@ def assemble(  # noqa: PLR0913, C901 - a kernel: arrays by name, sums as loops
 def gauss_newton_step(  # noqa: PLR0913 - a kernel: arrays by name
     members: Index, free: Index, d: Float, x: Float, g: Float, b: Buffers
 ) -> None:
-    """Write the result of a Gauss-Newton step to ``x`` (U, 3N) and ``g`` (p,); the buffer of S holds L."""
+    """Write the result of a Gauss-Newton step to ``x`` (U, 3N) and ``g`` (p,); S must have been factored."""
     f = free.size
     rows = b.jacobian.shape[0] // x.shape[0]
     m = members.size * rows

@@ -2,7 +2,7 @@
 
 A wire's residual is r = w (a F(x) − 1) with w = 1/σ. The model is r(x) − H g = noise of variance 1, with a
 few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), and an error of the
-forward model in proportion to the change of each resistance.
+forward model that is proportional to the change of each resistance.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ class Readings:
     """Resistances of one frame in the units of the problem."""
 
     a: Float
-    """(U, K) R · gain; the value at rest for a resistance that is not usable."""
+    """(U, K) R · gain; the value at rest for an unusable resistance."""
     noise: Float
-    """(U, K) standard deviation relative to R."""
+    """(U, K) relative standard deviation of R."""
     usable: NDArray[np.bool_]
-    """(U, K) whether a resistance is used."""
+    """(U, K) whether the resistance is usable."""
 
     def without(self, wires: list[int]) -> Readings:
-        """Return a copy in which the readings of ``wires`` are not usable."""
+        """Return a copy that marks the readings of ``wires`` as unusable."""
         usable = self.usable.copy()
         usable[wires] = False
         return Readings(self.a, self.noise, usable)
@@ -57,11 +57,11 @@ class Observation:
 
 
 class ObservationModel:
-    """Converts readings to observations.
+    """Conversion of readings to observations.
 
     Args:
         problem: The patch.
-        drift: ``none``, ``patch`` (one gain error) or ``wire`` (one per upper wire).
+        drift: ``none``, ``patch`` (one gain error) or ``wire`` (one gain error per upper wire).
         drift_std: Prior standard deviation of a gain error.
         model_error: Standard error of the forward model, as a fraction of the change of each resistance.
 

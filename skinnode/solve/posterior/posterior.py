@@ -4,9 +4,9 @@ gate      use the equations of wires whose resistances differ from those at rest
 hold      if the last field explains the whole frame within noise, solve nothing
 track     take chord or Gauss-Newton steps from the last field; after a jump, anneal from rest
           (``map_estimate``)
-adapt     set the prior's scale, the places of loads and, on request, the noise from the evidence
-reject    mark a wire whose residual no deformation explains INCONSISTENT, leave it out and solve the others
-          again
+adapt     set the prior's scale, the load locations and, on request, the noise from the evidence
+reject    mark a wire as INCONSISTENT if no deformation explains its residual, leave it out, and solve the
+          others again
 """
 
 from __future__ import annotations
@@ -37,31 +37,32 @@ from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
 """Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. A smaller noise
-forces the field onto a root of F = b, which can be a wrong root; on layouts with folds this happens already
+forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this already happens
 below ten times this noise."""
 LEFT_OUT: Final = 3
-"""Maximum number of wires to leave out in turn before the whole frame is INCONSISTENT."""
+"""Maximum number of wires to leave out, one after another, before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
-"""Least time of a solve from rest, as a number of factorisations of all wires including standard deviations;
-11 to 20 were measured for presses on 1 to 10 wires."""
+"""Minimum time of a solve from rest, in factorisations of all wires including standard deviations; 11 to 20
+were measured for presses on 1 to 10 wires."""
 
 Mask = NDArray[np.bool_]
 
 
 class Posterior:
-    """Estimates the displacement, loads and contacts of one patch, frame by frame.
+    """Estimator of the displacement, loads and contacts of one patch, frame by frame.
 
-    Not shared between owners. Compiled code releases the GIL. The constructor compiles the kernels.
+    Do not share an instance between owners. Compiled code releases the GIL. The constructor compiles the
+    kernels.
 
     Args:
         layout: The patch, with any number of lower wires.
-        options: Options of the estimate; default :class:`skinnode.solve.options.PosteriorOptions()`.
+        options: Options of the estimate; the default is :class:`skinnode.solve.options.PosteriorOptions()`.
         **arguments: Options by name, which override ``options``.
 
     Attributes:
         layout: The patch.
         options: Options in effect.
-        from_rest_s: Least time of a touched frame solved from rest, s; 0 without a deadline.
+        from_rest_s: Minimum time to solve a touched frame from rest, s; 0 without a deadline.
 
     Raises:
         ValueError: If an option has the wrong shape or is out of range.
@@ -110,17 +111,17 @@ class Posterior:
         seconds, self._seconds = self._seconds, math.inf  # a deadline could skip kernels
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compile it now, not on the first frame without a touch
+        self._estimator.gamma()  # compiles it now, not on the first frame without a touch
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads)
 
     def reset(self) -> None:
-        """Forget the stream: the next frame is solved from the rest position."""
+        """Discard the state of the stream: the next frame is solved from the rest position."""
         wires = self.layout.shape[0]
         self._hyper.reset()
         self._gate.reset()
         self._members: Index = np.arange(0)
-        self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field, then its nuisances
+        self._trusted = np.zeros_like(self._estimator.moved)  # last accepted field; its nuisances follow
         self._trusted_g = np.zeros_like(self._estimator.g)
         self._contacts_found: tuple[Contact, ...] = ()
         self._force = np.zeros((*self.layout.upper_m.shape,))
@@ -137,15 +138,15 @@ class Posterior:
         """Estimate the displacement field, loads and contacts of one frame.
 
         No resistance value raises an exception. A wire without usable resistances is estimated from its
-        neighbours, with a larger standard deviation. A wire that no deformation explains is INCONSISTENT and
-        left out of the estimate. A wire that does not converge even on its own is MAX_STEPS and also left
-        out. If the whole frame cannot be solved, the last trusted field is held with an infinite standard
-        deviation.
+        neighbours, with a larger standard deviation. A wire whose resistances no deformation explains is
+        INCONSISTENT and left out of the estimate. A wire that does not converge even on its own gets the
+        status MAX_STEPS and is also left out. If the whole frame cannot be solved, the last trusted field is
+        held with an infinite standard deviation.
 
         Args:
             frame_ohm: (U, K) resistances, ohm; values that are not positive and finite are ignored.
             valid: (U, K) bool, False if a chunk or wire is missing; default all True.
-            relative_noise: A number or (U, K), noise of this frame only. Resistances whose noise is not
+            relative_noise: Noise of this frame only, a number or (U, K). Resistances whose noise is not
                 positive and finite are ignored.
 
         Returns:
@@ -171,12 +172,12 @@ class Posterior:
             except TimeoutError:
                 known = self._known
                 status, held = self._give_up(Status.DEADLINE)
-                self._known = known  # the next frame starts where this one did
+                self._known = known  # the next frame starts where this frame did
             observation = self._observe(readings)
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:
-        """Set the time of :func:`time.perf_counter` at which the next updates stop; inf for no limit."""
+        """Set the :func:`time.perf_counter` value at which the next updates stop; inf for no limit."""
         self._until = until
 
     def covariance_m2(self) -> Float:
@@ -199,7 +200,7 @@ class Posterior:
         return full
 
     def energy(self, moved: Float) -> float:
-        """Return uᵀ (s² C)⁻¹ u, −2 log of the last frame's prior density up to a constant.
+        """Return uᵀ (s² C)⁻¹ u, which is −2 log of the last frame's prior density up to a constant.
 
         Args:
             moved: (U, 3N) displacement, pitches.
@@ -235,7 +236,7 @@ class Posterior:
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):
-            return False  # with other resistances, the field has another uncertainty
+            return False  # with different resistances, the uncertainty of the field differs
         if self._beyond_prior(observation, roots.SUSPICIOUS):
             return False
         noises = np.ones(len(self._wires))
@@ -245,14 +246,14 @@ class Posterior:
         return not self._gate.moved(fit, observation.count, noises).any()
 
     def _solve(self, observation: Observation, readings: Readings) -> tuple[NDArray[np.int64], Mask]:
-        """Solve a frame; return statuses (U,) and held wires (U,). Updates the trusted field on success."""
+        """Solve a frame; return statuses (U,) and held wires (U,). On success, update the trusted field."""
         if not readings.usable.any():
             return self._give_up(Status.ILL_CONDITIONED)
         status = np.full(len(self._wires), int(Status.CONVERGED))
         self._gate.next_frame()
         at_rest = self._estimator.fit(observation, None)
         touched = self._gate.touched(at_rest, observation.count, self._members)
-        # only all wires together can show that nothing touches
+        # only all wires together can show that nothing touches the patch
         wanted = touched if self.options.hold and touched.size else self._wires
         seen = readings.usable
         for _ in range(LEFT_OUT + 3):
@@ -283,7 +284,7 @@ class Posterior:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Return and keep the wires outside ``wanted`` that contradict the field of the others."""
+        """Return and keep the wires outside ``wanted`` that contradict the field of the other wires."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)
@@ -302,7 +303,7 @@ class Posterior:
         self._members, self._known, self._seen = members, True, seen
         held = np.ones(len(status), bool)
         held[members] = False
-        held &= seen.any(axis=1)  # the frame says nothing about a wire without resistances
+        held &= seen.any(axis=1)  # the frame contains no information on a wire without resistances
         return status, held
 
     def _give_up(self, status: Status) -> tuple[NDArray[np.int64], Mask]:
@@ -314,12 +315,12 @@ class Posterior:
     # -- finding the maximum ---------------------------------------------------------------------------
 
     def _converge(self, observation: Observation, members: Index) -> bool:
-        """Solve from the last trusted field, or else by annealing from rest."""
+        """Solve from the last trusted field or, if that fails, by annealing from rest."""
         estimator = self._estimator
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
         self._annealed = False
-        hurry = self._seconds < math.inf  # annealing takes several frames' worth of time
+        hurry = self._seconds < math.inf  # annealing takes as long as several frames
         if (self._known or hurry) and estimator.track(observation, members):
             gone = float(np.abs(estimator.moved - self._compared).max())
             far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)
@@ -350,7 +351,7 @@ class Posterior:
     def _refine(
         self, observation: Observation, readings: Readings, members: Index, *, local: bool
     ) -> Observation:
-        """Adapt the hyperparameters; if the layout has folds, to the likelier of two maxima.
+        """Adapt the hyperparameters and, if the layout has folds, select the likelier of two maxima.
 
         The prior that expects loads everywhere may have led to a wrong maximum. The field is therefore
         annealed again with loads expected where they were found, and replaced if the new field is likelier
@@ -381,7 +382,7 @@ class Posterior:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # at least half of the move that the gate may overlook
+        if held.all():  # allow for half of the move that the gate may overlook
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

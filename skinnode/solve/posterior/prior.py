@@ -1,4 +1,4 @@
-"""Elastic prior: the displacement expected of the rubber before any resistance is read.
+"""Elastic prior: the displacement of the rubber that is expected before any resistance is read.
 
 Each electrode site lies in a cell one pitch wide. Independent surface loads on the cells displace the
 electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;
@@ -28,12 +28,13 @@ from skinnode.model.layout import Float, PatchLayout
 from skinnode.solve.linalg.cholesky import multiply
 
 MARGIN: Final = 2
-"""Rings of cells beyond the outermost electrodes. A third and a fourth ring change the evidence of Hertz
-presses, on the patch or half off it, by less than 1 in 800."""
+"""Number of rings of cells beyond the outermost electrodes. A third and a fourth ring change the evidence of
+Hertz presses, on the patch or half outside it, by less than 1 in 800."""
 SHEAR_SHARE: Final = 0.4
 """Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
-coefficient of 0.6 is at 1.5 standard deviations. From 0.25 to 0.4 the evidence changes by 2 %. With smaller
-ratios, layouts that are insensitive to shear (`aligned`) report too small standard deviations."""
+coefficient of 0.6 is at 1.5 standard deviations. The evidence changes by 2 % between 0.25 and 0.4. With
+smaller ratios, layouts that are insensitive to shear (`aligned`) report standard deviations that are too
+small."""
 SLACK: Final = 0.005
 """Ratio of ε to the standard deviation of the normal displacement; keeps C regular. Values from 0.001 to 0.02
 give the same results."""
@@ -41,14 +42,14 @@ give the same results."""
 
 @dataclass(frozen=True, eq=False)
 class ElasticPrior:
-    """Prior of one layout for s = 1; the median standard deviation of normal displacement is 1 pitch."""
+    """Prior of one layout for s = 1; the median standard deviation of the normal displacement is 1 pitch."""
 
     covariance: Float
     """(3UN, 3UN) C, pitch²."""
     response: Float
     """(3UN, 3Q) displacement per load, pitches; loads have a standard deviation of 1 at s = 1."""
     load_n: Float
-    """(3,) force of a load of 1 along the wire, across it and along the normal, N."""
+    """(3,) force of a unit load along the wire, across the wire and along the normal, N."""
     cell_m: Float
     """(Q, 3) centres of the cells, m."""
     frame: Float

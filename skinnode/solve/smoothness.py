@@ -18,8 +18,8 @@ from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
 """Correlation length ℓ, pitches. At 1.0, the guided start finds 3204 of the 3209 wires that are on the branch
-of the rest position in 82 random presses each of 70 % on staggered, h = 0.5, and of 10, 30 and 50 % on
-staggered, h = 1; values of 0.7 and 1.5 find fewer."""
+of the rest position in 82 random presses each of 70 % on the staggered layout, h = 0.5, and of 10, 30
+and 50 % at h = 1; values of 0.7 and 1.5 find fewer."""
 ROUGH_SHARE: Final = 1e-3
 """Relative increase of the diagonal of C, so that C⁻¹ exists in floating point."""
 

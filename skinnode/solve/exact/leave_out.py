@@ -10,9 +10,9 @@ range of the unknowns and of the electrode's other columns‖.
 
 Both options are assumptions about the skin, and the standard deviations of the unknowns are valid only if the
 assumption is. χ² tests the assumption of active_only well. It tests that of normal_only less well, because a
-smooth shear resembles a gradient of z. On staggered, h = 0.5, noise 1e-5, a strong Hertzian press with a
-shear of 0.3 of its depth is rejected; a weaker press is accepted with errors in z of up to 16 of its small
-standard deviations, or 0.2 % of h. Allowing for this would cost more than solving for the shear.
+smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong Hertzian press
+with a shear of 0.3 of its depth is rejected; a weaker press is accepted with errors in z of up to 16 of its
+small standard deviations, or 0.2 % of h. Allowing for this would cost more than solving for the shear.
 """
 
 from __future__ import annotations

@@ -21,9 +21,10 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps of successive bridges. On staggered, h = 0.5, from rest, 3 substeps solve every wire if
-a 50 % press occurs between two frames, and 5 solve all but one of 24 at 70 %. Adaptive steps restricted to
-the trusted branch do worse, because the straight line crosses singular points that the press avoids."""
+"""Number of substeps of successive bridges. On the staggered layout, h = 0.5, from rest, 3 substeps solve
+every wire if a 50 % press occurs between two frames, and 5 solve all but one of 24 at 70 %. Adaptive steps
+restricted to the trusted branch do worse, because the straight line crosses singular points that the press
+avoids."""
 BRIDGE_TOLERANCE: Final = 1e-6
 """Tolerance of bridge substeps: the paper's intermediate tolerance."""
 BRIDGE_STEPS: Final = 20

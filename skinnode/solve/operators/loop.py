@@ -134,7 +134,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Return whether ``r_trial``, with the norm ``norm``, is explained by rounding of x."""
+    """Return whether rounding of x explains ``r_trial``, whose norm is ``norm``."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)

@@ -32,8 +32,8 @@ ANNEAL_NOISE: Final = 0.03
 """Initial relative noise of annealing, at which one Gauss-Newton step from rest gets close to the maximum."""
 ANNEAL_RATIO: Final = 4.0
 """Ratio of the noise of one annealing step to that of the next. For presses of up to 70 % from rest on
-staggered and aligned, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 of 80 cases, a ratio of
-5 in 79."""
+the staggered and aligned layouts, h = 0.5 and 1, a ratio of 3 leads to the correct maximum in 80 of 80 cases,
+a ratio of 5 in 79."""
 SETTLED: Final = 0.02
 """RMS of a correction, relative to the RMS standard deviation, at which chord steps stop."""
 CHORDS: Final = 4

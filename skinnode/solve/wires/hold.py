@@ -10,8 +10,8 @@ of the c χ²_ν with the same mean and variance (Satterthwaite 1946).
 A slow move can hide in that sum, especially if it follows the direction that a wire determines worst, one of
 K. The variance of a held coordinate allows for such a move: its correction c = Σ_k (∂x_j/∂r_k) ρ_k contains
 the move and the noise of both frames, and the excess of c² over that noise is a lower limit of the variance.
-Measured coverage of the 95 % intervals, staggered, h = 0.5, noise 1e-5: 98 % for unmoved wires (99 % of the
-frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96 % for a move by 40
+Measured coverage of the 95 % intervals (staggered layout, h = 0.5, noise 1e-5): 98 % for unmoved wires (99 %
+of the frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96 % for a move by 40
 standard deviations along the worst-determined direction in 200 or 800 frames (86 % without the allowance).
 """
 

@@ -52,7 +52,7 @@ class PlannedFrame:
     count: int
     """Number of frames per period."""
     spacing_s: float
-    """Minimum time between two of these frames, s."""
+    """Minimum time between two frames of a period, s."""
     jitter_s: float
     """Maximum deviation from the spacing, s."""
     worst_s: float
@@ -191,8 +191,8 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
         hand: the hand.
 
     Raises:
-        ConfigError: if the wire format cannot carry a patch, or another device's frame uses an identifier of
-            the hand.
+        ConfigError: if the wire format cannot carry a patch, or a frame of another device uses an identifier
+            of the hand.
     """
     profiles = {patch.name: _profile(hand, i, patch) for i, patch in enumerate(hand.patches)}
     return tuple(
@@ -225,7 +225,7 @@ def _plan_of_bus(hand: HandConfig, i: int, bus: BusConfig, profiles: dict[str, P
     for patch in patches:
         frames += _of_a_patch(hand, bus, patch, profiles[patch.name])
     ours = {frame.can_id: frame.name for frame in frames}
-    for patch in patches:  # identifiers of every node, although the plan counts SDO only once
+    for patch in patches:  # the plan counts SDO only once, but the identifiers of every node are in use
         ours |= {
             od.command_cob_id(patch.node_id): f"commands to {patch.name}",
             od.sdo_response_cob_id(patch.node_id): f"SDO answers of {patch.name}",
@@ -334,7 +334,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Return the scan time; its worst case adds SYNC, node latency, chunk pacing, last chunk and summary."""
+    """Return the scan time; the worst case includes SYNC, node latency, pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

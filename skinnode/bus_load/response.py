@@ -60,7 +60,7 @@ class Message:
         return burst * self.period_ns + number * self.spacing_ns
 
     def most_in(self, window_ns: int) -> int:
-        """Return the maximum number of instances queued in a half-open window of this length."""
+        """Return the maximum number of instances queued in a half-open window of length ``window_ns``."""
         bursts, rest_ns = divmod(window_ns + self.jitter_ns, self.period_ns)
         begun = (
             self.count
@@ -76,7 +76,8 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     Args:
         message: the message.
         others: the other messages on the bus.
-        bit_ns: bit time, ns; a frame queued up to this late can still join an arbitration.
+        bit_ns: bit time, ns; a frame queued up to one bit time after an arbitration starts still takes part
+        in it.
 
     Returns:
         The time, or None if it is unbounded because the message and all higher-priority messages together
@@ -94,7 +95,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
     longest_ns, wait_ns = 0, blocking_ns
     for instance in range(message.most_in(busy_ns)):
         own_ns = blocking_ns + instance * message.time_ns
-        wait_ns = max(wait_ns, own_ns)  # start from the shorter wait of the previous instance
+        wait_ns = max(wait_ns, own_ns)  # the previous instance's wait is a lower bound to start from
         while (longer_ns := own_ns + _work_ns(higher, wait_ns + bit_ns)) > wait_ns:
             wait_ns = longer_ns
         passed_ns = wait_ns - message.due_ns(instance) + message.time_ns

@@ -28,7 +28,7 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return the CRC by byte, and the next run and the number of stuff bits by ``run << 8 | byte``.
+    """Return tables of the CRC by byte, and of the next run and number of stuff bits by ``run << 8 | byte``.
 
     A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
     to 4. A fifth equal bit causes a stuff bit, which begins a new run.

@@ -56,7 +56,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the bits in the longest frame, with a stuff bit after the first 5 and every 4 further bits.
+    """Return the bits in the longest frame: a stuff bit follows the first 5 bits and every 4 further bits.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -154,9 +154,9 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
-    # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 and every 4 further bits. FDF, res and
-    # BRS alternate, ESI is 0 and the length code is known. The data are the worst case. The first run is one
-    # recessive bit, BRS.
+    # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 bits and every 4 further bits. FDF,
+    # res and BRS alternate, ESI is 0 and the length code is known. The data are the worst case. The first run
+    # is one recessive bit, BRS.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -289,7 +289,7 @@ class BusLoad:
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if not stuffing.are_loaded():  # faster for a command that listens for only 1 or 2 s
+        if not stuffing.are_loaded():  # loading would delay a command that listens for 1 or 2 s
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))

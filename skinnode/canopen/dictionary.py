@@ -61,7 +61,7 @@ class Entry:
     access: str
     """ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
     default: Value | None = None
-    """Default value; None for a device-specific value such as a serial number, which is zero at start."""
+    """Default value; None, for a device-specific value such as a serial number, means zero at start."""
     plus_node_id: bool = False
     """Whether the node-ID is added to the default at start, as for a COB-ID."""
     mappable: bool = False

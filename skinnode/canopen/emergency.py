@@ -209,4 +209,4 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that return the text for the manufacturer-specific bytes of a skinnode patch, at least two."""
+"""Functions that return the text for the two or more manufacturer-specific bytes from a skinnode patch."""

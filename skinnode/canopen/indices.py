@@ -10,7 +10,7 @@ from typing import Final
 
 # --- identity (0x1018)
 VENDOR_ID: Final = 0
-"""Vendor-ID. CiA has not assigned a vendor-ID to this project, and never assigns 0."""
+"""Vendor-ID; 0, which CiA never assigns, because this project has no vendor-ID of its own."""
 PRODUCT_CODE: Final = 0x534B494E
 """Product code, 'SKIN' in ASCII."""
 REVISION_NUMBER: Final = 0x0001_0001
@@ -149,7 +149,7 @@ PDO_BYTES: Final = 12
 """Sub-index of the maximum PDO length, which is 8 bytes, or 64 over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""Sub-indices before the codes; over CAN FD, the first is the upper wire, and the first column follows."""
+"""Sub-indices before the codes; over CAN FD they hold wire and scan counter, and the first column follows."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6

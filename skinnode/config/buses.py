@@ -35,7 +35,7 @@ class OtherFrame(Table):
     period_ms: Annotated[
         float, Field(ge=0.1, le=3_600_000, allow_inf_nan=False), Allowed("a number from 0.1 to 3600000")
     ]
-    """Minimum time between two of these frames, milliseconds."""
+    """Minimum time between two frames with this identifier, milliseconds."""
 
 
 class BusConfig(Table):
@@ -123,8 +123,8 @@ class BringUpConfig(Table):
     """Action if a patch does not answer at the start: ``refuse`` to start, or start with the other patches
     and ``wait`` for it."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
-    """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; as a guest that
-    sends nothing, it only expects it. At 250 ms, a lost node is detected within a second, and the heartbeats
+    """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; a guest that sends
+    nothing only expects this period. At 250 ms, a lost node is detected within a second, and the heartbeats
     of four nodes take 0.1 % of the bus."""
 
     @property

@@ -1,6 +1,6 @@
 """Explains pydantic validation errors in one line: key, value found, values allowed, position.
 
-Pydantic knows the key but not its line in the file, and its messages name Python types ("Input should be a
+Pydantic reports the key but not its line in the file, and its messages name Python types ("Input should be a
 valid integer") instead of the range allowed in TOML.
 """
 

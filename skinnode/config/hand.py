@@ -21,7 +21,7 @@ from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
 MOST_BUSES: Final = 64
-"""Maximum number of buses per hand, far more than any machine has interfaces."""
+"""Maximum number of buses per hand, far above the number of CAN interfaces of any machine."""
 
 
 class HandConfig(Table):
@@ -138,7 +138,7 @@ class HandConfig(Table):
         masters = [bus for bus in self.buses if bus.role == "master"]
         if (len(masters) - 1) * self.sync.stagger_ms >= self.sync.period_ms:
             most = self.sync.period_ms / (len(masters) - 1)
-            allowed = f"below {most:g}: all {len(masters)} buses must send their SYNC within one period"
+            allowed = f"below {most:g}: the SYNC must be sent on all {len(masters)} buses within one period"
             raise ConfigError("sync.stagger_ms", self.sync.stagger_ms, allowed)
         for i, bus in enumerate(self.buses):
             node_ids = [patch.node_id for patch in self.patches_on(bus.name)]
@@ -170,7 +170,7 @@ class HandConfig(Table):
 
 
 def load_hand(path: Path | str) -> HandConfig:
-    """Read a hand file. Paths in it are relative to its folder.
+    """Read a hand file. Paths in the file are relative to its folder.
 
     Args:
         path: The file.

@@ -106,8 +106,8 @@ class LayoutConfig(Table):
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
     """Return a preset layout from a cache.
 
-    The patches of a hand are mostly alike, and every check builds them. Layouts are immutable and can be
-    shared.
+    Most patches of a hand have the same layout, and every check of the hand needs it. Layouts are immutable
+    and can be shared.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
 
@@ -144,7 +144,7 @@ class PoseConfig(Table):
         return self
 
     def build(self) -> Pose:
-        """Return the pose as :func:`skinnode.model.pose.positions_in_hand_m` takes it."""
+        """Return the pose in the form that :func:`skinnode.model.pose.positions_in_hand_m` takes."""
         if self.rpy_rad is not None:
             return Pose.from_rpy(self.position_m, self.rpy_rad)
         return Pose(self.position_m, self.quaternion_xyzw or (0.0, 0.0, 0.0, 1.0))

@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts in a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern of a key with many more parts; also matches long runs of numbers joined by dots, which no hand file
-has."""
+"""Pattern of a key with far more parts than that; also matches long runs of numbers joined by dots, which no
+hand file has."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # integer range of TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -69,7 +69,7 @@ def read_toml(path: Path, what: str) -> Document:
         what: Kind of file, for errors.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, is nested deeper than any hand file, or has
+        ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or has
             integers outside the range that TOML guarantees. The message is one line.
     """
     try:

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum number of attempts to lock; an attempt fails only if another owner releases the lock in between."""
+"""Maximum attempts to lock; an attempt fails only if the owner removes the file between open and lock."""
 
 
 class FileInUse(BlockingIOError):
-    """Another owner holds the lock; ``process`` is its process ID, or None if unknown."""
+    """Error raised if another owner holds the lock; ``process`` is its process ID, or None if unknown."""
 
     def __init__(self, path: Path, process: int | None) -> None:
         self.process = process
@@ -25,7 +25,7 @@ class FileInUse(BlockingIOError):
 
 
 class NotARegularFile(OSError):
-    """The path is a symbolic link, a folder, a pipe or a device; only regular files can be locked."""
+    """Error raised if the path is a symbolic link, a folder, a pipe or a device, not a regular file."""
 
     def __init__(self, path: Path, what: str) -> None:
         allowed = "allowed: a regular file, or a name that does not exist"
@@ -55,7 +55,7 @@ def lock_file(path: Path) -> FileLock:
         The lock, which the caller must release.
 
     Raises:
-        FileInUse: This or another process owns the lock.
+        FileInUse: This process or another one owns the lock.
         NotARegularFile: ``path`` exists and is not a regular file.
         OSError: The file cannot be created.
     """
@@ -84,7 +84,7 @@ def lock_file(path: Path) -> FileLock:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # the previous owner removed the name after it was opened here
+        os.close(descriptor)  # the previous owner removed the file after it was opened here
     raise FileInUse(path, None)
 
 

@@ -13,7 +13,7 @@ from skinnode.node.storage import Storage
 
 
 class Application(Protocol):
-    """Application of a device. The object dictionary contains its objects from the start."""
+    """Application of a device. The object dictionary contains the application's objects from the start."""
 
     @property
     def deadline_ns(self) -> int:

@@ -27,7 +27,7 @@ EXACT: Final = Pacing(slack_ns=0, catch_up_ns=100_000)
 """Pacing for a board, whose thread wakes for every chunk.
 
 The interval between two chunks is at most one unit (100 µs) shorter than the inhibit time, so a scan takes
-longer only if a wake-up is later than that.
+longer than planned only if a wake-up is more than 100 µs late.
 """
 
 THRIFTY: Final = Pacing(slack_ns=2_000_000, catch_up_ns=50_000_000)

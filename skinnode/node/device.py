@@ -1,9 +1,9 @@
 """CANopen device: the CiA 301 communication services around an application.
 
 The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes in frames
-and times and asks when to call again. On a bus the caller is :class:`~skinnode.node.runner.NodeRunner`; a
-test passes plain numbers. No received frame raises an exception, but an exception from the application or
-from ``send`` propagates to the caller.
+and times, and reads the time of the next call from the device. On a bus the caller is
+:class:`~skinnode.node.runner.NodeRunner`; a test passes plain numbers. No received frame raises an exception,
+but an exception from the application or from ``send`` propagates to the caller.
 """
 
 from __future__ import annotations

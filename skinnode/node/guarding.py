@@ -50,7 +50,7 @@ class Guarding:
     def on_written(self, t_ns: int) -> None:
         """Apply a new guard time or life time factor.
 
-        A life time in progress starts again. If the new life time is 0, a life guarding error is cleared.
+        A running life time restarts. If the new life time is 0, a life guarding error is cleared.
         """
         if self._guarded or not self._life_ns:
             self._start(t_ns)

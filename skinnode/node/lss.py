@@ -29,7 +29,7 @@ _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
 """Error codes in responses to the configuration services; the meaning of 1 depends on the service."""
 
 
-# Part of the address that each frame of *switch selective* and *identify* tests, and the comparison.
+# For each frame of *switch selective* and *identify*: the part of the address tested, and the comparison.
 _QUESTIONS: Final[dict[int, tuple[int, Callable[[int, int], bool]]]] = {
     0x40: (0, operator.eq),
     0x41: (1, operator.eq),
@@ -248,7 +248,7 @@ class BitRateChange:
         self._over_ns = t_ns + 2 * delay_ms * 1_000_000
 
     def silent(self, t_ns: int) -> bool:
-        """Change the bit rate if that is due, and return whether the node must neither send nor receive."""
+        """Change the bit rate if the change is due; return whether the node must neither send nor receive."""
         if self.deadline_ns == NO_DEADLINE_NS:
             return False
         if t_ns >= self._change_ns:

@@ -32,7 +32,7 @@ DomainWriter = Callable[[bytes], None]
 
 
 class Lengths(NamedTuple):
-    """Range of lengths that a client may write to an object, bytes."""
+    """Permitted length of the data that a client writes to an object, bytes."""
 
     least: int
     """Minimum length, bytes."""
@@ -159,7 +159,7 @@ class ObjectStore:
         return (index, subindex) in self._entries
 
     def lengths(self, index: int, subindex: int) -> Lengths:
-        """Return the range of lengths that a client may write.
+        """Return the permitted length of the data that a client writes to an object.
 
         Raises:
             Refused: if the object does not exist or is read-only.

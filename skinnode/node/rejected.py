@@ -15,11 +15,11 @@ class Rejected(IntEnum):
     """Reason for rejecting a frame; the value is the sub-index of object 0x2040."""
 
     NMT = 1
-    """NMT frame that is not two bytes long, or an unknown command for this node."""
+    """NMT frame that is not two bytes long, or that carries an unknown command for this node."""
     SYNC = 2
     """SYNC message that is longer or shorter than 0x1019 requires."""
     TIME = 3
-    """TIME message that is not six bytes long, or not a time of day."""
+    """TIME message that is not six bytes long, or that holds no valid time of day."""
     HEARTBEAT = 4
     """Heartbeat from a monitored node that is not one byte long."""
     SDO = 5

@@ -145,7 +145,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            if self._port.sent + self._heard > moved:  # a round without frames proves nothing
+            if self._port.sent + self._heard > moved:  # no frames, no proof that the bus works
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
                 self._set_bus_state(BusState.ACTIVE)

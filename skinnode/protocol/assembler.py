@@ -17,11 +17,10 @@ check reveals that they are not one scan.
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes that the receiver must hold (:mod:`skinnode.protocol.scan_check`). If the check fails, the wrong chunk
 cannot be identified, so the whole scan is discarded, together with the codes held for chunks that were not
-sent. A stream is *checked* from the first check that passes, or if its owner knows that the node sends checks
-(:meth:`ScanAssembler.reset`). In a checked stream no scan is complete without its check. A scan whose summary
-was lost, or that lacks codes of chunks that were not sent again, is published as *unchecked*, and a summary
-without a check is rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks
-have been received.
+sent. A stream is *checked* from the first check that passes, or from a :meth:`ScanAssembler.reset` with
+``checked``. In a checked stream no scan is complete without its check. A scan whose summary was lost, or that
+lacks codes of chunks that were not sent again, is published as *unchecked*, and a summary without a check is
+rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks have been received.
 
 **Order of counters.** A counter up to half the counter range ahead is newer; any other counter is late, and
 its frame is dropped. After a timeout without an accepted frame any counter starts a new stream, because the
@@ -127,7 +126,7 @@ class ScanAssembler:
         self._t_chunk_ns = self._t_summary_ns = 0  # time of the frame before the summary, and of the summary
 
         self._held = HeldChunks(profile)
-        self._follows = False  # whether the open scan follows the last one directly
+        self._follows = False  # whether the open scan follows the last scan without a gap
         self._changed_only = False
 
         self._complete = self._torn = self._missed = self._discarded = self._mixed_scans = self._resyncs = 0

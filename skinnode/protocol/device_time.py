@@ -37,10 +37,10 @@ class DeviceTimeTracker:
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
-        """Return the 32-bit device time nearest to the last device time plus the host time elapsed since.
+        """Return the 32-bit device time nearest to the last device time plus the host time that has elapsed.
 
-        The upper bits of the first time come from the host's clock, which allows for a summary received up to
-        three seconds after the scan.
+        The upper bits of the first time are taken from the host's clock. They are correct if the summary is
+        received up to three seconds after the scan.
 
         Args:
             low_us: low bits of the time from a checked summary, µs.

@@ -22,7 +22,7 @@ DEFAULT_CODE_LO: Final = 0.25
 DEFAULT_CODE_HI: Final = 1.25
 """R/R0 at the highest code; pressing brings electrodes closer and lowers R, sliding moves some apart."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Number of scans per full scan; lost codes are known again within 0.8 s, for a tenth of the full traffic."""
+"""Number of scans per full scan; lost codes are sent again within 0.8 s, at a tenth of the full traffic."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

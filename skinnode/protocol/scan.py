@@ -73,8 +73,8 @@ class AssemblerStats:
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing when their scan was published. Chunks of missed scans are excluded, and chunks of scans
-    without a summary while only changed chunks are sent."""
+    """Chunks missing when their scan was published. Not counted are the chunks of missed scans and, while
+    only changed chunks are sent, of scans without a summary."""
     summaries_lost: int
     """Summaries missing when their scan was published."""
     duplicates: int

@@ -179,7 +179,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
         except (ValueError, KeyError, TypeError, RecursionError):
             bad += 1
             if bad <= COMPLAINTS_KEPT:
-                what = "no event" if line.endswith(b"\n") else "cut off"
+                what = "no event" if line.endswith(b"\n") else "truncated"
                 complaints.append(f"{path.name} line {number}: {what}")
     if bad > COMPLAINTS_KEPT:
         complaints.append(f"{bad - COMPLAINTS_KEPT} more lines like these")

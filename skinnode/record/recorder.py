@@ -90,7 +90,7 @@ def _is_folder(path: Path) -> bool:
 
 
 class Recorder:
-    """Recording of a host, from construction to :meth:`close`; the host takes it as ``tap``.
+    """Recording of a host, from construction to :meth:`close`; it is passed to the host as ``tap``.
 
     Example::
 

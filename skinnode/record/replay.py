@@ -86,7 +86,7 @@ class Replay:
         """The log; ``damaged`` and ``damages`` report what cannot be read."""
         ends = [event for event in events if event["event"] == "ended"]
         self.ended = bool(ends)
-        """Whether the recording was closed, not killed."""
+        """Whether the recording was closed; False if its process was killed."""
         self._recorded: int | None = ends[0].get("frames") if ends else None
         self._read = 0
         self._first_ns: int | None = None

@@ -1,7 +1,7 @@
 """CAN interfaces: bus ports, their receiving threads, and frame log files.
 
 ``socketcan`` receives batches of frames through the system call in ``recvmmsg``, and reads how many frames
-the kernel dropped; ``port`` sends, counts and reopens; ``receiver`` has the receiving threads.
+the kernel dropped; ``port`` sends, counts and reopens; ``receiver`` contains the receiving threads.
 
 No other package of the project uses python-can at run time.
 """

@@ -61,7 +61,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame, which is safe after the next :meth:`flush`."""
+        """Write a frame; it is safe only after the next :meth:`flush`."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()
@@ -114,7 +114,7 @@ class FrameLog:
         try:
             writer.stop()
         finally:
-            with contextlib.suppress(OSError):  # a full disk raises again
+            with contextlib.suppress(OSError):  # on a full disk, closing raises the error again
                 writer.file.close()
 
 

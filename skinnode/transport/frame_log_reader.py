@@ -88,7 +88,7 @@ class FrameLogReader:
                 yield logged
             elif line.strip():
                 cut = not line.endswith(b"\n") and len(line) < _LONGEST_LINE
-                self._complain(number, offset, f"{'cut off' if cut else 'no frame'}: {_shown(line)}")
+                self._complain(number, offset, f"{'truncated' if cut else 'no frame'}: {_shown(line)}")
             offset += len(line)
 
     # --- BLF
@@ -120,7 +120,7 @@ class FrameLogReader:
                     tail = b""
                 at = following
             if tail:
-                self._complain(None, size, f"cut off: a frame that ends after {counted(len(tail), 'byte')}")
+                self._complain(None, size, f"truncated: a frame that ends after {counted(len(tail), 'byte')}")
 
     def _container(self, data: mmap.mmap, at: int) -> tuple[int, bytes | None]:
         """Return the end of the container at ``at``, and its readable content; None if it is damaged."""
@@ -131,7 +131,7 @@ class FrameLogReader:
         cut = end > len(data)
         if method == _STORED:
             if cut:
-                self._complain(None, at, "cut off: a container without its end")
+                self._complain(None, at, "truncated in the middle of a container")
             return min(end, len(data)), body
         if method != _DEFLATE:
             self._complain(None, at, f"a container compressed by unknown method {method}")
@@ -143,7 +143,7 @@ class FrameLogReader:
             self._complain(None, at, f"a container that cannot be decompressed ({error})")
             return at + _OBJECT.size, None  # its length may be wrong too
         if not inflater.eof:
-            self._complain(None, at, "cut off: a container without its end")
+            self._complain(None, at, "truncated in the middle of a container")
         return min(end, len(data)), objects
 
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:

@@ -21,7 +21,7 @@ from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
 """Capacity of an intake: 2 s of a fully loaded bus at 1 Mbit/s (8,000 frames/s), longer than any pause that a
-host would survive."""
+host tolerates."""
 
 _POLL_S: Final = 0.02
 """Maximum time that a thread waits for a frame before it checks whether to end, s."""
@@ -237,7 +237,7 @@ class Receiver:
             self._joining.append(intake)
             return
         if intake in self._alone:
-            self._alone[intake].join()  # it ends after the failure; the error must stay set until then
+            self._alone[intake].join()  # it ends because of the failure, which must stay set until then
         intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = threading.Thread(target=self._receive_alone, args=(intake,), name=name, daemon=True)

@@ -102,7 +102,7 @@ class Acquisition:
         self.forget_sent()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0, ohm. The node then no longer tares by itself, so the client must set every other R0."""
+        """Set one R0, ohm. The node then stops taring by itself, so the client must also set all other R0."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.forget_sent()

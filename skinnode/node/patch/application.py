@@ -127,7 +127,7 @@ class PatchApplication:
             t_ns: when the SYNC was received, ns.
         """
         scans = not self._period_ns
-        if not scans or self.stream.full:  # otherwise this scan's summary is sent first
+        if not scans or self.stream.full:  # otherwise the new scan sends its summary at this SYNC
             self.stream.on_sync(turns, t_ns)
         if scans:
             self._scan(self._following() if counter is None else counter, turns, t_ns)
@@ -249,7 +249,7 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If SYNC numbers the scans, a receiver would take this scan for that of the next SYNC.
+                # If SYNC numbers the scans, a receiver would mistake this scan for the scan of the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

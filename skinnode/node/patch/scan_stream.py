@@ -11,9 +11,9 @@ therefore compensates for lateness of up to ``catch_up_ns``, if necessary with s
 never exceeds the mean rate (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum
 interval is strict.
 
-The node knows the time of a SYNC, but not how long sampling then takes. The node therefore requests a timer
-event immediately after the first chunk of a scan. This event supplies the current time, from which the
-interval to the second chunk is measured.
+The node receives the time of a SYNC, but cannot measure how long sampling then takes. The node therefore
+requests a timer event immediately after the first chunk of a scan. This event supplies the current time, from
+which the interval to the second chunk is measured.
 
 Synchronous TPDOs obey the synchronous window (0x1007): chunks and a summary not sent before the window closes
 are discarded. The window does not apply to event-driven TPDOs.
@@ -38,7 +38,7 @@ from skinnode.node.pdo.tpdo import Tpdo, TpdoEngine
 from skinnode.protocol.summary import SummaryFlag, pack_checked_summary, pack_summary, pack_summary_record
 
 _HELD_UP: Final = 0.1
-"""Fraction of the sending time that may be lost before chunks count as delayed; thread jitter loses less."""
+"""Fraction of the sending time that may be lost before chunks count as delayed; thread jitter costs less."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ class ResistanceSource(Protocol):
 
 
 class SourceFault(IntEnum):
-    """Kind of a failed reading, sent as the first detail byte of the emergency message."""
+    """Type of reading failure, sent as the first detail byte of the emergency message."""
 
     RAISED = 1
     """The source raised an exception."""

@@ -74,7 +74,7 @@ class WireFaultReporter:
         self._reported = WireFaults.none(self._profile)
 
     def report(self, faults: WireFaults, t_ns: int) -> None:
-        """Send one message with the kind and number of the first new fault and the count of faulty wires.
+        """Send one message with the first new fault (kind and wire number) and the number of faulty wires.
 
         A pulled connector is one event, so it causes one message.
 

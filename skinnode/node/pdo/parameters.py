@@ -127,7 +127,7 @@ class PdoRecords:
         self._store = store
         self._parameter, self._mapping, self._transmits = parameter, mapping, transmits
         self._taken = taken
-        # Maximum bytes of a PDO, equal to the number of entries, because the smallest object is one byte.
+        # Maximum bytes of a PDO, equal to its number of mapping entries: the smallest object has one byte.
         self._longest = sum([store.has(mapping, sub) for sub in range(1, _MOST_MAPPED + 1)])
         store.guard(parameter, self._guard_parameter)
         store.guard(mapping, self._guard_mapping)

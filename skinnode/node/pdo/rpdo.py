@@ -127,7 +127,7 @@ class RpdoEngine:
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
-        """Handle a frame that may be an RPDO, or be several RPDOs that share its COB-ID.
+        """Handle a frame, which any number of RPDOs may receive, because several can share its COB-ID.
 
         Args:
             cob_id: identifier of the frame.
@@ -155,7 +155,7 @@ class RpdoEngine:
         wrong = None
         if len(data) < parameters.size:
             wrong = EmcyCode.PDO_NOT_PROCESSED
-        elif len(data) > fd_length(parameters.size):  # equals the mapped length for a classic frame
+        elif len(data) > fd_length(parameters.size):  # a length up to 8 stays as it is
             wrong = EmcyCode.PDO_LENGTH_EXCEEDED
         self._set_wrong(rpdo, wrong, data, t_ns)
         if wrong is EmcyCode.PDO_NOT_PROCESSED:

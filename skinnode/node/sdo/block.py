@@ -1,9 +1,9 @@
 """SDO block transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.15): up to 127 segments, then one acknowledgement.
 
 CAN delivers a frame twice if the last bit of its end of frame is disturbed (ISO 11898-1), and a frame does
-not identify its block. If a repeated acknowledgement were taken for that of the next block, segments would be
-skipped. For this reason a frame equal to the previous frame is ignored unless the protocol allows a
-repetition there.
+not identify its block. If a repeated acknowledgement were mistaken for the acknowledgement of the next block,
+segments would be skipped. For this reason a frame equal to the previous frame is ignored unless the protocol
+allows a repetition there.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ wakes late; clients wait at least 300 ms (canopen library) for a frame. Each tim
 as slower buses do, the time is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean time between two segments, ns, which takes a quarter of a 125 kbit/s bus. If the bus refuses
-segments even at this pace, the pace is not the cause."""
+"""Maximum mean time between two segments, ns; at this pace, segments take a quarter of a 125 kbit/s bus. If
+the bus refuses segments even at this pace, the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
 """Maximum segments sent per timer event, to compensate for a thread that wakes late (2 ms by default).
 
@@ -40,7 +40,7 @@ TWICE_NS: Final = 3_000_000
 """Maximum time between the two deliveries of one frame, ns: two maximum-length frames at 125 kbit/s and an
 error frame.
 
-A client that sends a genuine second acknowledgement has received more segments in between.
+A client that sends a genuine second acknowledgement has received more segments since the first one.
 """
 
 _LAST: Final = 0x80
@@ -199,7 +199,7 @@ class BlockDownload(Transfer):
         self._crc = crc
         self._received = 0  # segments of the current block received without a gap
         self._last: bytes | None = (
-            None  # last segment of the transfer; the end request tells how much of it is data
+            None  # last segment of the transfer; the end request gives the number of its data bytes
         )
         self._previous = b""  # the last request, if it was acknowledged
         channel.send(MULTIPLEXER_U32.pack(0xA0 | crc << 2, target.index, target.subindex, MAX_BLOCK_SEGMENTS))

@@ -6,8 +6,8 @@ ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. CRC: po
 initial value 0.
 
 CRC and stuffing are computed bytewise with tables. The head of a frame is padded on the left to whole bytes.
-For the CRC, the padding is zeros, which leave the CRC at 0. For stuffing, it is alternating bits that end in
-a 1, so the dominant start of frame begins a new run.
+For the CRC, the padding is zeros, which leave the CRC at 0. For stuffing, the padding is alternating bits
+that end in a 1, so the dominant start of frame begins a new run.
 
 CAN FD frames have an 11-bit identifier and switch the bit rate. Bit stuffing follows the same rule up to the
 end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and

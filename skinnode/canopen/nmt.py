@@ -11,7 +11,7 @@ STOPPED           command 2            NMT, error control
 
 A node obeys every command in every state except INITIALISING, in which it receives no commands. *Reset node*
 (129) resets all objects to their defaults, and *reset communication* (130) the objects from 0x1000 to 0x1FFF.
-The node boots after both.
+The node boots after either command.
 """
 
 from __future__ import annotations

@@ -167,7 +167,8 @@ class CalibrationConfig(Table):
     )
     """Poisson's ratio of the rubber."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """One factor per upper wire that restores its resistances to their values at the time of the baseline."""
+    """One factor per upper wire; it restores the wire's resistances to their values at the time of the
+    baseline."""
 
     @property
     def rubber(self) -> Rubber:

@@ -71,7 +71,7 @@ class HeartbeatConsumer:
     Args:
         store: object dictionary.
         emcy: reports missed heartbeats and restarts.
-        failed: called with the time in ns at which heartbeats were missed, after their EMCY.
+        failed: called, after the EMCY, with the time in ns at which heartbeats were missed.
     """
 
     def __init__(self, store: ObjectStore, emcy: EmcyProducer, failed: Callable[[int], None]) -> None:

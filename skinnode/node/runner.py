@@ -145,7 +145,8 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            if self._port.sent + self._heard > moved:  # no frames, no proof that the bus works
+            # A turn without frames does not show that the bus works.
+            if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:
                 self._set_bus_state(BusState.ACTIVE)

@@ -1,7 +1,7 @@
 """Assembler of one patch's received chunks and summaries into scans; not thread-safe, and without a clock.
 
 **Scans are never mixed.** A scan holds only frames with its own counter that arrived within the *timeout* of
-its first frame, and it is closed for good when a frame of a newer scan arrives. Frames of two scans can
+its first frame, and it is closed permanently when a frame of a newer scan arrives. Frames of two scans can
 therefore share a scan only if they carry the same counter and arrive within the timeout of each other. Such
 mixing cannot happen while counter range × period is longer than the timeout plus the age of the oldest frame,
 measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter range is

@@ -162,7 +162,7 @@ class PatchProfile:
 
     @property
     def code_type(self) -> DataType:
-        """Type of a code in the object dictionary."""
+        """Data type of a code in the object dictionary."""
         return DataType.UNSIGNED16 if self.code_bits == 16 else DataType.UNSIGNED24
 
     @property

@@ -237,7 +237,8 @@ class Receiver:
             self._joining.append(intake)
             return
         if intake in self._alone:
-            self._alone[intake].join()  # it ends because of the failure, which must stay set until then
+            # The thread ends after the failure; the error must stay set until then.
+            self._alone[intake].join()
         intake.resume()
         name = f"receive {intake.port.config.name}"
         thread = threading.Thread(target=self._receive_alone, args=(intake,), name=name, daemon=True)

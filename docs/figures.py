@@ -66,7 +66,7 @@ def path(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['experiments']} random presses per setting, one wire, 30 unknowns. "
         "*Plain*: as in the paper, `Uniform(plain=True)`; *ours*: `Uniform()`. A call evaluates F with J; "
-        "calls are per step, and the paper counts 31 for each, by finite differences. *Lost*: wires not "
+        "calls are per step; with finite differences, as in the paper, each counts as 31. *Lost*: wires not "
         "CONVERGED; the error is the mean of the others."
     ]
     for setting in figures["settings"]:
@@ -255,9 +255,10 @@ def _pair(row: dict[str, Any]) -> str:
 def stability(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['seeds']} seeds per row, {len(figures['rows'])} rows, "
-        f"**{figures['wrong']} wires CONVERGED and wrong**. Wrong is an error above 5 deviations and beyond "
-        "chance, with exact data above 1e-6. Below: the rows with noise, by `auto` (by the method it chose); "
-        "errors and standard deviations in the deepest frame, median over the seeds."
+        f"**{figures['wrong']} wires CONVERGED and wrong**. A wire is wrong if it is CONVERGED "
+        "with an error above 5 standard deviations and beyond chance, or above 1e-6 with exact data. The "
+        "table lists the rows with noise, solved by the method that `auto` chose; errors and standard "
+        "deviations are medians over the seeds, in the deepest frame."
     ]
     rows = [
         [

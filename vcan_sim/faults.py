@@ -1,6 +1,6 @@
 """Faults that can be injected into a node, as data, and counts of the injected faults.
 
-A chunk suffers at most one fault, so that the counts can be compared with a receiver's.
+A chunk has at most one fault, so that the counts can be compared with a receiver's.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Faults:
     short: float = 0.0
     """The chunk lacks one byte."""
     remote: float = 0.0
-    """A remote frame is sent instead."""
+    """A remote frame is sent instead of the chunk."""
     miscounted: float = 0.0
     """The chunk carries the counter of another scan."""
     miscounted_by: int | None = None
@@ -150,7 +150,7 @@ class Faults:
     restart_every_s: float = 0.0
     """Seconds between spontaneous resets of the node; 0 for never."""
     emcy_per_s: float = 0.0
-    """Emergency messages per second; when they stop, one more reports *error reset*."""
+    """Emergency messages per second; when they stop, one more message reports *error reset*."""
     babble_per_s: float = 0.0
     """Frames per second with COB-ID 0x3F0, which no device uses."""
 

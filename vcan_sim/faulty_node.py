@@ -32,7 +32,7 @@ up to 270 frames, which fit the default receive buffer of a socket."""
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of events at one rate per turn; further events are dropped."""
+"""Maximum number of periodic events of one kind per turn; further events are dropped."""
 
 
 class Emit(Protocol):
@@ -240,7 +240,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the answer to an upload, falsified if a fault asks for a wrong identity or layout."""
+        """Return the answer to an upload, falsified if a fault requires a wrong identity or layout."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id

@@ -28,8 +28,7 @@ class Put(Protocol):
 class FaultyScans:
     """Sends the chunks and summaries of a node with faults.
 
-    A scan suffers at most one scan fault. A chunk suffers at most one chunk fault, and none if its scan has a
-    fault.
+    A scan has at most one scan fault. A chunk has at most one chunk fault, and none if its scan has a fault.
 
     Args:
         injector: The node's faults, random generator and counts.
@@ -78,7 +77,7 @@ class FaultyScans:
         self._swapped, self._late = None, []
 
     def send_chunk(self, data: bytes) -> None:
-        """Send a chunk with the faults that it and its scan suffer."""
+        """Send a chunk, with its own fault or the fault of its scan."""
         counter = data[_CHUNK_COUNTER_BYTE]
         if counter != self._counter:
             self._begin_scan(counter)
@@ -98,7 +97,7 @@ class FaultyScans:
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
-        """Send a summary with the faults that its scan suffers."""
+        """Send a summary, with the fault of its scan."""
         injected, tally = self._injector.injected, self._injector.tally
         if data[_SUMMARY_COUNTER_BYTE] != self._counter:  # a scan without chunks
             self._begin_scan(data[_SUMMARY_COUNTER_BYTE])

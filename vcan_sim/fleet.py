@@ -250,7 +250,7 @@ class _Station:
         self._frames = self._pdos = 0
 
     def connect(self, emit: Emit) -> FaultyNode:
-        """Return a new node on the patch that sends through ``emit``."""
+        """Return a new node of the patch that sends through ``emit``."""
         config = self._config
         self._node = FaultyNode(
             config.node_id,

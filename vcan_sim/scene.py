@@ -23,7 +23,7 @@ from skinnode.model.elastic import HertzContact, Rubber
 from skinnode.model.layout import Float, PatchLayout
 
 LEAD_S: Final = 0.8
-"""Rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
+"""Duration of rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Fractions of a cycle; the remainder is rest. In a 4 s cycle a press takes 1.4 s."""
@@ -36,7 +36,7 @@ _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times in s since first contact."""
+    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times are s since contact."""
 
     radius_m: float
     depth_m: float

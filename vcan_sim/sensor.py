@@ -155,7 +155,7 @@ class FaultyConverter:
 def simulated(layout: PatchLayout) -> SimulatedPatch:
     """Return a patch that a sphere presses: the source named ``simulated`` in ``skinnode node``.
 
-    The scene starts immediately. The first touch comes after 0.8 s, so that a tare at power-on sees an
+    The scene starts immediately. The first touch occurs after 0.8 s, so that a tare at power-on sees an
     untouched patch.
     """
     source = SimulatedPatch(Scene(layout))

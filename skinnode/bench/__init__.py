@@ -6,5 +6,5 @@
 
 Each subcommand of ``skinnode bench`` has a module with a function ``run``, which returns the figures as plain
 values; ``skinnode.cli.bench`` prints and writes them. ``truth`` simulates presses in closed form and shares
-no assumption with the solvers. ``load`` and ``soak`` take their frames from the simulator.
+no assumptions with the solvers. ``load`` and ``soak`` take their frames from the simulator.
 """

@@ -27,7 +27,7 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""Noise of roughly a 16-bit converter."""
+"""Noise roughly equal to that of a 16-bit converter."""
 STRIDE: Final = 4
 """Number of path samples per tracker frame."""
 DRIFT: Final = 0.02

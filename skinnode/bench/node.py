@@ -1,9 +1,9 @@
 """Timing and cost of a node: chunk pacing, SYNC to first chunk, heartbeat on a full bus, µs per frame.
 
-A frame's time is when the node passes it to its interface, on the monotonic clock that also stamps SYNC. SYNC
-and load come from another endpoint in another thread of the same process, so the interpreter lock affects the
-result. Other work on the machine affects it even more; ``chrt -f 20 skinnode bench node`` gives the figures
-of an idle machine.
+A frame's time is the time at which the node passes it to its interface, on the monotonic clock that also
+stamps SYNC. SYNC and load come from another endpoint in another thread of the same process, so the
+interpreter lock affects the result. Other work on the machine affects it even more; ``chrt -f 20 skinnode
+bench node`` gives the figures of an idle machine.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Frames per second, with eight data bytes, that fill a bus at 1 Mbit/s."""
+"""Rate of frames with eight data bytes that fills a bus at 1 Mbit/s, frames per second."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
-_BURST_S: Final = 1e-3  # one burst per millisecond, because no thread wakes 8000 times a second
+_BURST_S: Final = 1e-3  # one burst per millisecond, because no thread can wake 8000 times a second
 _MOST_S: Final = 5e-3  # frames overdue by more than this are dropped: a real bus cannot catch up
 
 Row = dict[str, Any]
@@ -79,7 +79,7 @@ class _Rig:
         return self._port.received
 
     def take(self) -> None:
-        """Discard the frames of the node; a full queue would stop it."""
+        """Discard the node's frames, because a full queue would stop the node."""
         while self.manager.recv(0.0) is not None:
             pass
 

@@ -1,22 +1,22 @@
 """The paper's path experiments, repeated with its protocol and compared with its values (``paper.toml``).
 
-Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. It
-is a smooth random press by a sphere of 6 to 12 mm on rubber, in Hertz's closed form with friction, somewhere
-in the middle of the patch; its wire is the wire nearest the press. Of 1000 samples on the way down, n
-evenly spaced samples are used.
+Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
+sphere with a radius of 6 to 12 mm presses on rubber (Hertz's closed form with friction) at a random point in
+the middle of the patch; the wire is the one nearest to that point. Of 1000 samples on the way down, n evenly
+spaced samples are used.
 
 Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 more calls
 than F alone. Here F and J together cost about as much as two evaluations of F; ×31 gives the cost with finite
 differences. Calls per step are means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖
 / ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order optimality is that of r =
-a F − 1, dimensionless with lengths in pitches; MATLAB's would be that of F, which is larger by F² in the unit
-of length; the paper does not state its unit.
+a F − 1, dimensionless with lengths in pitches; MATLAB would give that of F, which is larger by a factor of F²
+and depends on the unit of length; the paper does not state its unit.
 
-Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves
-10 of 10 at any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1.
-At h = 0.7 and 30 %, Gauss-Newton fails as it did for the authors: at 5 and 10 steps, in 6 and 2 of 10
-experiments, but not from 20 steps on. This setting was found by searching h = 0.3 … 1 and presses of
-15 … 30 %; at h = 1 and 25 %, 5 and 3 fail, but there levenberg_marquardt also fails at more steps.
+Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves 10 of
+10 with any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1. At h = 0.7 and
+30 %, Gauss-Newton fails as it did for the authors: at 5 and 10 steps, in 6 and 2 of 10 experiments, but not
+from 20 steps on. This setting was found by searching h = 0.3 … 1 and presses of 15 … 30 %; at h = 1 and 25 %,
+5 and 3 fail, but there levenberg_marquardt also fails at more steps.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ def optimality(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
 
 
 def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """Return the largest coordinate of the next Newton step, pitches."""
+    """Return the largest component of the next Newton step in magnitude, in pitches."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(np.linalg.solve(slopes, r)).max())
 
@@ -370,7 +370,7 @@ Say = Callable[[str], None]
 
 
 def print_all(figures: dict[str, Any], say: Say) -> None:
-    """Print the tables and the data of the figures, each next to the paper's value."""
+    """Print the tables and the figure data, with the paper's value next to each number."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
     say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second try.")

@@ -18,8 +18,8 @@ from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
 """Error, in reported standard deviations, that counts as a fault if exceeded. A run scores about 1e5
-coordinates; by chance alone, 2e-4 of a coordinate is expected beyond six standard deviations: one false
-alarm in 5,000 runs."""
+coordinates; by chance alone, 2e-4 coordinates are expected beyond six standard deviations: one false alarm in
+5,000 runs."""
 
 EXCESS_LIMIT = 1.15
 """Maximum ratio of a run's RMS error to its RMS reported standard deviation, as required by this project."""

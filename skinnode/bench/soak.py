@@ -45,10 +45,10 @@ from vcan_sim.sensor import REMEMBERED_READINGS
 WARM_UP: Final = 0.25
 """Fraction of the run after which memory is measured for the first time."""
 BLOCKS: Final = 2000
-"""Maximum growth in blocks. The number varies by a few hundred; a leak of one block per scan adds 10,000 in
-three minutes."""
+"""Maximum growth in blocks. The number of blocks varies by a few hundred; a leak of one block per scan adds
+10,000 in three minutes."""
 RESIDENT_MB: Final = 8.0
-"""Maximum growth of resident memory in MB; C's allocator returns memory at its own pace."""
+"""Maximum growth of resident memory in MB; the C allocator may return freed memory late."""
 BACK_S: Final = 15.0
 """Seconds after which a stream that has not resumed counts as lost. Recovery should take one second; a loaded
 machine may need more."""
@@ -157,7 +157,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
     try:
         fleet = Fleet(hand, faults=Faults(seed=seed))
         for source in fleet.patches.values():
-            for k in range(REMEMBERED_READINGS):  # fill its memory of readings, which must not grow
+            for k in range(REMEMBERED_READINGS):  # fill its record of readings, which must not grow later
                 source.read(-1000 * TIME_STEP_US * (k + 1))
         with fleet:
             before = {bus.name: Counter(fleet.passed(bus.name).sent) for bus in hand.buses}

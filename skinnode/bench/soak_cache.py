@@ -1,4 +1,4 @@
-"""A damaged copy of the kernel cache for a soak to start with."""
+"""Damaged copy of the kernel cache with which a soak starts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """One wire of the reference patch solved to 1e-9 from a nearby start, by us and by peers on the same F and J.
 
 The start is the second-to-last sample of a ten-step path to a 10 % press. Every peer runs at the loosest
-tolerance that brings the displacement to 1e-9; a peer that never gets there is listed without a time.
+tolerance that reduces the displacement error to 1e-9; a peer that never reaches it is listed without a time.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Number of streams for which ``auto`` must equal another method bit for bit before it is skipped."""
+"""Number of streams on which ``auto`` must equal another method bit for bit before ``auto`` is skipped."""
 
 
 @contextlib.contextmanager

@@ -175,7 +175,7 @@ class Converter:
 
     @property
     def exact(self) -> bool:
-        """Whether a reading equals the resistance."""
+        """Whether a reading equals the true resistance."""
         return self.sigma == 0.0 and self.bits == 0
 
     @property

@@ -2,13 +2,14 @@
 
 A wire in a frame is
 
-flagged    if its status is not CONVERGED, so that nothing was claimed
+flagged    if its status is not CONVERGED, so that no accuracy was claimed
 accurate   if it is CONVERGED and every coordinate is within the reported uncertainty
 wrong      if it is CONVERGED and an error is too large, or if it is not finite, whatever its status
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
-beyond that. Chance must neither condemn a long run nor excuse a fault, so two conditions must hold in each
-row. For errors that are Gaussian with the reported standard deviation, each fails with a probability of 1e-4:
+beyond that. A long run must not fail by chance, nor a fault pass as chance, so two conditions must hold in
+each row. For errors that are Gaussian with the reported standard deviation, each fails with a probability of
+1e-4:
 
 - no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)
   standard deviations with probability 1e-4. z is 5.7 for 9,000 coordinates and 6.4 for 1e6 (Bonferroni's
@@ -61,7 +62,7 @@ class Solved:
 
 
 def beyond(deviations: float) -> float:
-    """Return the probability that a normal variable is over ``deviations`` sigma from its mean."""
+    """Return the probability that a normal variable is more than ``deviations`` sigma from its mean."""
     return math.erfc(deviations / math.sqrt(2.0))
 
 

@@ -180,7 +180,7 @@ class ArrayTable:
         vars(self).update(values, table=table)  # keeps the arrays alive
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name in self._names and value is not getattr(self, name):  # x += 1 sets x to itself
+        if name in self._names and value is not getattr(self, name):  # x += 1 assigns x itself
             raise AttributeError(
                 f"{type(self).__name__}.{name}: kernels use its address; write to it in place"
             )

@@ -81,7 +81,7 @@ class Contact:
     """Area of the contact, assuming a smooth body (Hertz), m²; one cell's area if too small to resolve."""
     area_std_m2: float
     normal_force_n: float
-    """Normal force, N, positive when pressing."""
+    """Normal force, N; positive for a press."""
     normal_force_std_n: float
     shear_force_n: Float
     """(2,) shear force along and across the wires, N."""
@@ -123,7 +123,7 @@ class FieldFrame:
     noise_factor: float = 1.0
     """Ratio of the estimated noise to the configured noise; 1 if the noise is not estimated."""
     held: NDArray[np.bool_] | None = None
-    """(U,) wires not solved because they moved no more than the noise of the frame."""
+    """(U,) wires not solved because their movement did not exceed the noise of the frame."""
     core_std_m: Float | None = None
     """(U, N, 3) standard deviation of the bulk of the errors, without the allowance for the tail, metres;
     None if equal to ``displacement_std_m``."""

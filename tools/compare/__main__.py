@@ -3,7 +3,7 @@
 NEW is the working tree by default. The old commit makes the inputs: streams of resistances on five layouts,
 with two noise levels, with and without faults, and recordings of simulated hands. Both commits then process
 them: forward model, every method of the tracker, path following with every operator, systems of equations,
-replay of the recordings, generated files. The report gives, for each part, a hash of all its arrays in either
+replay of the recordings, generated files. The report gives, for each part, a hash of all its arrays in each
 commit and, for each array that differs, the largest relative difference.
 
 Exit status 0 if all arrays are equal, or are float arrays that differ by at most ``--rtol``; otherwise 1.

@@ -57,7 +57,7 @@ RECORDINGS = {
 
 
 def layouts() -> dict[str, sk.PatchLayout]:
-    """Return patches of two presets, one bent round a cylinder, and two with other numbers of wires."""
+    """Return patches of two presets, one bent round a cylinder, and two with different numbers of wires."""
     flat = sk.PatchLayout.preset("staggered")
     middle, radius_m = flat.upper_m[..., 0].mean(), 25e-3
 

@@ -1,10 +1,10 @@
 """Time a benchmark of two commits in turn on one machine: ``python -m tools.compare.speed OLD [NEW]``.
 
-NEW is the working tree by default. Each round runs the benchmark once in either tree; which tree goes first
-alternates, so that a change of the speed of the machine hits both. The report gives the shortest time of each
-row in either commit, and their ratio. Rows of NumPy and LAPACK show the noise of the machine.
+NEW is the working tree by default. Each round runs the benchmark once in each tree; the order alternates, so
+that a change in the speed of the machine affects both trees. The report gives the shortest time of each row
+in each commit, and their ratio. Rows of NumPy and LAPACK show the timing noise of the machine.
 
-Exit status 0 if no row is slower than ``--limit`` times the old one, otherwise 1.
+Exit status 0 if no row takes more than ``--limit`` times its old time, otherwise 1.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> int:
     parser.add_argument("old", metavar="OLD", help="commit, such as HEAD~1 or a tag")
     parser.add_argument("new", metavar="NEW", nargs="?", help="commit; the working tree by default")
     parser.add_argument("--benchmark", default="kernel", help="name of the benchmark; default kernel")
-    parser.add_argument("--rounds", type=int, default=5, help="runs of either commit; default 5")
+    parser.add_argument("--rounds", type=int, default=5, help="runs of each commit; default 5")
     parser.add_argument("--limit", type=float, default=1.05, help="largest allowed ratio; default 1.05")
     options, arguments = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as temporary:

@@ -245,7 +245,7 @@ def _be_pytest(tree: Tree, arguments: Sequence[str], answer: Path, limit_s: floa
 
 
 def _end_children(group: int) -> None:
-    """Kill a process group, and processes that left it, which become children of this process as orphans."""
+    """Kill a process group and the processes that left it, which this process adopts as orphans."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
     for _ in range(100):

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import can
 
@@ -42,6 +42,16 @@ class Damage:
     def __str__(self) -> str:
         where = f"offset {self.offset}" if self.line is None else f"line {self.line} (offset {self.offset})"
         return f"{where}: {self.what}"
+
+
+class _Container(NamedTuple):
+    """Container of a BLF file."""
+
+    end: int
+    """Offset from which to look for the next container, bytes."""
+    objects: bytes | None
+    """Content, as far as it is readable; None if nothing is."""
+    intact: bool = False
 
 
 class FrameLogReader:
@@ -108,43 +118,51 @@ class FrameLogReader:
                     None, _FILE_HEADER_BYTES, f"no container for {counted(at - _FILE_HEADER_BYTES, 'byte')}"
                 )
             while at < size:
-                end, objects = self._container(data, at)
-                if objects is None:
-                    tail = b""
-                else:
+                end, objects, intact = self._container(data, at)
+                if objects is not None:
                     whole, tail = self._whole_objects(tail + objects, at)
                     yield from self._frames(header, whole, at)
+                if not intact:  # the length of a partial frame may be wrong, and would swallow later frames
+                    tail = b""
                 following = _find_container(data, end)
-                if following > end + _PADDING_BYTES and not (following == size and objects is None):
+                if following > end + _PADDING_BYTES and intact:
                     self._complain(None, end, f"no container for {counted(following - end, 'byte')}")
                     tail = b""
                 at = following
             if tail:
                 self._complain(None, size, f"truncated: a frame that ends after {counted(len(tail), 'byte')}")
 
-    def _container(self, data: mmap.mmap, at: int) -> tuple[int, bytes | None]:
-        """Return the end of the container at ``at``, and its readable content; None if it is damaged."""
+    def _container(self, data: mmap.mmap, at: int) -> _Container:
+        """Return the end and the content of the container at ``at``.
+
+        A damaged container ends after its header, because its length may be wrong too.
+        """
         _, _, _, size, _ = _OBJECT.unpack_from(data, at)
-        end = at + size
-        body = data[at + _CONTAINER_HEAD_BYTES : end]
+        begin, end = at + _CONTAINER_HEAD_BYTES, at + size
+        body = data[begin:end]
         method = struct.unpack_from("<H", data, at + _OBJECT.size)[0] if len(body) else _DEFLATE
-        cut = end > len(data)
+        damaged = _Container(at + _OBJECT.size, None)
         if method == _STORED:
-            if cut:
+            if end > len(data):
                 self._complain(None, at, "truncated in the middle of a container")
-            return min(end, len(data)), body
+                return damaged._replace(objects=body)
+            return _Container(end, body, intact=True)
         if method != _DEFLATE:
             self._complain(None, at, f"a container compressed by unknown method {method}")
-            return min(end, len(data)), None
+            return damaged
         inflater = zlib.decompressobj()
         try:
             objects = inflater.decompress(body, _MOST_INFLATED)
         except zlib.error as error:
             self._complain(None, at, f"a container that cannot be decompressed ({error})")
-            return at + _OBJECT.size, None  # its length may be wrong too
+            return damaged
         if not inflater.eof:
             self._complain(None, at, "truncated in the middle of a container")
-        return min(end, len(data)), objects
+            return damaged._replace(objects=objects)
+        if len(inflater.unused_data) > _PADDING_BYTES:
+            self._complain(None, at, "a container with a wrong length")
+            return _Container(end - len(inflater.unused_data), objects, intact=True)
+        return _Container(min(end, len(data)), objects, intact=True)
 
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
         """Return the complete objects in ``data``, and the beginning of an incomplete object at its end."""

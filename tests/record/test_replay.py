@@ -179,7 +179,7 @@ def written(path: Path, frames: int) -> bytes:
 
 
 SWALLOWED = (472, 600, 2844, 3034, 3564, 3780)
-"""Seeds of garbage that decompressed into a frame with a wrong length, which swallowed all later containers."""
+"""Seeds of garbage that became a frame with a wrong length, which swallowed all later containers."""
 GARBAGE = (
     b"\xff" * 100,
     b"LOBJ" * 25,

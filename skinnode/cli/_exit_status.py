@@ -18,6 +18,7 @@ slow, so its handlers are installed before anything else is loaded.
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -48,6 +49,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
         argv: Command-line arguments; default: the arguments of the process.
     """
     _handle(_exit_at_once)
+    atexit.register(_ignore_signals)
     run: Callable[..., int] = import_module("skinnode.cli._errors").run
     app = import_module(module).app
     _handle(_stop)
@@ -61,7 +63,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
     sys.exit(status)
 
 
-def _handle(handler: Callable[[int, FrameType | None], object]) -> None:
+def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
     """Install ``handler`` for the signals in the main thread, the only thread in which Python allows it."""
     import threading
 
@@ -69,6 +71,11 @@ def _handle(handler: Callable[[int, FrameType | None], object]) -> None:
         for number in _SIGNALS:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, handler)
+
+
+def _ignore_signals() -> None:
+    """Keep the exit status once all threads have ended: Python is about to restore the default handlers."""
+    _handle(signal.SIG_IGN)
 
 
 def _exit_at_once(number: int, _frame: FrameType | None) -> None:

@@ -68,7 +68,7 @@ def folder(tmp_path: Path, multicast_group: str) -> Path:
     sizes = "upper_wires = 2, upper_electrodes = 2, lower_wires = 6, lower_electrodes = 2"
     (tmp_path / "hand.toml").write_text(
         f'[[buses]]\nname = "can0"\ninterface = "udp_multicast"\nchannel = "{multicast_group}"\n'
-        f'[sync]\nperiod_ms = 50\n[[patches]]\nname = "thumb"\nnode_id = 5\n'
+        f'[sync]\nperiod_ms = 250\n[[patches]]\nname = "thumb"\nnode_id = 5\n'
         f'layout = {{ preset = "staggered", {sizes} }}\n'
     )
     return tmp_path
@@ -225,6 +225,33 @@ def test_a_signal_while_child_processes_start(tmp_path: Path, turn: int, number:
         preexec_fn=lambda: [signal.signal(each, signal.SIG_DFL) for each in SIGNALS],
     )
     assert (done.returncode, done.stderr) == (128 + number, "")
+
+
+LATE = """
+import os, sys
+
+class Late:
+    def __del__(self):
+        os.kill(os.getpid(), {number})
+
+sys.modules["late"] = Late()  # freed when Python frees the modules, after its handlers
+sys.argv = ["skinnode", "hand", "new"]
+from skinnode.cli.main import main
+main()
+"""
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_one_while_python_frees_its_modules_does_not_matter(number: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LATE.format(number=int(number))],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+        preexec_fn=lambda: [signal.signal(each, signal.SIG_DFL) for each in SIGNALS],
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_second_one_does_not_matter(folder: Path) -> None:

@@ -74,8 +74,8 @@ def test_a_node_that_is_replugged_runs_again_and_the_other_does_not_notice(
         other = stats.patches["p0"]
         numbers = scans(take(undisturbed, other.solved - 10))
         assert (other.withheld, other.assembler.scans_torn, other.assembler.scans_missed) == (0, 0, 0)
-        # the one processor of a guest may stand still for a period: then a scan is overtaken, and counted
-        assert other.skipped <= (1 if crossing_hand.buses[0].interface == "socketcan" else 0)
+        # a machine may stand still for a period: then a scan is overtaken, and counted
+        assert other.skipped < other.offered / 10
         assert numbers[-1] - numbers[0] + 1 - len(numbers) <= other.skipped
 
 

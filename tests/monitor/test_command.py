@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from skinnode.config import HandConfig
-from skinnode.host import Host
+from skinnode.host import Condition, Host
 from skinnode.record import Recorder, replay
 from vcan_sim.fleet import Fleet
 
@@ -51,7 +51,10 @@ def test_json_of_a_hand_that_is_not_there_is_a_fault(
 @pytest.mark.real_time
 def test_json_of_a_recording(tmp_path: Path) -> None:
     hand, path = a_hand(2, sync={"period_ms": 200}), tmp_path / "run.log"
-    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder):
+    with Fleet(hand), Recorder(hand, path) as recorder, Host.from_config(hand, tap=recorder) as host:
+        for name in ("p0", "p1"):
+            while host.health(name).condition is not Condition.OPERATIONAL:
+                time.sleep(0.05)
         time.sleep(1.5)
     solved = len(list(replay(path)))
     done = run("--replay", str(path), "--speed", "2", "--json")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for a pipe, in columns; greater than the length of skinnode's longest line."""
+"""Console width for a pipe, in columns; greater than the length of the longest line printed."""
 
 
 def print_json(value: Any) -> None:
@@ -80,7 +80,7 @@ def _console_type() -> type[Console]:
 
 
 def table(*columns: str, right: tuple[str, ...] = ()) -> Table:
-    """Return an empty table with few rules; ``right`` names the numeric columns, which are right-aligned."""
+    """Make an empty table whose only rule is below the header; ``right`` names the right-aligned columns."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 

@@ -43,7 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Return a wrapper of ``stream`` that escapes control characters and those its encoding lacks."""
+    """Return a wrapper of ``stream`` that escapes control characters and those missing from its encoding."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)

@@ -89,7 +89,7 @@ def _bus_faults(running: Host, stats: HostStats) -> list[str]:
     for name in stats.buses:
         bus = running.bus_health(name)
         if bus.no_sync:
-            faults.append(f"{name}: no SYNC of its master is heard")
+            faults.append(f"{name}: no SYNC received from its master")
         if bus.controller in ("error warning", "error passive", "bus-off"):
             faults.append(f"{name}: its controller is {bus.controller} at the end")
     return faults

@@ -78,7 +78,7 @@ def stability(
 ) -> None:
     """Solve every hard case with many seeds; report error, standard deviation, status and verdict.
 
-    Exit status 1 if any wire is CONVERGED and wrong.
+    Exit status 1 if any wire is CONVERGED but wrong.
     """
     from skinnode.bench import stability as bench
     from skinnode.bench.verdict import named
@@ -113,7 +113,7 @@ def accuracy(
 ) -> None:
     """Measure error versus time, noise and code width; the coverage of intervals; and the time per frame.
 
-    Exit status 1 if a requirement is not met; times depend on the machine and are not counted.
+    Exit status 1 if a requirement is not met, except for times, which depend on the machine.
     """
     from skinnode.bench import accuracy as bench
 
@@ -185,7 +185,7 @@ def node(
         typer.echo(f"{row['what']:30}{row['us']:8.1f}")
     typer.echo(
         "\nexact pacing is for a board; thrifty pacing is for many nodes on one machine, with bursts\n"
-        "at the same mean pace. The figures include the effect of other work on this machine."
+        "at the same mean rate. The figures include the effect of other work on this machine."
     )
     _write(json, figures)
 
@@ -204,7 +204,7 @@ def pipeline(
 ) -> None:
     """Run four full buses with sixteen patches through a host and measure losses, latency and CPU load.
 
-    Exit status 1 if a frame was lost or a sum does not agree. Times are reported but not counted.
+    Exit status 1 if a frame was lost or the frame counts do not add up. Times do not affect it.
     """
     from skinnode.bench import pipeline as bench
 
@@ -245,8 +245,8 @@ def soak(
     """Run a simulated hand under random faults for minutes or hours.
 
     Frames of every kind are dropped, the processor is starved, and the kernel cache is damaged at the start.
-    The host must survive, every patch must recover, every sum must be exact, and memory, threads and file
-    descriptors must not grow. Exit status 1 if any of this fails.
+    The host must survive, every patch must recover, all frame counts must add up, and memory, threads and
+    file descriptors must not grow. Exit status 1 if any of this fails.
     """
     from skinnode.bench import soak as bench
 

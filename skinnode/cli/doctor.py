@@ -1,4 +1,4 @@
-"""``skinnode doctor [HAND.toml]``: reports faults, the certainty of each finding, and the remedy."""
+"""``skinnode doctor [HAND.toml]``: reports faults, each with its certainty and its remedy."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def _summary(groups: list[Group]) -> str:
     from skinnode.text.words import counted
 
     if not groups:
-        return "no fault found in what was checked"
+        return "the checks that were made found no fault"
     below = sum(len(group.consequences) for group in groups)
     causes = counted(len(groups), "finding")
     return f"{causes} with {counted(below, 'consequence')}" if below else causes

@@ -28,10 +28,10 @@ def check(
 ) -> None:
     """Validate a hand file and the files it names, and compute the load of its buses.
 
-    For each bus the command prints the planned load, with every frame at its longest and with random data;
-    the worst-case time from SYNC to the end of each patch's summary, also as a fraction of the SYNC period;
-    and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if a bus needs more than
-    its max_load, 2 if the file cannot be used.
+    For each bus the command prints the planned load, with every frame at its maximum length and with random
+    data; the worst-case time from SYNC to the end of each patch's summary, also as a fraction of the SYNC
+    period; and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if a bus needs
+    more than its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
@@ -172,7 +172,7 @@ def _remarks(plan: BusPlan) -> list[str]:
     late = [s.patch for s in plan.scans if s.worst_s is None or s.worst_s > plan.period_s]
     if not late:
         return []
-    return [f"note: in the worst case a scan of {', '.join(late)} has not ended at the next SYNC"]
+    return [f"note: in the worst case, a scan of {', '.join(late)} does not end before the next SYNC"]
 
 
 @app.command()

@@ -63,7 +63,9 @@ def set_node(
     serial: Annotated[
         int | None,
         typer.Option(
-            min=0, max=0xFFFF_FFFF, help="Serial number of the node; default: the only node without one."
+            min=0,
+            max=0xFFFF_FFFF,
+            help="Serial number of the node; default: that of the only node without a node-ID.",
         ),
     ] = None,
     node_id: Annotated[
@@ -95,7 +97,7 @@ def set_node(
     """Set the node-ID or bit rate of one node, and store them.
 
     A node that already has a node-ID is reset so that the new one takes effect. Exit status 0 if everything
-    was done, 1 if the node did not store or did not boot, 2 if nothing could be done.
+    was done, 1 if the node did not store its settings or did not boot, 2 if nothing could be done.
     """
     from skinnode.canopen import indices as od
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress

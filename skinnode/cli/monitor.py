@@ -141,7 +141,7 @@ def _plan(hand: Path | None, interface: str | None, channel: str | None, simulat
 def _running(
     stack: ExitStack, plan: HandConfig, stop: threading.Event, simulate: bool, quiet: bool
 ) -> Source:
-    """Return a source that runs a host, closed by ``stack``. Raises as :meth:`Host.from_config`."""
+    """Return a source that runs a host; ``stack`` closes the source. Raises as :meth:`Host.from_config`."""
     from skinnode.cli._console import progress
     from skinnode.compiled.jit import is_cold
     from skinnode.host import Host
@@ -169,7 +169,7 @@ def _running(
 
 
 def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
-    """Return a source that plays a recording, closed by ``stack``."""
+    """Return a source that plays a recording; ``stack`` closes the source."""
     from skinnode.monitor.source import ReplaySource
     from skinnode.record import replay
 
@@ -186,7 +186,7 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
     app.run(mouse=False)  # the terminal keeps the mouse, for selecting and copying text
     if app.failure is not None:
         raise app.failure
-    if app.return_code:  # a defect of the screen; textual has printed it
+    if app.return_code:  # a defect in the screen's code; textual has printed it
         raise typer.Exit(2)
     if app.terminal_is_deaf:  # output would not be visible
         raise typer.Exit(1 if app.faults.lines else 0)

@@ -57,7 +57,7 @@ def node(
         ),
     ] = None,
     strict_timing: Annotated[
-        bool, typer.Option("--strict-timing", help="Keep time to 0.2 ms instead of 2 ms; needs more CPU.")
+        bool, typer.Option("--strict-timing", help="Keep time to within 0.2 ms, not 2 ms; needs more CPU.")
     ] = False,
     seconds: Seconds = None,
     as_json: JsonLines = False,

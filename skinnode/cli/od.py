@@ -176,7 +176,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. A refusal raises SdoAbort for a single object, and is listed for several."""
+    """Read the objects. If there is only one, a refusal raises SdoAbort; otherwise it is listed."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

@@ -108,5 +108,5 @@ def _faults(run: Replay) -> list[str]:
     for name, stream in run.patch_stats().items():
         found += [f"{name}: {text}" for text in losses_of_stream(stream).values()]
         if not stream.offered and not run.stopped:
-            found.append(f"{name}: no scan that could be decoded")
+            found.append(f"{name}: no scan could be decoded")
     return found

@@ -149,7 +149,7 @@ def _print_bus(found: Discovery, place: Place) -> None:
             f"vendor:product {_vendor_product(address.vendor_id, address.product_code)}"
         )
     if found.more_unconfigured:
-        out.print("more nodes without a node-ID: skinnode lss list")
+        out.print("there are more nodes without a node-ID; to find them, run: skinnode lss list")
     nodes = counted(len(found.nodes), "node")
     out.print(f"{nodes} on {place.bus.interface} {place.bus.channel}, {found.seconds:.1f} s")
 

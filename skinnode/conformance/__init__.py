@@ -4,7 +4,7 @@
 ``dut`` (the device under test) build on both and serve the cases. ``run`` resets the device before each case
 and restores its configuration; ``report`` and ``html_report`` write the results.
 
-The suite knows a node only through its EDS and its frames. It deliberately has its own tester, SDO client,
+The suite relies only on a node's EDS and its frames. It deliberately has its own tester, SDO client,
 EDS reader and constants, because code shared with the node would share the node's errors.
 """
 

@@ -24,7 +24,7 @@ class Verdict(StrEnum):
 
 
 class NotApplicable(Exception):
-    """The device does not offer what the case checks.
+    """The device does not offer the feature that the case checks.
 
     The text names the object, EDS entry or response that proves it.
     """

@@ -71,7 +71,7 @@ def name(code: int) -> str:
 
 
 def crc16(data: bytes) -> int:
-    """Return the CRC of a block transfer: x¹⁶ + x¹² + x⁵ + 1, start value 0 (7.2.4.3.16)."""
+    """Return the CRC of a block transfer: x¹⁶ + x¹² + x⁵ + 1, initial value 0 (7.2.4.3.16)."""
     crc = 0
     for byte in data:
         crc ^= byte << 8

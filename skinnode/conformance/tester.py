@@ -100,7 +100,7 @@ class Tester:
         Args:
             can_id: CAN-ID of a data frame.
             within_s: Maximum wait.
-            match: Further condition.
+            match: Additional condition that the frame must meet.
 
         Returns:
             The frame; None if none arrives within ``within_s``.

@@ -34,7 +34,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Pause without fields, s, which shows that all scans of a SYNC are solved and no others have arrived."""
+"""Time without a new field, s, which shows that all scans of a SYNC are solved and no others have arrived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +279,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the number of losses that the host knows of: frames its queue dropped, and missing chunks."""
+    """Return the number of losses that the host counted: frames dropped by its queue, and missing chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())

@@ -63,7 +63,7 @@ def simulated(hand: HandConfig) -> Iterator[None]:
 
 
 def _run_nodes(hand: HandConfig, parent: Connection) -> None:
-    """Run the nodes until the parent closes its end of the pipe, as also happens if the parent is killed."""
+    """Run the nodes until the parent closes its end of the pipe or is killed."""
     import signal
 
     from vcan_sim.fleet import Fleet

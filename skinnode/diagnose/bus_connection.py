@@ -40,7 +40,7 @@ class State(NamedTuple):
 
 
 def no_answer(wrong: str) -> str:
-    """Describe a node without a valid SDO answer; ``wrong`` is its newest answer, or empty."""
+    """Describe a node without a valid SDO answer; ``wrong`` is its newest invalid answer, or empty."""
     if not wrong:
         return "does not answer SDO requests"
     return f"answers SDO requests with data that is not a CiA 301 answer (newest: {wrong})"

@@ -32,7 +32,7 @@ from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
-"""Number of scans for a noise estimate; they determine its standard deviation to 10 %."""
+"""Number of scans for a noise estimate, which is then accurate to 10 %."""
 
 LONGEST_S: Final = 15.0
 """Maximum wait for scans, whatever the period."""
@@ -41,7 +41,7 @@ DEFAULT_NOISE: Final = 3e-6
 """Relative noise assumed for the converter if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses before the attempts to read a node; a host that reads a baseline occupies it for 0.1 to 0.3 s."""
+"""Pauses before attempts to read a node; a host reading a baseline keeps the node busy for 0.1 to 0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -167,7 +167,7 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Ask several times if necessary; return the answer, or the reason why there is none.
+    """Try a read several times if necessary; return its result, or why it failed.
 
     A running host may access the node at the same time, and a server handles one transfer at a time.
     """
@@ -286,8 +286,8 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
     """Count frames, by COB-ID, that neither a service, a node nor ``others`` in the hand file explains.
 
-    COB-IDs in the pre-defined connection set of a node that was found are attributed to it, whatever the
-    device; those of a patch that does not answer, to a host that polls it.
+    COB-IDs in the pre-defined connection set of a node that was found are attributed to that node,
+    whatever the device. Those of a patch that does not answer are attributed to a host that polls the patch.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}

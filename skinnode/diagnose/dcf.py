@@ -111,7 +111,7 @@ def _with_value(entry: EdsEntry, value: str | None, as_bytes: str | None) -> Eds
         try:
             return replace(entry, given=bytes.fromhex(as_bytes))
         except ValueError:
-            return entry  # no bytes, so another tool wrote it
+            return entry  # not hexadecimal, so another tool wrote it
     if value and entry.data_type == _VISIBLE_STRING:  # exact, because trailing zeros are written as bytes
         return replace(entry, given=octets(value.strip()))
     return replace(entry, default=value.strip()) if value else entry

@@ -1,7 +1,7 @@
 """Finds the nodes on a bus, by SDO, by heartbeats and by LSS.
 
-Every node-ID is asked for its device type while heartbeats are recorded. LSS finds nodes without a node-ID.
-Nothing is written except LSS mode switches, which concern only nodes without a node-ID.
+The device type of every node-ID is requested while heartbeats are recorded. LSS finds nodes without a
+node-ID. Nothing is written except LSS mode switches, which concern only nodes without a node-ID.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="discovery") as pool:
         try:
             lss = pool.submit(find_unconfigured, connection)
-            progress("asking node-IDs 1 to 127")
+            progress("querying node-IDs 1 to 127")
             answered = _sweep(connection)
             progress(f"{counted(len(answered), 'node answers', 'nodes answer')}; reading identities")
             jobs = [pool.submit(_examine, connection, node_id, count) for node_id, count in answered.items()]
@@ -159,7 +159,7 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Return the nodes without a node-ID, and whether there are others that time did not allow to find.
+    """Return the nodes without a node-ID, and whether there are more that were not found in time.
 
     The nodes return to LSS waiting mode.
     """
@@ -204,7 +204,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
     if not duplicate and identity[:2] == [od.VENDOR_ID, od.PRODUCT_CODE]:
         strangers = _number(connection, node_id, od.REJECTED_FRAMES, 7)
         if strangers:
-            duplicate = f"the node received its own node-ID from another node {strangers} times (0x2040:7)"
+            duplicate = f"another node sent boot-ups or heartbeats with this ID (0x2040:7 = {strangers})"
     heartbeat_s = connection.heartbeat_s(node_id)
     state = connection.state(node_id, heartbeat_s, guarding=not connection.guarded(node_id))
     return FoundNode(
@@ -255,7 +255,7 @@ def _two_serials(connection: BusConnection, node_id: int) -> str:
         return ""
     serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
     shown = " and ".join(map(str, serials))
-    return f"one request got {len(answers)} answers" + (f": serials {shown}" if shown else "")
+    return f"one SDO request received {len(answers)} answers" + (f": serials {shown}" if shown else "")
 
 
 def _number(connection: BusConnection, node_id: int, index: int, subindex: int) -> int | None:

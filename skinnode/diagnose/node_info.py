@@ -56,7 +56,7 @@ class PatchInfo:
     """Wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
-    """Number of frames that the node ignored, by reason; reasons with none are left out."""
+    """Number of frames that the node ignored, by reason; reasons with a count of 0 are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class NodeInfo:
         found = [f"error register: {register_text(self.error_register)}"] if self.error_register else []
         if self.patch is not None:
             if self.patch.baseline_missing:
-                found.append(f"{self.patch.baseline_missing} crossings have no baseline: skinnode tare")
+                found.append(f"{self.patch.baseline_missing} crossings have no baseline; run skinnode tare")
             for text, wires in (
                 ("upper wires open", self.patch.open_upper),
                 ("upper wires shorted", self.patch.shorted_upper),

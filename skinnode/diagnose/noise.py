@@ -21,19 +21,19 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans; fewer give the standard deviation with an error of more than a quarter."""
+"""Minimum number of scans; with fewer, the standard deviation is in error by more than a quarter."""
 
 _MOST_SCANS: Final = 64
 """Maximum number of scans used, the newest; computing time grows with its square."""
 
 _FLOOR: Final = 8
-"""Number of singular values that form the floor of a patch; they give the noise level to a fifth."""
+"""Number of singular values that form the floor of a patch; they give the noise level to within a fifth."""
 
 _MOVED: Final = 6.0
 """Minimum motion of a touched crossing, in units of the stated noise."""
 _EXPLAINED: Final = 2.0
 """Minimum ratio of the motion of a touched crossing to its unexplained residual. Noise with 25 degrees of
-freedom exceeds it once in a million."""
+freedom exceeds this ratio once in a million crossings."""
 _TOUCHED: Final = 2
 """Minimum number of crossings that move together on touched skin; a loose contact moves only one."""
 _STEP: Final = 20.0

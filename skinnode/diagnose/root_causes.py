@@ -2,8 +2,8 @@
 
 One overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All these findings
 are true, but none of them is the fault that must be repaired. A rule names a cause and its possible
-consequences, at the same patch or at every patch of a bus. If the text of a finding does not decide, its
-evidence does: emergencies follow from an overload only if each of their texts reports an overrun.
+consequences, at the same patch or at every patch of a bus. If the text of a finding is ambiguous, its
+evidence decides: emergencies follow from an overload only if each of their texts reports an overrun.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Rule:
     cause: str
     follow: tuple[str, ...]
     evidence: Mapping[str, str]
-    """By pattern of ``follow``: a pattern that each part of the evidence must match for the finding to count
-    as a consequence."""
+    """Evidence pattern for each pattern of ``follow``; every part of the evidence must match it for the
+    finding to count as a consequence."""
 
 
 _HOLES: Final = ("scans with holes", "whole scans are missing")

@@ -109,7 +109,7 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of a scan's SYNC: the newest one before its first frame with the same counter."""
+        """Return the time of a scan's SYNC: the latest with its counter or none, before its first frame."""
         for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None

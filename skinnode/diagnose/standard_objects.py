@@ -88,7 +88,7 @@ _MANY: Final = (
 SINGLE: Final = tuple(_ONE)
 """Indices of objects that occur once."""
 SERIES: Final = tuple(indices for indices, _ in _MANY)
-"""Index ranges of objects that may occur several times, in contiguous order from the first index."""
+"""Index ranges of objects that may occur several times, numbered consecutively from the first index."""
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:

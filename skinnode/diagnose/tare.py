@@ -66,7 +66,7 @@ class Tared:
 def refusal(patch: PatchConfig, bus: BusConfig) -> str:
     """Return why the hand file forbids taring this patch; empty if it allows it."""
     if patch.baseline is not None:
-        return f"its baseline is kept in {patch.baseline}, which a host would write back"
+        return f"its baseline is kept in {patch.baseline}, from which a host would restore it"
     if bus.role == "guest" and bus.guest_sends == "nothing":
         return f"the hand sends nothing on {bus.name} (role guest, guest_sends nothing)"
     return ""

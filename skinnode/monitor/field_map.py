@@ -30,7 +30,7 @@ Colours = Literal["rgb", "ansi", "none"]
 Line = list[Segment]
 """Line of the screen, or a part of it."""
 
-# Five points of matplotlib's "magma" (CC0), in which equal steps of depth look equally bright apart.
+# Five points of matplotlib's "magma" (CC0), where equal steps of depth look like equal steps of brightness.
 _MAGMA: Final = np.array([(0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)], float)
 LEVELS: Final = 24
 """Number of shades. More shades would be indistinguishable and take longer to draw and to transmit."""
@@ -214,7 +214,7 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
     """Draw shear as arrows; larger shear is brighter.
 
-    If there is room, each electrode has an arrow; with more room there are arrows in between.
+    If there is room, each electrode has an arrow; with more room there are also arrows between electrodes.
     """
     colours = style.colours
     wires, electrodes = surface.depth_m.shape

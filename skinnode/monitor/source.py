@@ -89,11 +89,11 @@ class Source(Protocol):
         """End the recording and return its final statistics."""
 
     def close(self) -> None:
-        """Release what the source holds."""
+        """Release the source's resources."""
 
 
 class HostSource:
-    """Source for a running host, which its owner closes."""
+    """Source for a running host; the caller closes the host."""
 
     live = True
 
@@ -164,7 +164,7 @@ class HostSource:
         return ended
 
     def close(self) -> None:
-        """Release what the source holds."""
+        """Release the source's resources."""
         if self._recorder is not None:
             self.stop_recording()
         self._fields.close()
@@ -239,7 +239,7 @@ class ReplaySource:
         raise SkinError("this is a recording already")
 
     def close(self) -> None:
-        """Release what the source holds."""
+        """Release the source's resources."""
         self._run.stop()
         self._thread.join()
         self._running.close()

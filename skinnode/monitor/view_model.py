@@ -207,7 +207,7 @@ def _latencies_s(history: Sequence[Snapshot], name: str) -> list[float]:
 
 @functools.lru_cache(maxsize=128)
 def upper_m(layout: LayoutConfig) -> Float:
-    """Return (U, N, 3) positions at rest, m; a placeholder if only the patch knows its layout."""
+    """Return (U, N, 3) positions at rest, m; a placeholder if only the patch stores its layout."""
     return layout.build().upper_m
 
 
@@ -223,7 +223,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # a missing patch loses everything
+        lossy = []  # a missing patch loses every frame
     level: Level = "good"
     if lossy or words:
         level = "note"
@@ -258,7 +258,7 @@ def _bus_view(
     if health.away is not None:
         words.append(f"away: {health.away}")
     if health.no_sync:
-        words.append("no SYNC from its master")
+        words.append("no SYNC received from its master")
     if health.controller not in (None, "error active"):
         words.append(f"the controller is {health.controller}")
     lost = health.kernel_dropped + health.dropped

@@ -98,7 +98,7 @@ def test_a_scan_that_may_outlast_its_period_is_noted(tmp_path: Path) -> None:
     )
     found = command("check", str(path))
     assert found.exit_code == 0
-    assert "note: in the worst case a scan of p has not ended at the next SYNC" in found.stdout
+    assert "note: in the worst case, a scan of p does not end before the next SYNC" in found.stdout
 
 
 def test_a_file_that_cannot_be_used(tmp_path: Path) -> None:

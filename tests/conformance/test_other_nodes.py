@@ -148,7 +148,7 @@ def test_a_sheet_is_read() -> None:
         (("2=0x1017", "2=0x1016"), "0x1016 is listed only"),
         (("SubNumber=2", "SubNumber=3"), "SubNumber=3, but 2"),
         (("VendorNumber=0x42", "VendorNumber=0x43"), "vendornumber=0x43, the device reports 0x00000042"),
-        (("DefaultValue=0\n[1018]", "DefaultValue=300\n[1018]"), "default 300 exceeds its type"),
+        (("DefaultValue=0\n[1018]", "DefaultValue=300\n[1018]"), "default 300 exceeds the range of its type"),
         (("AccessType=wo", "AccessType=write"), "access type 'write'"),
         (("DataType=0x9", "DataType=0x99"), "data type 0x0099"),
     ],

@@ -134,7 +134,7 @@ def test_a_patch_without_a_baseline_is_a_fault(bus: BusConfig, powered: Powered)
     powered(bus, 5, source=Rest(LAYOUT, lambda ohm: np.full_like(ohm, np.inf)))
     done = run(["info", "5"], bus)
     assert done.status == 1
-    assert "12 crossings have no baseline: skinnode tare" in done.stdout
+    assert "12 crossings have no baseline; run skinnode tare" in done.stdout
 
 
 def test_fits_a_terminal_of_80_columns_and_is_whole_in_a_pipe(

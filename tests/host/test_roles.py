@@ -154,12 +154,12 @@ def test_a_guest_that_hears_no_sync_says_so(hand: HandConfig, rack: Rack, listen
     with Host.from_config(hand) as host:
         events = host.events()
         assert eventually(lambda: host.bus_health("can0").no_sync)
-        assert faults_and_notes(host)[0] == ["can0: no SYNC of its master is heard"]
+        assert faults_and_notes(host)[0] == ["can0: no SYNC received from its master"]
         assert "no SYNC" in {told.what for told in iter(lambda: events.get(0.5), None)}
         with SyncProducer([(listener.send, Ticks(240))], hand.sync.period_s):
             assert eventually(lambda: not host.bus_health("can0").no_sync)
             take(host.fields(timeout_s=10), 4)
-            assert "can0: no SYNC of its master is heard" not in faults_and_notes(host)[0]
+            assert "can0: no SYNC received from its master" not in faults_and_notes(host)[0]
         assert eventually(lambda: host.bus_health("can0").no_sync)  # and again
 
 

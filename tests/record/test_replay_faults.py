@@ -176,7 +176,7 @@ def test_a_bad_line_costs_its_patch_alone(
     assert played.fields == [field for field in whole.fields if field["patch"] == "p1"]
     complaint, *others = played.faults
     assert complaint.startswith(f"x.jsonl line {number + 1}: ")
-    assert others == ["p0: no scan that could be decoded"]
+    assert others == ["p0: no scan could be decoded"]
 
 
 @pytest.mark.parametrize("frames", ["[1]", "null", "1e999", '"x"', "-5"])

@@ -79,7 +79,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
         yield f"{entry}: data type 0x{entry.data_type:04X} is not defined"
         return
     if entry.mappable and not (entry.into_rpdo or entry.into_tpdo):
-        yield f"{entry}: mappable, but its access suits neither RPDOs nor TPDOs"
+        yield f"{entry}: mappable, but its access type permits neither RPDOs nor TPDOs"
     if entry.mappable and entry.data_type == _DOMAIN:
         yield f"{entry}: mappable, although a DOMAIN"
     try:
@@ -89,7 +89,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
         yield f"{entry}: default {entry.default!r} does not fit its type"
         return
     if value is not None and value >= 1 << 8 * entry.size:
-        yield f"{entry}: default {entry.default} exceeds its type"
+        yield f"{entry}: default {entry.default} exceeds the range of its type"
 
 
 def _doubtful(entry: EdsEntry, node_id: int) -> Iterator[str]:

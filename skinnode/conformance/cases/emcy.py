@@ -29,7 +29,9 @@ def register(dut: Dut) -> None:
 
 
 @case(
-    "EMCY-03", "0x1003, the error history, is empty after a reset: 0, and no data at sub-index 1", "7.5.2.4"
+    "EMCY-03",
+    "0x1003, the error history, is empty after a reset: its count is 0, and sub-index 1 has no data",
+    "7.5.2.4",
 )
 def history(dut: Dut) -> None:
     dut.need(_HISTORY, 1)

@@ -38,7 +38,7 @@ def answered(dut: Dut) -> None:
 
 @case(
     "GUARD-03",
-    "The toggle bit starts at 0, alternates, and is 0 again after reset communication",
+    "The toggle bit starts at 0, alternates, and is 0 again after a communication reset",
     "7.2.8.3.2.1",
 )
 def toggle(dut: Dut) -> None:
@@ -46,7 +46,7 @@ def toggle(dut: Dut) -> None:
     for number in range(5):
         guarded(dut, 127, number % 2, f"answer {number + 1}")
     dut.reset(RESET_COMMUNICATION)
-    guarded(dut, 127, 0, "first after reset communication")
+    guarded(dut, 127, 0, "first after a communication reset")
 
 
 @case("GUARD-04", "Remote frames for other node-IDs are not answered", "7.2.8.3.2.1; 7.3.3")

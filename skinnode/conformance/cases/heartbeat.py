@@ -89,7 +89,7 @@ def too_late(dut: Dut) -> None:
 
 @case(
     "HB-07",
-    "After reset node, the first heartbeat starts monitoring; 0x1029 applies if heartbeats stop",
+    "After a node reset, the first heartbeat starts monitoring; 0x1029 applies if heartbeats stop",
     "7.2.8.2.2.2, 7.5.2.32",
 )
 def after_reset(dut: Dut) -> None:

@@ -58,7 +58,7 @@ def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
         dut.sdo.aborts(request, index, subindex, _WRONG_SIGNATURE, what)
     _compare(dut, after, "after the wrong signature")
     dut.reset()
-    _compare(dut, before, "after the wrong signature and reset node")
+    _compare(dut, before, "after the wrong signature and a node reset")
 
 
 def _store(dut: Dut, subindex: int) -> None:
@@ -66,7 +66,7 @@ def _store(dut: Dut, subindex: int) -> None:
     _, after = _change(dut)
     dut.store(subindex)
     dut.reset()
-    _compare(dut, after, "stored, after reset node")
+    _compare(dut, after, "stored, after a node reset")
 
 
 def _restore(dut: Dut, subindex: int) -> None:
@@ -80,7 +80,7 @@ def _restore(dut: Dut, subindex: int) -> None:
     dut.reset()
     defaults = {index: dut.need(index).default_bytes(dut.node_id) for index in after}
     _compare(
-        dut, {i: d for i, d in defaults.items() if d is not None}, "after restoring defaults and reset node"
+        dut, {i: d for i, d in defaults.items() if d is not None}, "after restoring defaults and a node reset"
     )
 
 
@@ -89,7 +89,7 @@ def store_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 1)
 
 
-@case("OTHER-02", "0x1010:01 stores with the signature 'save': values survive reset node", "7.5.2.13")
+@case("OTHER-02", "0x1010:01 stores with the signature 'save': values survive a node reset", "7.5.2.13")
 def store_all(dut: Dut) -> None:
     _store(dut, 1)
 
@@ -99,7 +99,7 @@ def restore_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 1)
 
 
-@case("OTHER-04", "0x1011:01 restores with the signature 'load': defaults after reset node", "7.5.2.14")
+@case("OTHER-04", "0x1011:01 restores with the signature 'load': defaults after a node reset", "7.5.2.14")
 def restore_all(dut: Dut) -> None:
     _restore(dut, 1)
 
@@ -109,7 +109,7 @@ def store_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 2)
 
 
-@case("OTHER-06", "0x1010:02 (communication) stores with 'save': values survive reset node", "7.5.2.13")
+@case("OTHER-06", "0x1010:02 (communication) stores with 'save': values survive a node reset", "7.5.2.13")
 def store_communication(dut: Dut) -> None:
     _store(dut, 2)
 
@@ -119,7 +119,7 @@ def restore_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 2)
 
 
-@case("OTHER-08", "0x1011:02 (communication) restores with 'load': defaults after reset node", "7.5.2.14")
+@case("OTHER-08", "0x1011:02 (communication) restores with 'load': defaults after a node reset", "7.5.2.14")
 def restore_communication(dut: Dut) -> None:
     _restore(dut, 2)
 
@@ -137,7 +137,7 @@ def verify(dut: Dut) -> None:
     dut.reset()
     got = dut.sdo.integer(_VERIFY, 1), dut.sdo.integer(_VERIFY, 2)
     if got != (date, time):
-        raise Failed(f"date {date} and time {time} after reset node", f"{got[0]} and {got[1]}")
+        raise Failed(f"date {date} and time {time} after a node reset", f"{got[0]} and {got[1]}")
     _change(dut)
     got = dut.sdo.integer(_VERIFY, 1), dut.sdo.integer(_VERIFY, 2)
     if got != (0, 0):

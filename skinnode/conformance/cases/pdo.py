@@ -36,7 +36,7 @@ _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check COB-IDs (the first four as pre-defined, valid COB-IDs distinct) and transmission types."""
+    """Check transmission types, and COB-IDs: the first four as pre-defined, and all valid ones distinct."""
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -99,8 +99,11 @@ def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
     return set_up(dut, pdo, PdoSetup(253, remote=True)), payload_bytes(mapped(dut, pdo))
 
 
-@case("PDO-04", "OPERATIONAL: types 254 and 255 are sent at the event timer, not before the inhibit time",
-      "7.2.2.2, 7.5.2.37")  # fmt: skip
+@case(
+    "PDO-04",
+    "OPERATIONAL: types 254 and 255 are sent when the event timer elapses, not before the inhibit time",
+    "7.2.2.2, 7.5.2.37",
+)
 def event_driven(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
         length = payload_bytes(mapped(dut, pdo))

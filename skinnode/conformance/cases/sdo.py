@@ -31,7 +31,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that fits. Raises NotApplicable, which names what is lacking."""
+    """Return the first entry that fits. Raises NotApplicable, naming ``lack``, if none fits."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -211,7 +211,7 @@ def default_sdo(dut: Dut) -> None:
 
 @case(
     "SDO-13",
-    "0x1000 can be read by the transfer that the server chooses, with the announced length",
+    "0x1000 can be read by whichever transfer the server chooses, with the announced length",
     "7.2.4.3.5",
 )
 def read_short(dut: Dut) -> None:

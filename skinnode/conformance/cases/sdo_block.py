@@ -125,7 +125,7 @@ def further_servers(dut: Dut) -> None:
             dut.sdo.aborts(b"\x40" + mux(index, 1), index, 1, NO_OBJECT, f"read of 0x{index:04X}:01")
 
 
-@case("SDO-29", "Further SDO servers are unchanged after reset communication", "7.5.2.33; 7.3.2.2")
+@case("SDO-29", "Further SDO servers are unchanged after a communication reset", "7.5.2.33; 7.3.2.2")
 def servers_after_reset(dut: Dut) -> None:
     servers = dut.eds.indices(0x1201, 0x127F)
     if not servers:
@@ -145,7 +145,7 @@ def servers_after_reset(dut: Dut) -> None:
 
 @case(
     "SDO-30",
-    "SDO clients (0x1280 to 0x12FF) stored by 0x1010:01 survive reset communication",
+    "SDO clients (0x1280 to 0x12FF) stored through 0x1010:01 survive a communication reset",
     "7.5.2.34, 7.5.2.13",
 )
 def clients_stored(dut: Dut) -> None:

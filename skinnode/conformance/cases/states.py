@@ -51,13 +51,13 @@ def boot_up(dut: Dut) -> None:
     if not changed:
         raise Failed("at least one parameter of 0x1000 to 0x1FFF that can be changed", "none")
     dut.reset()
-    _check_state(dut, 127, "after reset node")
+    _check_state(dut, 127, "after a node reset")
     for (index, subindex), value in before.items():
         if index < 0x2000:
             now = dut.sdo.read(index, subindex)
             if now != value:
                 raise Failed(
-                    f"0x{index:04X}:{subindex:02X} = {value.hex(' ')} after reset node", now.hex(" ")
+                    f"0x{index:04X}:{subindex:02X} = {value.hex(' ')} after a node reset", now.hex(" ")
                 )
 
 
@@ -98,7 +98,7 @@ def _timed(dut: Dut) -> dict[int, int]:
 
 
 def _no_pdos(dut: Dut, state: str) -> None:
-    """Check that no TPDO is sent at the event timer or after SYNC."""
+    """Check that no TPDO is sent when the event timer elapses or after SYNC."""
     can_ids = _timed(dut) if state == "PRE-OPERATIONAL" else {}
     sync(dut)
     for can_id in can_ids:
@@ -115,7 +115,7 @@ def _emcy(dut: Dut, what: str) -> None:
 
 @case(
     "STATE-03",
-    "OPERATIONAL: SDO, PDO, EMCY are served; 0x1029 applies to a lost partner",
+    "OPERATIONAL: SDO, PDO, EMCY are served; 0x1029 applies to a communication error",
     "7.3.2.2.3, 7.5.2.32",
 )
 def operational(dut: Dut) -> None:

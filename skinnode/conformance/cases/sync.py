@@ -134,7 +134,9 @@ def counter(dut: Dut) -> None:
 
 
 @case(
-    "SYNC-08", "Producer and counter, stored by 0x1010:01, start at 1 after reset node", "7.5.2.13, 7.5.2.22"
+    "SYNC-08",
+    "Producer and counter stored through 0x1010:01 start at 1 after a node reset",
+    "7.5.2.13, 7.5.2.22",
 )
 def counter_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
@@ -144,7 +146,7 @@ def counter_stored(dut: Dut) -> None:
     produce(dut)
     dut.store(1)
     dut.reset()
-    _counted(dut, [1, 2, 3], "after reset node")
+    _counted(dut, [1, 2, 3], "after a node reset")
 
 
 @case("SYNC-09", "The overflow value cannot be written while the period is not 0", "7.5.2.22")
@@ -157,7 +159,7 @@ def overflow_in_use(dut: Dut) -> None:
     dut.sdo.aborts(request, OVERFLOW, 0, _BUSY, "write to 0x1019:00 with a period in 0x1006")
 
 
-@case("SYNC-10", "The overflow value stored by 0x1010:01 survives reset node", "7.5.2.13, 7.5.2.22")
+@case("SYNC-10", "The overflow value stored through 0x1010:01 survives a node reset", "7.5.2.13, 7.5.2.22")
 def overflow_stored(dut: Dut) -> None:
     dut.need(OVERFLOW)
     dut.need_storage(STORE, 1)
@@ -167,4 +169,4 @@ def overflow_stored(dut: Dut) -> None:
     dut.reset()
     value = dut.sdo.integer(OVERFLOW)
     if value != 5:
-        raise Failed("0x1019:00 = 5 after reset node", str(value))
+        raise Failed("0x1019:00 = 5 after a node reset", str(value))

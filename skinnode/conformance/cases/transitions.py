@@ -22,7 +22,7 @@ _NAMES = {PRE_OPERATIONAL: "enter pre-operational", START: "start", STOP: "stop"
 
 
 def _application_object(dut: Dut) -> tuple[EdsEntry, bytes] | None:
-    """Change an object from 0x2000 to 0x9FFF; return it and its old value, or None if none can change."""
+    """Change an object from 0x2000 to 0x9FFF; return it and its old value, or None if none can be changed."""
     for entry in dut.eds.between(0x2000, 0x9FFF):
         if not (entry.readable and entry.writable and entry.data_type in UNSIGNED and entry.size <= 4):
             continue
@@ -61,7 +61,7 @@ def resets(dut: Dut) -> None:
     entry, before = changed
     written = dut.sdo.read(entry.index, entry.subindex)
     for reset, wanted, what in (
-        (RESET_COMMUNICATION, written, "after reset communication"),
+        (RESET_COMMUNICATION, written, "after a communication reset"),
         (RESET_NODE, before, "after reset node"),
     ):
         dut.reset(reset)
@@ -71,7 +71,7 @@ def resets(dut: Dut) -> None:
 
 
 def _transition(dut: Dut, command: int, *others: int) -> None:
-    """Check that ``command`` leads to its state after each of ``others``, with node-ID and with 0 (all)."""
+    """Check that ``command`` works after each of ``others``, sent to the node-ID and to 0 (all nodes)."""
     state, name = _COMMANDS[command], _NAMES[command]
     dut.start_heartbeat()
     for other in others:

@@ -59,7 +59,8 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
         yield found(
             "the node is missing",
             Sure.CERTAIN,
-            f"node {patch.node_id} neither answers SDO nor sends heartbeats; other nodes on {bus.name} do",
+            f"node {patch.node_id} neither answers SDO requests nor sends heartbeats; "
+            f"other nodes on {bus.name} do",
             "check its supply and connector; skinnode scan shows whether it has another node-ID",
         )
         return
@@ -92,7 +93,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
             "the serial number differs from the hand file",
             Sure.CERTAIN,
             f"serial {known(node.serial)}, hand file: {wanted.serial}",
-            "if two patches were swapped, put them back, or correct the hand file and its calibration",
+            "if two patches were swapped, swap them back, or correct the hand file and its calibration",
         )
     yield from _check_state(bus, patch, node)
 
@@ -124,7 +125,7 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
             Sure.CERTAIN,
             f"error register 0x{info.error_register:02X} ({register_text(info.error_register)}); "
             f"last: {info.errors[0] if info.errors else 'none reported'}",
-            "fix the fault that it names; skinnode info shows the error history",
+            "fix the reported fault; skinnode info shows the error history",
         )
     reported = [emergency for emergency in patch.emergencies if emergency.code]
     if reported:
@@ -133,5 +134,5 @@ def _check_state(bus: BusFacts, patch: PatchFacts, node: FoundNode) -> Iterator[
         )
         shown = "; ".join(f"{count} × {text}" for text, count in kinds.most_common(3))
         yield found(
-            "emergency messages during the examination", Sure.CERTAIN, shown, "fix the faults they name"
+            "emergency messages during the examination", Sure.CERTAIN, shown, "fix the reported faults"
         )

@@ -102,7 +102,7 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
             "this machine dropped frames",
             Sure.CERTAIN,
             f"{bus.dropped} of {bus.frames + bus.dropped}, by the kernel or the receive queue",
-            "raise net.core.rmem_max, reduce the load; the findings on scans below may follow from this",
+            "raise net.core.rmem_max or reduce the load; the findings about scans may result from this",
         )
     for patch in bus.patches:
         if patch.scans is None:

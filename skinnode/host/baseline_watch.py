@@ -21,8 +21,8 @@ _DOUBT_NS: Final = 2_000_000_000
 
 _REGISTER_NS: Final = 500_000_000
 """Minimum interval between readings of an error register that is not zero. The emergency message that clears
-an error may be lost, and the patch must be operational within a second of it. These readings cost four SDO
-frames per second."""
+an error may be lost, yet the patch must count as operational within a second of the end of the error. These
+readings take four SDO frames per second."""
 
 
 class BaselineWatch:
@@ -64,7 +64,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Read the error register of a node with an error: the frame that reports its end may be lost."""
+        """Read the error register of a node with an error: the frame that clears the error may be lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return

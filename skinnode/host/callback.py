@@ -23,7 +23,7 @@ class FieldCallback:
     """Callback that receives each field until :meth:`close` or the end of the host.
 
     Exceptions raised by the function are counted, and the first is logged with its traceback; the next field
-    is delivered nevertheless. Threads: a thread of its own calls the function; any thread may call the
+    is delivered nevertheless. Threads: a dedicated thread calls the function; any thread may call the
     methods.
     """
 
@@ -50,7 +50,7 @@ class FieldCallback:
         return self._failed
 
     def close(self) -> None:
-        """End the calls. Waits up to a second for a running call; the function itself may call it."""
+        """End the calls and wait up to a second for a running call; the function may call this method."""
         self._fields.end()
         self.join()
 

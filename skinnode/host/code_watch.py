@@ -2,15 +2,15 @@
 
 **Frozen.** A converter whose noise is visible in the codes cannot repeat the same codes for long. If the
 noise has a standard deviation of σ codes, a reading repeats its code with a probability of at most 2Φ(1/2σ) −
-1 (the value for a true resistance in the middle of a step), and n scans of m codes are all equal with at most
-that probability to the power of n·m. For a run of equal scans to count as frozen, this bound must be below
-``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file states may repeat its codes for
-hours. Therefore the stream itself must also have shown noise, that is, ``FLICKERS`` scans in which a code
-returned to its previous value (a touch or creeping rubber moves codes in one direction only), and the run
-must be ``LONGER`` times as long as any run that ended by itself. A converter that never flickers is never
-reported as frozen. Scans that contain only the changed chunks, or lack chunks, are ignored. One false alarm
-remains possible: a converter with a third of the noise in the hand file flickers while rubber creeps and is
-constant afterwards, so it may be reported once.
+1 (the value for a true resistance in the middle of a step), and the probability that n scans of m codes are
+all equal is at most that value to the power of n·m. For a run of equal scans to count as frozen, this bound
+must be below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file states may repeat
+its codes for hours. Therefore the stream itself must also have shown noise, that is, ``FLICKERS`` scans in
+which a code returned to its previous value (a touch or creeping rubber moves codes in one direction only),
+and the run must be ``LONGER`` times as long as any run that ended by itself. A converter that never flickers
+is never reported as frozen. Scans that contain only the changed chunks, or lack chunks, are ignored. One
+false alarm remains possible: a converter with a third of the noise in the hand file flickers while rubber
+creeps and is constant afterwards, so it may be reported once.
 
 **Wires.** A wire is open or shorted if all its crossings are open or shorted in a complete scan. Noise and
 drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
@@ -19,7 +19,7 @@ if the mean square of this difference exceeds ``NOISY`` times both that of the m
 that of the expected noise. A wire drifts if the resistances of all its crossings changed by the same fraction
 of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and its neighbours did not
 follow. A touch, in contrast, is uneven along a wire, and the rubber moves the adjacent wires as well.
-Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) moved a wire that far at 780,000
+Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) exceeded ``DRIFT`` on a wire at 780,000
 instants; none was mistaken for drift. Consequently, two neighbours that drift alike are not reported, nor is
 a wire while it is touched.
 """
@@ -61,7 +61,8 @@ it."""
 UNEVEN: Final = 0.05
 """Maximum deviation of a crossing from the median of its wire, as a fraction of the drift."""
 APART: Final = 0.3
-"""Minimum distance of a wire from the nearer of its neighbours, as a fraction of the drift."""
+"""Minimum difference in R / R0 between a wire and the more similar of its neighbours, as a fraction of the
+drift."""
 
 
 class WireState(enum.StrEnum):
@@ -190,8 +191,8 @@ class CodeWatch:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # The distance from rest counts too: if a touch moved the median wire, the untouched wires are
-            # away from it.
+            # The distance from rest counts too: if a touch moved the median wire, the untouched wires deviate
+            # from it.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])

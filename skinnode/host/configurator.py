@@ -277,9 +277,9 @@ class Configurator:
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
         """Read the baseline as one block, or value by value from a node without block transfer.
 
-        For 300 values, a block transfer takes 176 frames and single reads take 600. At 1 Mbit/s, this is 86
-        ms at the node's own pace compared with 75 ms plus 300 response times; single reads never occupy the
-        whole bus.
+        For 300 values, a block transfer takes 176 frames and single reads take 600. At 1 Mbit/s, the block
+        transfer takes 86 ms at the node's own pace, and the single reads take 75 ms plus 300 response times;
+        single reads never occupy the whole bus.
         """
         try:
             data = remote.read_block(od.BASELINE_DOMAIN, 4 * profile.n_codes)

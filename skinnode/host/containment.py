@@ -31,7 +31,7 @@ _LONGEST_BRIEF_S: Final = 0.02
 other subjects."""
 
 _COMPLAINTS: Final = 64
-"""Maximum number of distinct messages per subject remembered as logged; beyond it, messages are logged
+"""Maximum number of logged messages remembered per subject; when it is reached, messages may be logged
 again."""
 
 

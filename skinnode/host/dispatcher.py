@@ -52,13 +52,13 @@ class BusStats:
     controller: BusState | None
     """Newest reported state of the controller; None if none was reported."""
     foreign_ids: Mapping[int, int]
-    """Number of frames by foreign COB-ID."""
+    """Number of frames for each foreign COB-ID."""
     read: int
     """Frames of all kinds read from the interface."""
     waiting: int
     """Frames read but not dispatched yet."""
     kernel_dropped: int
-    """Frames for which the kernel had no room; 0 if the interface does not report them."""
+    """Frames dropped by the kernel for lack of buffer space; 0 if the interface does not report them."""
     dropped: int
     """Frames dropped because the receive queue was full."""
     malformed: int
@@ -188,7 +188,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames of a batch; ``others`` are its frames of types that no handler takes."""
+        """Count the frames of a batch; ``others`` are those of types that no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -217,7 +217,8 @@ class Dispatcher:
     def measure(self, now_ns: int) -> None:
         """Compute the load if an interval has passed.
 
-        This takes as long as handling forty frames, so with several buses, call it for one bus at a time.
+        This takes as long as handling forty frames, so a mainline with several buses calls it for only one
+        bus per turn.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)

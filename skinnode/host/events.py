@@ -29,7 +29,8 @@ class HealthEvent:
     subject: str
     """Name of a patch or a bus, or ``host``."""
     what: str
-    """The new condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that grew, or ``defects``.
+    """The new condition, the counter of :class:`PatchHealth` or :class:`BusHealth` that increased, or
+    ``defects``.
     """
     text: str
     """Human-readable description, without the subject."""

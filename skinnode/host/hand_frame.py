@@ -44,9 +44,11 @@ class HandFrame:
 
 
 class HandGatherer:
-    """Gatherer of fields into hand frames, in order of scan number. No thread, no clock; one owner.
+    """Assembler of hand frames from fields, in order of scan number.
 
-    A frame is ready when every awaited patch has delivered its field for the frame or a newer field. A patch
+    Has neither a thread nor a clock; only one owner may use it.
+
+    A frame is ready when every awaited patch has delivered its field for the frame, or a newer field. A patch
     that missed :data:`~skinnode.host.health.SCANS_MISSED` consecutive frames is not awaited until it delivers
     again. No patch is awaited for longer than ``patience_ns`` after the first field.
 
@@ -98,7 +100,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`next` will return the oldest frame at the latest; None if there is no frame."""
+        """Return the latest time at which :meth:`next` returns the oldest frame; None without a frame."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:

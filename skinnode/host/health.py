@@ -82,7 +82,7 @@ class PatchHealth:
     duplicate_id: bool = False
     """Whether heartbeats arrive more often than a single node sends them."""
     conflicts: int = 0
-    """Number of frames that contradict other frames of their scan: the node counts wrongly, or two nodes
+    """Number of frames that contradict other frames of their scan: the node's counter is wrong, or two nodes
     share a node-ID."""
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""

@@ -46,7 +46,7 @@ _BUS_COUNTERS: Final = {
 class HealthWatch:
     """Watch that compares the health of all patches and buses with the last check and publishes changes.
 
-    Threads: a thread of its own runs the checks, from construction to :meth:`close`.
+    Threads: a dedicated thread runs the checks, from construction to :meth:`close`.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class HealthWatch:
             why = f" ({now.reason})" if now.reason else ""
             self._publish(name, now.condition.value, f"{before.condition}, now {now.condition}{why}")
         if now.restarts_in_a_loop and not before.restarts_in_a_loop:
-            self._publish(name, "restarts in a loop", "restarts in a loop: supply, or watchdog?")
+            self._publish(name, "restarts in a loop", "restarts in a loop: check its supply and watchdog")
         if now.duplicate_id and not before.duplicate_id:
             self._publish(name, "duplicate node-ID", f"two nodes have node-ID {now.node_id}")
         for fault in sorted({*now.wires} - {*before.wires}):

@@ -46,7 +46,7 @@ class HostStats:
     malformed: tuple[CodecError, ...]
     """The first malformed frame of each bus that had one."""
     defects: Mapping[str, DefectStats]
-    """Exceptions contained by the host, by patch and by bus; ``host`` holds those of neither."""
+    """Exceptions contained by the host, by patch and by bus; ``host`` holds those that concern neither."""
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
@@ -95,15 +95,15 @@ class Host:
         cancelled: Callable[[], bool] = never,
         tap: HostTap | None = None,
     ) -> Iterator[Host]:
-        """Bring up the hand of a hand file; shut it down at the end of the ``with`` block.
+        """Bring up the hand that a hand file describes; shut it down at the end of the ``with`` block.
 
         Args:
             path: The hand file.
-            interface: See :meth:`from_config`, as for the other arguments.
-            channel: See there.
-            boot_deadline_s: See there.
-            cancelled: See there.
-            tap: See there.
+            interface: As in :meth:`from_config`, like all arguments below.
+            channel: As in :meth:`from_config`.
+            boot_deadline_s: As in :meth:`from_config`.
+            cancelled: As in :meth:`from_config`.
+            tap: As in :meth:`from_config`.
 
         Raises:
             ConfigError: if the file cannot be used.

@@ -99,7 +99,7 @@ def running_parts(hand: HandConfig, options: StartOptions) -> Iterator[HostParts
     """
     check_plan(hand)
     check_files(hand)
-    load_kernels()  # for the bus load: compiling them later would delay the mainline
+    load_kernels()  # the kernels compute the bus load; compiling them later would delay the mainline
     defects = Defects("host")
     publisher = Publisher(tuple(patch.name for patch in hand.patches), defects)
     callbacks = Callbacks(defects)
@@ -199,7 +199,7 @@ def _logged_already(error: Exception) -> None:
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:
-    """Wait for the scans of the last SYNC, so that the shutdown cuts none off."""
+    """Wait for the scans of the last SYNC, so that the shutdown interrupts none of them."""
     end_s = time.monotonic() + min(1.5 * period_s, LAST_SCAN_S)
     while not all(stream.settled(ticks.newest) for stream, ticks in streams):
         if time.monotonic() > end_s:

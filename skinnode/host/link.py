@@ -58,7 +58,7 @@ class BusLink(Dispatcher):
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
         """Why the bus is away; None while it works."""
-        self._due_s = 0.0  # when a reopened interface counts as working unless it failed
+        self._due_s = 0.0  # time from which a reopened interface counts as working, unless it fails first
         self._outages = 0
         self.t_dispatched_ns = 0
         """Monotonic time up to which all received frames have been dispatched."""

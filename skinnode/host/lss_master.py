@@ -2,7 +2,7 @@
 
 A slave that does not match stays silent, so every negative answer costs a timeout. Responses are not
 numbered: a late response to an earlier request looks like one to the current request. Therefore a node counts
-as found or selected only once it has sent its own address, which no other response equals; and after a
+as found or selected only once it has sent its own address, which is unlike any other response; and after a
 service without a response, the master waits until no late response can arrive.
 """
 
@@ -41,7 +41,7 @@ _SCAN_ANSWERS_S: Final = (0.03, 0.15)
 attempt found no node."""
 
 _TRIES: Final = 2
-"""Number of requests without a response after which no node is assumed; a busy machine may miss one."""
+"""Number of unanswered requests after which no node is assumed to exist; a busy machine may miss one."""
 
 _SETTLE: Final = 0.2
 """Maximum spread in time of several slaves' responses to one request, as a fraction of the timeout."""
@@ -52,7 +52,8 @@ _UNDER_WAY_S: Final = 0.4
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""Address parts of skinnode patches, which fastscan tries first: three or four requests instead of 96."""
+"""Address parts of skinnode patches, which fastscan tries first; this takes three or four requests instead of
+96."""
 
 
 class LssFailed(BusError):
@@ -62,8 +63,8 @@ class LssFailed(BusError):
 class LssMaster:
     """LSS master on one bus. Sends with ``send``; :meth:`on_response` takes the frames with COB-ID 0x7E4.
 
-    Threads: only one thread at a time may use it, but calls of :meth:`give_node_id` wait for each other; the
-    mainline calls :meth:`on_response`.
+    Threads: only one thread at a time may use it, but concurrent calls of :meth:`give_node_id` wait for each
+    other; the mainline calls :meth:`on_response`.
     """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
@@ -72,7 +73,7 @@ class LssMaster:
         self._dialogue = threading.Lock()
 
     def on_response(self, data: bytes, t_ns: int) -> None:
-        """Process a slave's response. Ignored, as the standard requires, unless 8 bytes long."""
+        """Process a slave's response; as the standard requires, ignore it unless it is 8 bytes long."""
         if len(data) == 8:
             self._answers.put(data)
 
@@ -222,7 +223,7 @@ class LssMaster:
         _require_done(self._must(LssCommand.CONFIGURE_BIT_TIMING, request, what), what)
 
     def store(self) -> None:
-        """Make the node store its node-ID and bit rate, so that it keeps them over a power cycle.
+        """Make the node store its node-ID and bit rate, so that it keeps them across a power cycle.
 
         Raises:
             LssFailed: if the node refuses or does not answer.

@@ -9,10 +9,10 @@ from skinnode.canopen.nmt import NmtCommand, encode
 
 
 def start(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Tell a node to become operational."""
+    """Command a node to become operational."""
     send(NMT_COB_ID, encode(NmtCommand.START, node_id))
 
 
 def stand_by(send: Callable[[int, bytes], None], node_id: int) -> None:
-    """Tell a node to become pre-operational: it then sends nothing but heartbeats, EMCY and SDO responses."""
+    """Command a node to become pre-operational: it then sends only heartbeats, EMCY and SDO responses."""
     send(NMT_COB_ID, encode(NmtCommand.ENTER_PRE_OPERATIONAL, node_id))

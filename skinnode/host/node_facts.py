@@ -1,4 +1,4 @@
-"""Facts that the host knows about a patch once its node has been configured."""
+"""Facts about a patch that are available once its node has been configured."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skinnode.protocol.profile import PatchProfile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeFacts:
-    """Facts about a patch, learned while its node was configured."""
+    """Facts about a patch, collected while its node was configured."""
 
     config: PatchConfig
     layout: PatchLayout
@@ -21,7 +21,7 @@ class NodeFacts:
     baseline_ohm: Float
     """(U, K) resistances at rest with which the node encodes, ohm."""
     serial: int | None
-    """Serial number; None if the host may not ask for it."""
+    """Serial number; None if the host is not allowed to read it."""
     heartbeat_s: float
     """Heartbeat period of the node, s."""
     checked: bool = False

@@ -142,7 +142,7 @@ class NodeSupervision:
         elif remote.monitor.said_since(NmtState.OPERATIONAL, node.since_ns):
             self._running(node, now_ns)
         elif remote.link.t_dispatched_ns > node.since_ns + START_DEADLINE_S * 1e9:
-            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL  # a state from before the command
+            silent = remote.monitor.nmt_state == NmtState.OPERATIONAL  # a state reported before the command
             self._fail(node, _not_started(remote, silent=silent), now_ns, refused=not silent)
         elif now_ns >= node.probe_ns:  # NMT commands are unconfirmed: the command may be lost
             node.probe_ns = now_ns + _PROBE_NS
@@ -168,8 +168,8 @@ class NodeSupervision:
         monitor = node.remote.monitor
         monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
-        monitor.running = monitor.running and not refused  # another host may be using it now
-        self._await_again(node, now_ns, was_silent=True)  # also if refused: another node may replace it
+        monitor.running = monitor.running and not refused  # another host may be using the node
+        self._await_again(node, now_ns, was_silent=True)  # even if refused: another node may replace it
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty after a defect. If this raises an exception, the next turn repeats it."""
@@ -221,7 +221,7 @@ class NodeSupervision:
         if remote.link.t_dispatched_ns > max(said_ns, node.since_ns) + patience_ns and not remote.listen_only:
             _log.warning("node %d (%s) is lost: no heartbeat", remote.patch.node_id, remote.patch.name)
             node.phase, node.since_ns, node.not_before_ns = Phase.AWAITED, now_ns, 0
-            remote.link.call(remote.stream.withhold, remote.defects)  # until its state is known
+            remote.link.call(remote.stream.withhold, remote.defects)  # until the node's state is known
             return
         if node.unconfigured:
             node.unconfigured = False

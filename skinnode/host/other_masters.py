@@ -1,4 +1,7 @@
-"""Detect other masters on a bus by frames that only masters send; the host receives none of its own."""
+"""Detect other masters on a bus by frames that only masters send.
+
+The host does not receive its own frames.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ class OtherMasters:
     def handlers(self, node_ids: list[int]) -> dict[int, Callable[[bytes, int], None]]:
         """Return handlers for frames that only a master sends.
 
-        If another master runs the bus, the SYNC and NMT commands that it sends itself are left out.
+        If another master runs the bus, there are no handlers for SYNC and NMT commands.
 
         Args:
             node_ids: Node-IDs of the hand on this bus.

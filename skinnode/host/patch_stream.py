@@ -1,8 +1,8 @@
 """From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
 
-The mainline assembles scans and leaves the newest in a box for one scan, from which a worker takes and solves
-it. A scan that is overtaken while the worker is busy is skipped and counted. The stream's token ensures that
-at most one worker processes the stream at a time.
+The mainline assembles scans and puts the newest in a box that holds one scan; a worker takes it from there
+and solves it. A scan that is overtaken while the worker is busy is skipped and counted. The stream's token
+ensures that at most one worker processes the stream at a time.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class PatchStream:
         self._workers, self._publisher, self._defects = output.workers, output.publisher, output.defects
         assembler.on_discarded = self._doubt
         self._unwatched: deque[tuple[int, Scan]] = deque()
-        self._box: deque[tuple[Scan, ScanStamp, ScanSolver]] = deque()  # one scan; both ends are atomic
+        self._box: deque[tuple[Scan, ScanStamp, ScanSolver]] = deque()  # holds one scan; thread-safe
         self._token: deque[None] = deque([None])
         self.tap: StreamTap | None = None
         self._left_out: list[int] = []
@@ -212,7 +212,7 @@ class PatchStream:
             self.tap.resumed(self._patch, solver, anew=anew)
 
     def inform_tap(self) -> None:
-        """Tell a new tap that scans are being passed on, if they are."""
+        """Notify a new tap if scans are being passed on."""
         if self.tap is not None and self._solver is not None:
             self.tap.resumed(self._patch, self._solver, anew=False)
 
@@ -352,7 +352,8 @@ class PatchStream:
     def stats(self) -> StreamStats:
         """Return all counters.
 
-        They are read in such an order that no scan that may still be solved counts as skipped.
+        The counters are read in such an order that a scan that may still be solved is never counted as
+        skipped.
         """
         offered, waiting = self._offered, len(self._box)
         return StreamStats(

@@ -25,7 +25,7 @@ from skinnode.protocol.scan import Scan
 
 LEAST_GRACE_NS: Final = 5_000_000
 """Minimum time to wait for a summary once all chunks have arrived; half a period if that is longer. On a full
-bus, the summary yields to the chunks of all other patches."""
+bus, the summary loses arbitration to the chunks of all other patches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,4 +122,4 @@ def receive_patch(
 
 
 def _ignore(data: bytes, t_ns: int) -> None:
-    """Ignore NMT commands from another master to its nodes."""
+    """Ignore NMT commands that another master sends to its own nodes."""

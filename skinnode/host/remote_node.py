@@ -22,12 +22,12 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum wait for a short job on the mainline, which runs jobs fifty times a second unless its bus is away,
-s."""
+"""Maximum wait for a short job on the mainline, which runs jobs fifty times a second unless the node's bus is
+away, s."""
 
 _ANSWER_S: Final = 0.05
-"""Wait for the responses to a single SDO request, s. If no other node has the node-ID, this wait delays a
-failed bring-up twice."""
+"""Wait for the responses to a single SDO request, s. If no other node has the node-ID, a failed bring-up
+takes two such waits longer."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
@@ -124,7 +124,7 @@ class RemoteNode:
                 raise
             node_id, kind = self.patch.node_id, NodeTimeout if isinstance(error, NodeTimeout) else NodeError
             text = str(error).removeprefix(f"node {node_id}: ")
-            why = f"one question got {count} answers: two nodes have node-ID {node_id} (see skinnode scan)"
+            why = f"one request got {count} responses: two nodes have node-ID {node_id} (see skinnode scan)"
             raise kind(node_id, f"{text}; {why}") from error
         try:
             return ScanSolver(self.facts, self._hand.solver)
@@ -141,8 +141,8 @@ class RemoteNode:
         Raises:
             BusError: if the command cannot be sent.
         """
-        # If another master runs the node, its stream has continued since the bus was opened, unless it
-        # booted.
+        # If another master runs the node, the node's stream has continued since the bus was opened, unless
+        # the node has booted since.
         anew = not self.has_other_master or self.monitor.boot_ups > 0
         self.link.call(lambda: self.stream.resume(solver, withholdings, anew=anew), self.defects)
         if not self.has_other_master:

@@ -33,7 +33,7 @@ ATTEMPTS: Final = 3
 """Maximum number of attempts at a transfer that gets no response, or the response to an earlier transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
-"""Messages of canopen if no response arrived; the second applies after segments were requested again."""
+"""canopen's messages for a missing response; the second is used after segments have been requested again."""
 
 _OUT_OF_STEP: Final = (
     AbortCode.TOGGLE_BIT,
@@ -222,7 +222,8 @@ class RemoteOd:
         if kept != value:
             raise NodeError(
                 self.node_id,
-                f"object {_name(index, subindex)}: got {_shown(kept)} back, expected {_shown(value)} as set",
+                f"object {_name(index, subindex)}: read back {_shown(kept)}, "
+                f"expected {_shown(value)} as written",
             )
 
     def _transfer(self, index: int, subindex: int, verb: str, ask: Callable[[], Any]) -> Any:
@@ -243,7 +244,7 @@ class RemoteOd:
                 failure = abort
                 if abort.code not in _OUT_OF_STEP:
                     break
-            except Exception as error:  # bugs in canopen also raise: AttributeError, struct.error …
+            except Exception as error:  # bugs in canopen raise AttributeError, struct.error and others
                 failure = error
                 if not isinstance(error, SdoError):
                     self._on_defect(error)

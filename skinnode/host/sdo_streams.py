@@ -56,7 +56,7 @@ class Client(SdoClient):
         self._abort_code: int = AbortCode.TIMED_OUT
 
     def abort(self, abort_code: int = AbortCode.TIMED_OUT) -> None:
-        """Remember the code for :meth:`give_up`, which knows the object."""
+        """Store the code for :meth:`give_up`, which gets the object as an argument."""
         self._abort_code = abort_code
 
     def request_response(self, sdo_request: bytes) -> bytes:
@@ -124,7 +124,7 @@ class BlockUpload(BlockUploadStream):
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # as all of canopen
 
     def abort(self, abort_code: int) -> None:
-        """Remember the code. canopen calls this if the end of the transfer does not arrive."""
+        """Store the code. canopen calls this if the end of the transfer does not arrive."""
         self._error = True
         self.sdo_client.abort(abort_code)
 

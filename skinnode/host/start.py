@@ -150,7 +150,8 @@ class _Start:
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
     """Start all nodes whose master is the host, and wait until their heartbeats report operational.
 
-    The deadline is counted in polling pauses, so that no node is late while the host's machine is suspended.
+    The deadline is counted in polling pauses, so that time during which the host's machine is suspended does
+    not count.
 
     Raises:
         NodeTimeout: if a node does not report operational in time.
@@ -195,7 +196,8 @@ def _silence(
 ) -> BusError:
     """Return the error for a silent node.
 
-    If all nodes of a bus are silent, the error is for the bus: suspect cable, supply or bit rate.
+    If all nodes of a bus are silent, the error concerns the bus, and its cable, supply or bit rate is
+    suspect.
     """
     bus, patch = node.bus, node.patch
     on_bus = [other.patch for other in nodes if other.bus is bus]

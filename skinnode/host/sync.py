@@ -101,7 +101,7 @@ class SyncProducer:
     first; if the thread wakes a whole period late, it skips that period rather than sending two SYNC messages
     in a row. A SYNC that has begun is sent on all buses.
 
-    Threads: a thread of its own sends.
+    Threads: a dedicated thread sends.
 
     Args:
         buses: For each bus, the function that sends and the SYNC counters.

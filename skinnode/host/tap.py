@@ -1,4 +1,4 @@
-"""Taps: let a recorder see everything that passes through a host."""
+"""Taps: pass all frames of a host, and the events that affect their decoding, to a recorder."""
 
 from __future__ import annotations
 

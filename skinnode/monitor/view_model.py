@@ -243,7 +243,7 @@ def _faults(health: PatchHealth) -> list[str]:
     if health.duplicate_id:
         words.append(f"two nodes have node-ID {health.node_id}")
     if health.restarts_in_a_loop:
-        words.append("restarts in a loop: supply, or watchdog?")
+        words.append("restarts in a loop: check its supply and watchdog")
     words += [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     if health.error_register:
         words.append(health.emergency_text or f"error: {register_text(health.error_register)}")

@@ -52,8 +52,8 @@ Mask = NDArray[np.bool_]
 
 FOLDED: Final = 250.0
 """RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. It is 70 for the
-staggered layout at h = 0.5, where none of 6000 wires did, and at least 1200 for staggered layouts from h = 1
-and for aligned and symmetric layouts, where one wire in 30 ends at a wrong root."""
+staggered layout at h = 0.5, where none of 6000 wires ran into one, and at least 1200 for staggered layouts
+from h = 1 and for aligned and symmetric layouts, where one wire in 30 ends at a wrong root."""
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
 while R changes only in its seventh digit. Wires on a symmetry line of the layout are blind, because each of
@@ -69,8 +69,8 @@ are then as doubtful as near a fold."""
 # -- one root -----------------------------------------------------------------------------------------------
 
 JUMP: Final = 0.2
-"""Move of an electrode between two frames, in clearances, above which the next root may be wrong; moves of
-0.24 and more were observed to cross folds."""
+"""Movement of an electrode between two frames, in clearances, above which the next root may be wrong;
+movements of 0.24 and more were observed to cross folds."""
 LARGE: Final = 0.03
 """Displacement, in clearances, above which the roughness is checked; folds lie at larger displacements."""
 ROUGH_IN_STREAM: Final = 1.2
@@ -78,8 +78,8 @@ ROUGH_IN_STREAM: Final = 1.2
 The ratio is 0.5 to 1 for presses, up to 1.7 if they move a single electrode, and 1 to 2 for wrong roots."""
 ROUGH_AT_PATH_END: Final = 0.8
 """Ratio of roughness to size of a displacement above which the end of a path is solved again from the
-smoothest displacement. The ratio is 0.67 on average for presses, below 0.9 for nine of ten, up to 1.9 if they
-move a single electrode, and 0.7 to 2 for wrong roots."""
+smoothest displacement. The ratio is 0.67 on average for presses, below 0.9 for nine presses in ten, up to 1.9
+if they move a single electrode, and 0.7 to 2 for wrong roots."""
 STILL_CONFIRMED: Final = 0.2
 """Relative change of a displacement since its confirmation up to which a rough wire is not checked again."""
 
@@ -108,13 +108,14 @@ roots."""
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
 REFEREE_NOISE: Final = 1e-5
-"""Smallest relative noise of a posterior that checks roots; with less noise, it is itself drawn to roots."""
+"""Smallest relative noise of a posterior that checks roots; with less noise, the posterior itself is forced
+onto a root of F = b."""
 AGREE: Final = 6.0
 """Number of standard deviations within which the posterior confirms a root."""
 NEAR: Final = 0.25
 """Largest first correction of an electrode, in clearances; after a larger one, annealing is used instead."""
 FAR: Final = 0.1
-"""Move of an electrode, in clearances, after which the estimate is compared with one annealed from rest.
+"""Movement of an electrode, in clearances, after which the estimate is compared with one annealed from rest.
 Without the comparison, presses of 0.3 or more crossed folds unnoticed, one frame at a time."""
 LIKELIER: Final = 4.0
 """Energy margin by which an estimate from a second annealing must be likelier to replace the first. A smaller
@@ -129,7 +130,7 @@ IMPOSSIBLE_CHANCE: Final = 1e-9
 """Probability per frame that the χ² test reports a wire that obeys the model as INCONSISTENT."""
 Z_REFUSE: Final = 5.998
 """Normal quantile of 1 − 1e-9; its χ² is the limit above which a tall system is INCONSISTENT. At 100
-frames/s, this happens by chance once in four months. Wrong roots and wrong values cause larger χ²."""
+frames/s, noise alone exceeds the limit once in four months. Wrong roots and wrong values cause larger χ²."""
 
 
 def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
@@ -138,7 +139,7 @@ def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
 
 
 def blind_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:
-    """Return the wires (U,) whose roots say nothing about their electrodes."""
+    """Return the wires (U,) whose resistances do not determine the positions of their electrodes."""
     return np.asarray(wire_std(layout, 1.0, normal_only) > BLIND)
 
 
@@ -169,7 +170,7 @@ def crossed_fold(branch: Index, before: Index) -> Mask:
 
 
 def rough_at_path_end(roughness: Float, displacement: Float, step_limit: float) -> Mask:
-    """Return the wires (U,) whose displacement is too rough for a press.
+    """Return the wires (U,) whose displacement is too rough to be a press.
 
     Args:
         roughness: (U,) √(uᵀ C⁻¹ u).

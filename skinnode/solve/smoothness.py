@@ -18,8 +18,8 @@ from skinnode.solve.wires.problem import PatchProblem
 
 CORRELATION_PITCHES: Final = 1.0
 """Correlation length ℓ, pitches. At 1.0, the guided start finds 3204 of the 3209 wires that are on the branch
-of the rest position in 82 random presses each of 70 % on the staggered layout, h = 0.5, and of 10, 30
-and 50 % at h = 1; values of 0.7 and 1.5 find fewer."""
+of the rest position in four sets of 82 random presses on the staggered layout: 70 % at h = 0.5, and 10, 30
+and 50 % at h = 1. Values of 0.7 and 1.5 find fewer."""
 ROUGH_SHARE: Final = 1e-3
 """Relative increase of the diagonal of C, so that C⁻¹ exists in floating point."""
 
@@ -54,7 +54,7 @@ class Smoothness:
 
 @functools.lru_cache(maxsize=64)
 def _covariance(layout: PatchLayout, size: float) -> tuple[Float, Float]:
-    """Return C (U, n, n) and its whitening for displacements of ``size``, pitches; the size is uncritical."""
+    """Return C (U, n, n) and its whitening for displacements of ``size`` (not critical), pitches."""
     electrodes: Float = layout.upper_m / layout.pitch_m
     wires, most = electrodes.shape[:2]
     gaps = electrodes[:, :, None, :] - electrodes[:, None, :, :]

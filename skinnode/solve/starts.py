@@ -27,7 +27,8 @@ one more wire in a hundred in presses of 50 % at h = 1."""
 POWER_STEPS: Final = 8
 """Number of inverse iterations; the second-smallest singular value is about 3 times the smallest."""
 DIFFERENCE: Final = 1e-4
-"""Step for the second derivative, pitches: about eps^(1/3), far below any clearance."""
+"""Step of the central difference of Jacobians, pitches: above eps^(1/3) = 6e-6, where rounding and truncation
+errors balance, yet far below any clearance."""
 
 
 def guided_start(problem: PatchProblem, wire: int, a: Float, covariance: Float) -> tuple[Float, int]:

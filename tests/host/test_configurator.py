@@ -253,7 +253,7 @@ def test_frames_of_the_bus_differ(make_hand: Callable[..., HandConfig]) -> None:
 def test_configuration_that_is_not_kept(make_hand: Callable[..., HandConfig]) -> None:
     tamper = answer_instead(0x1017, 0, b"\x00\x00")
     assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))) == (
-        "node 5: object 0x1017:0: got 0x0 back, expected 0xFA as set"
+        "node 5: object 0x1017:0: read back 0x0, expected 0xFA as written"
     )
 
 
@@ -358,7 +358,7 @@ def test_two_nodes_with_one_node_id_are_named_as_the_cause(hand: HandConfig) -> 
         pass
     assert str(caught.value).startswith("node 5: ")
     assert str(caught.value).endswith(
-        "; one question got 2 answers: two nodes have node-ID 5 (see skinnode scan)"
+        "; one request got 2 responses: two nodes have node-ID 5 (see skinnode scan)"
     )
 
 

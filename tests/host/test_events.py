@@ -103,7 +103,7 @@ def test_a_counter_is_reported_by_how_much_it_grew(hand: HandHealth) -> None:
 
 
 def test_a_loop_of_restarts_is_reported_when_it_begins(hand: HandHealth) -> None:
-    text = "restarts in a loop: supply, or watchdog?"
+    text = "restarts in a loop: check its supply and watchdog"
     assert after(hand, patch={"restarts_in_a_loop": True}) == [("thumb", "restarts in a loop", text)]
     assert after(hand, patch={"nmt_state": 127}) == []  # it goes on
     assert after(hand, patch={"restarts_in_a_loop": False}) == []

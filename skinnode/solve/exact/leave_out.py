@@ -145,7 +145,7 @@ class LeftOut:
         return np.asarray(whole | (self._stream.roots() & content))
 
     def _widen(self, u: int, frame: Frame) -> None:
-        """Add electrodes of wire u until they explain the frame; undo this if even all of them do not."""
+        """Add electrodes of wire u until they explain the frame; undo this if not even all electrodes do."""
         stream, solver, most = self._stream, self._stream.solver, self._layout.unknowns // 3
         before = solver.electrodes(u).copy()
         while stream.solvable()[u] and not self._explained()[u]:

@@ -24,5 +24,5 @@ class Solution:
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
     """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding of F, amplified
-    by the condition of J; inf if no root or minimum was found."""
+    by the condition number of J; inf if no root or minimum was found."""
     stats: SolveStats

@@ -112,7 +112,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the decrease of ‖r‖ to ``norm`` at the trial point with the predicted one; update the radius.
+    """Compare the actual and predicted decrease of ‖r‖, which is ``norm`` at the trial; update the radius.
 
     Returns ACCEPTED, REJECTED or a Status.
     """

@@ -115,7 +115,7 @@ def solve_path(
             "must be at least as many"
         )
     if schedule is not None and (isinstance(schedule, type) or not hasattr(schedule, "follow")):
-        raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic(), Adaptive() or alike")
+        raise ValueError(f"schedule: got {schedule!r}, must be Uniform(), Periodic(), Adaptive() or similar")
     problem = PatchProblem.of(layout, baseline_ohm)
     start = time.perf_counter()
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # the status reports divergence

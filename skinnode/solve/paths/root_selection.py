@@ -43,7 +43,7 @@ class PatchEstimate:
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return the wires (U,) that have no root, a root too rough for a press, or an undone step."""
+    """Return the wires (U,) that have no root, a root too rough to be a press, or an undone step."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
@@ -101,7 +101,7 @@ def compare_with_estimate(tracker: PathTracker, estimate: PatchEstimate, accurac
     """Compare every root with an estimate of the whole patch.
 
     A wire that has no root, or a root that the estimate does not confirm, is solved from the estimate. The
-    new root may lie across a fold, which the skin itself can pass, if the path led to the same root.
+    new root may lie across a fold if the path led to the same root, because the skin itself can cross a fold.
     """
     solver, end = tracker.solver, tracker.end
     todo = ~(estimate.agrees(solver.x) & end.converged)

@@ -30,7 +30,7 @@ SHORTEST: Final = 1 / 64
 """Shortest step as a fraction of the path; at a fold, halving would otherwise never end."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
 """Accuracy of an intermediate point: below √eps a root is accurate enough to keep its ∂X/∂R, and Newton's
-method takes 5 steps from a contraction of 1/2 to 1e-9."""
+method takes 5 steps from a contraction ratio of 1/2 to 1e-9."""
 
 
 class Schedule(Protocol):
@@ -50,11 +50,11 @@ class Uniform:
     Args:
         steps: Number of samples to solve; by default, or if there are fewer samples, all are solved.
         plain: Whether to start each sample at the last solution, as the paper does (Lahaye), and to leave
-            each wire where the last sample put it. Otherwise each sample starts on the secant through the
-            last two solutions, and a wire with no root or a rough root is solved again from the smoothest
+            each wire at the outcome of the last sample. Otherwise each sample starts on the secant through
+            the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
             displacement that explains the last sample. On the staggered layout, h = 1, with 10 samples of
-            each of 21 presses of 50 %, the secant alone loses none of 197 wires instead of 7, with 2.9
-            evaluations per sample instead of 4.
+            each of 21 presses of 50 %, starting on the secant alone loses none of 197 wires instead of 7, and
+            takes 2.9 evaluations per sample instead of 4.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -92,8 +92,8 @@ class Uniform:
 class Periodic:
     """Schedule that solves one sample per cycle T (section 5.2).
 
-    Between two solves the tracked point stays within the relaxed tolerance, so the samples in between add
-    no information.
+    Between two solves the tracked point stays within the relaxed tolerance, so the skipped samples add no
+    information.
 
     The cycle is determined from the samples themselves. The samples are followed from the rest position at
     1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If the solves
@@ -179,15 +179,16 @@ class Adaptive:
     """Schedule that solves as few points per wire as it can, interpolating R between samples.
 
     Each wire has its own step length and takes an Euler step along ∂X/∂R from the factors of the last
-    Jacobian, then operator steps. The next step length is chosen to maintain Newton's contraction: Euler's
-    error grows with the square of the step length (Deuflhard 2004, section 5.1.3), and F is smooth on the
-    scale of the clearance between the layers. A step that does not reach a root on the branch of the rest
-    position is undone and halved.
+    Jacobian, then operator steps. The next step length is chosen to maintain the contraction ratio of
+    Newton's method: Euler's error grows with the square of the step length (Deuflhard 2004, section 5.1.3),
+    and F is smooth on the scale of the clearance between the layers. A step that does not reach a root on the
+    branch of the rest position is undone and halved.
 
     A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
-    meet. A wire that gets stuck there, or arrives at a root too rough for a press, is solved by
-    Levenberg-Marquardt, regardless of the operator, from the smoothest displacement that explains the last
-    sample (:func:`skinnode.solve.starts.guided_start`), and keeps the smoother of the two roots.
+    meet. If a wire gets stuck there, or its root is too rough to be a press, it is solved again by
+    Levenberg-Marquardt, whatever the operator. That solve starts from the smoothest displacement that
+    explains the last sample (:func:`skinnode.solve.starts.guided_start`). If there are then two roots, the
+    smoother one is kept.
 
     Two samples are enough: the patch at rest and the frame to solve.
 

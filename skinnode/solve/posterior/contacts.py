@@ -94,7 +94,7 @@ class ContactFinder:
         return self._box_std[boxes]
 
     def _contact(self, region: Index, q: Float, posterior: LoadPosterior) -> Contact | None:
-        """Return the contact on the cells ``region``, or None if their total normal force does not press."""
+        """Return the contact on the cells ``region``, or None if their normal force is not compressive."""
         loads, weights = np.empty((7, len(region)), np.int64), np.empty((7, len(region)))
         centroid, shear = np.empty((2, 3))
         force, spread = _sum_region(

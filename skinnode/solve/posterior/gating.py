@@ -18,10 +18,11 @@ from skinnode.solve.roots import IMPOSSIBLE_CHANCE
 QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
-"""Apparent move of a single coordinate, in standard deviations, at which its wire counts as moved; noise
-alone causes such a move in one of 15 unmoved frames with 300 coordinates."""
+"""Apparent movement of a single coordinate, in standard deviations, at which its wire counts as moved. With
+300 coordinates at rest, noise alone reaches it in one frame in 15."""
 KEPT: Final = 50
-"""Number of frames for which a wire's equations stay in use after a move that the other wires missed."""
+"""Number of frames for which a wire's equations stay in use after a movement that the other wires' equations
+did not show."""
 
 
 class Fit(NamedTuple):

@@ -20,7 +20,7 @@ from skinnode.solve.posterior.observation import Observation
 SCALE_WORTH: Final = 2.0
 """Weight of the prior of s², as a number of directions; the data determine 100 to 200 directions."""
 SCALE_REST: Final = 0.005
-"""Scale that the prior of s² expects, in clearances: typical of presses by a tenth of the layer."""
+"""Scale that the prior of s² expects, in clearances: typical of presses that indent the layer by a tenth."""
 SCALE_MOST: Final = 1.0
 """Largest scale, in clearances; above it the surface would lie below the lower layer."""
 SCALE_STEP: Final = math.log(1.25)

@@ -19,7 +19,7 @@ LOCAL_SIGNIFICANT: Final = 4.0
 """Squared significance at which a load counts as found, in standard deviations squared."""
 LOCAL_CERTAIN: Final = 100.0
 """Squared significance at which a press is certain, in standard deviations squared. At 25, with high noise,
-the first locations found are unreliable and errors are 1 % larger. From 1000 on, on layouts with low
+the first locations found are unreliable and errors are 1 % larger. At 1000 and above, on layouts with low
 sensitivity (`aligned`), half of a press is still expected all over the patch, which increases errors by 14
 %."""
 
@@ -40,7 +40,7 @@ class LoadPosterior:
 
     @property
     def factors(self) -> int:
-        """Number of the current factors."""
+        """Serial number of the current factors."""
         return self._estimator.factors
 
     def mean(self) -> Float:

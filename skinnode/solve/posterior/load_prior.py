@@ -27,7 +27,7 @@ from skinnode.solve.posterior.prior import SLACK, ElasticPrior
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation, in cells, of the Gaussian that spreads the squared loads found over neighbouring cells.
 A smaller value relies on single cells, which is better for contacts on rubber that matches the prior but
-overconfident for others; a value of 1 loses a quarter of the gain."""
+overconfident for others; a value of 1 loses a quarter of the improvement."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells without a load found, relative to the mean over the patch; allows for
 light touches near a press."""

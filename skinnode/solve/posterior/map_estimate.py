@@ -2,11 +2,11 @@
 
 chord     starts at the last field with the factors of an older frame; typically needs two evaluations of F
           and J
-newton    computes new factors at the current field, then takes chord steps
+newton    refactorises at the current field, then takes chord steps
 anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
           its true value. At high noise the posterior has a single maximum, near that of the prior, and
           following it leads to the correct maximum. This solves presses of 70 % of the layer between two
-          frames, on layouts where the exact inverse goes wrong even along the samples of the press.
+          frames, on layouts where the exact inverse fails even if it follows the samples of the press.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ a ratio of 5 in 79."""
 SETTLED: Final = 0.02
 """RMS of a correction, relative to the RMS standard deviation, at which chord steps stop."""
 CHORDS: Final = 4
-"""Maximum number of chord steps per set of factors."""
+"""Maximum number of chord steps per factorisation."""
 CHORD_RATE: Final = 0.35
-"""Contraction of chord steps above which new factors are cheaper; they cost as much as ten chord steps."""
+"""Contraction ratio of chord steps above which refactorising is cheaper; a factorisation costs as much as ten
+chord steps."""
 NEWTONS: Final = 12
 """Maximum number of factorisations of a solve that starts near the maximum; it typically needs one or two, or
 more if full steps would cycle."""
@@ -48,8 +49,8 @@ HALVINGS: Final = 6
 PRIOR_DOUBT: Final = 3.0
 """Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
 expected load at a location is known only to within a factor. At 1, the hidden part of a first touch is 5 to 7
-standard deviations off in one of 20 000 wires, and so are dents that a half-space cannot have. At 2, one of
-12 000 coordinates of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds
+standard deviations off on one wire in 20 000, and so are dents that a half-space cannot have. At 2, one
+coordinate in 12 000 of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds
 5."""
 SMOOTH_SHARE: Final = 0.25
 """Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than real
@@ -74,7 +75,7 @@ class MapEstimator:
         core: (U, f) standard deviations for the 95 % interval, which assume smooth bodies, pitches.
         noise_variance: (U f,) variance of the displacement due to noise and nuisances, pitch².
         members: Wires whose equations are in the factors.
-        factors: Number of the current factors.
+        factors: Serial number of the current factors.
         evaluations: Number of evaluations of F and J since the owner set it to 0.
         factorisations: Number of factorisations since the owner set it to 0.
         until: Value of :func:`time.perf_counter` after which a solve raises TimeoutError.

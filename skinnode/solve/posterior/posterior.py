@@ -37,8 +37,8 @@ from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
 """Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. A smaller noise
-forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this already happens
-below ten times this noise."""
+forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this happens even at
+up to ten times this noise."""
 LEFT_OUT: Final = 3
 """Maximum number of wires to leave out, one after another, before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
@@ -108,7 +108,7 @@ class Posterior:
         touched = self.layout.upper_m.copy()
         touched[0, 0, 2] -= 0.1 * self._problem.clearance[0, 0] * self.layout.pitch_m
         potential = potential_per_m(self.layout, touched) * self.layout.pitch_m
-        seconds, self._seconds = self._seconds, math.inf  # a deadline could skip kernels
+        seconds, self._seconds = self._seconds, math.inf  # with a deadline, some kernels might not run
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
         self._seconds = seconds
         self._estimator.gamma()  # compiles it now, not on the first frame without a touch

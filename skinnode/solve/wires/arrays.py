@@ -43,7 +43,7 @@ COVARIANCE: Final = 1
 SKIP: Final = 2
 """Skip a wire whose first-order optimality ‖Jᵀr‖∞ is below tol_f (Xu et al. 2018, section 5.2)."""
 REUSE: Final = 4
-"""Follow a wire that moved only a little with its stored inverse, and keep that inverse."""
+"""Use the stored inverse to follow a wire that moved only a little, and keep that inverse."""
 
 
 class SolveOptions(ArrayTable):

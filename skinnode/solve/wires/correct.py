@@ -168,7 +168,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # the correction that proved convergence is free
+        if status == CONVERGED and not skipped:  # the correction that proved convergence costs nothing more
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

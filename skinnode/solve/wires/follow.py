@@ -1,8 +1,9 @@
 """Compiled solver for a wire that moved only a little, using the inverse of an earlier position.
 
 Simplified Newton steps with the old inverse need only F, and use the same convergence test as Newton's method
-(Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). Their contraction shows how much the inverse
-has changed along the path; while the change is small, the inverse is also kept for the standard deviations.
+(Deuflhard, Newton methods for nonlinear problems, 2004, 2.1). Their contraction ratio shows how much the
+inverse has changed along the path; while the change is small, the inverse is also kept for the standard
+deviations.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from skinnode.model.layout import Float
 from skinnode.solve.linalg.vectors import largest
 
 FOLLOW_STEPS: Final = 4
-"""Maximum number of simplified steps; each costs a fifth of a new inverse."""
+"""Maximum number of simplified steps; each costs a fifth as much as a new inverse."""
 CONTRACTION: Final = 0.1
 """Maximum size of a step relative to the previous step; a larger step needs a new Jacobian."""
 FRESH: Final = 0.01

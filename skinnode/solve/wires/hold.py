@@ -7,12 +7,13 @@ variance s², and lies in the n directions of the range of J. With t = s²/σ²,
 half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, t = 0). The quantile is that
 of the c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
-A slow move can hide in that sum, especially if it follows the direction that a wire determines worst, one of
-K. The variance of a held coordinate allows for such a move: its correction c = Σ_k (∂x_j/∂r_k) ρ_k contains
-the move and the noise of both frames, and the excess of c² over that noise is a lower limit of the variance.
-Measured coverage of the 95 % intervals (staggered layout, h = 0.5, noise 1e-5): 98 % for unmoved wires (99 %
-of the frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96 % for a move by 40
-standard deviations along the worst-determined direction in 200 or 800 frames (86 % without the allowance).
+A slow movement may go unnoticed in that sum, especially along the one direction of K that a wire determines
+worst. The variance of a held coordinate allows for such a movement: its correction c = Σ_k (∂x_j/∂r_k) ρ_k
+contains the movement and the noise of both frames, and the excess of c² over that noise is a lower limit of
+the variance. Measured coverage of the 95 % intervals (staggered layout, h = 0.5, noise 1e-5): 98 % for
+unmoved wires (99 % of the frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96
+% for a movement by 40 standard deviations along the worst-determined direction in 200 or 800 frames (86 %
+without the allowance).
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ wire to be held."""
 def chi2_quantile(dof: float, z: float) -> float:
     """Return the χ² quantile that corresponds to the normal quantile ``z`` (Wilson & Hilferty 1931).
 
-    The error is below 1 % at 99 % from 3 degrees of freedom on; the result is never too small in the far
-    tail.
+    At the 99 % quantile, the error is below 1 % for 3 or more degrees of freedom; the result is never too
+    small in the far tail.
     """
     spread = 2.0 / (9.0 * dof)
     root = 1.0 - spread + z * math.sqrt(spread)

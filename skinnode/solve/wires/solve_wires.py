@@ -24,8 +24,8 @@ from skinnode.solve.wires.follow import FRESH, follow, newton_step, standard_dev
 from skinnode.solve.wires.hold import within_noise
 
 REFRESH: Final = 8
-"""Maximum number of consecutive frames for which a followed wire keeps its inverse; wires take turns to renew
-it."""
+"""Maximum number of consecutive frames for which a followed wire keeps its inverse; wires renew their
+inverses in turn."""
 COVARIANCE_UNITS: Final = 3.0
 """Cost of the covariance of a square system of 30 unknowns, in evaluations of F and J with their step."""
 HELD_UNITS: Final = 0.25

@@ -36,7 +36,7 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    It only listens and reads, so it does not disturb a running hand. It checks the skin from scans; a hand
+    It only listens and reads, so it does not disturb a running hand. It judges the skin from scans; a hand
     that is not running sends scans only with --active. Do not touch the skin meanwhile. Exit status 0 if no
     fault was found, 1 if one was found, 2 if it could not run.
     """

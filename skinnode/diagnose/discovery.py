@@ -255,7 +255,7 @@ def _two_serials(connection: BusConnection, node_id: int) -> str:
         return ""
     serials = sorted({int.from_bytes(data[4:8], "little") for data in answers if data[0] & 0xE0 == 0x40})
     shown = " and ".join(map(str, serials))
-    return f"one SDO request received {len(answers)} answers" + (f": serials {shown}" if shown else "")
+    return f"one request got {len(answers)} responses" + (f": serials {shown}" if shown else "")
 
 
 def _number(connection: BusConnection, node_id: int, index: int, subindex: int) -> int | None:

@@ -49,7 +49,7 @@ def test_a_healthy_hand_has_no_finding(seed: int) -> None:
         ({"unconfigured": (LssAddress(0, 1, 2, 7),)}, "without a node-ID", Sure.CERTAIN),
         ({"strangers": (node(9),)}, "node 9 is not in the hand", Sure.CERTAIN),
         (
-            {"strangers": (node(9, product_code=1, duplicate="one SDO request received 2 answers"),)},
+            {"strangers": (node(9, product_code=1, duplicate="one request got 2 responses"),)},
             "two nodes have node-ID 9",
             Sure.CERTAIN,
         ),
@@ -96,7 +96,7 @@ def test_one_master_is_as_it_should_be(changes: dict[str, Any]) -> None:
     ("changes", "what"),
     [
         ({"found": node(state="stopped", answers=False)}, "is stopped and does not answer"),
-        ({"found": node(duplicate="one SDO request received 2 answers")}, "two nodes have its node-ID"),
+        ({"found": node(duplicate="one request got 2 responses")}, "two nodes have its node-ID"),
         ({"found": node(product_code=1)}, "another device has its node-ID"),
         ({"found": node(boot_ups=3)}, "restarts by itself"),
         ({"boot_ups": 2}, "restarts by itself"),

@@ -114,7 +114,7 @@ def event_driven(dut: Dut) -> None:
             dut.nmt(PRE_OPERATIONAL)
         can_id = set_up(dut, pdo, PdoSetup(254, event_ms=10, inhibit_100us=400))
         dut.operational()
-        frames = [expect_pdo(dut, can_id, length, f"{pdo} at its event timer") for _ in range(8)]
+        frames = [expect_pdo(dut, can_id, length, f"{pdo} when its event timer elapses") for _ in range(8)]
         gaps = gaps_ms(frames)
         # A delayed frame shortens the next interval; the mean hardly changes.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:

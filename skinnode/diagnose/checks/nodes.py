@@ -35,7 +35,7 @@ def check_nodes(bus: BusFacts) -> Iterator[Finding]:
                 "nodes",
                 bus.name,
                 f"two nodes have node-ID {node.node_id}",
-                Sure.CERTAIN if "answers" in node.duplicate else Sure.LIKELY,
+                Sure.CERTAIN if "responses" in node.duplicate else Sure.LIKELY,
                 node.duplicate,
                 "unplug one and give it another node-ID",
             )
@@ -67,7 +67,7 @@ def _check_node(bus: BusFacts, patch: PatchFacts) -> Iterator[Finding]:
     if node.duplicate:
         yield found(
             "two nodes have its node-ID",
-            Sure.CERTAIN if "answers" in node.duplicate else Sure.LIKELY,
+            Sure.CERTAIN if "responses" in node.duplicate else Sure.LIKELY,
             node.duplicate,
             "unplug one and give it another node-ID: skinnode lss set --serial …",
         )

@@ -51,7 +51,7 @@ def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
     line = next(filter(None, numbers), None)
     if line is not None:
         shown = [*text.split("\n"), ""][min(line, text.count("\n") + 1) - 1]
-        allowed = "a file as in CiA 306: each [section] once, each key once per section, comments after ;"
+        allowed = "a file as in CiA 306: each [section] once, each key once per section, ';' before comments"
         return _mistake("EDS", shown, allowed, source, line)
     for line, section, key, value in _lines(text):
         if _OBJECT.fullmatch(section) and key.lower() in _NUMBERS and not _NUMBER.fullmatch(value):

@@ -122,7 +122,7 @@ UNTIL_TOLD = {
     "vcan-sim": ["vcan-sim", "hand.toml"],
     "node": [
         *["skinnode", "node", "--source", "simulated", "--node-id", "9", "--interface", "udp_multicast"],
-        *["--channel", "239.74.1.1"],
+        *["--channel", "MULTICAST GROUP"],
     ],
 }
 
@@ -131,11 +131,14 @@ UNTIL_TOLD = {
     ("command", "number"),
     [(command, number) for command in UNTIL_TOLD for number in SIGNALS[: 2 if command == "monitor" else 3]],
 )
-def test_what_runs_until_it_is_told_has_done_its_work(folder: Path, command: str, number: int) -> None:
+def test_what_runs_until_it_is_told_has_done_its_work(
+    folder: Path, multicast_group: str, command: str, number: int
+) -> None:
+    arguments = [multicast_group if word == "MULTICAST GROUP" else word for word in UNTIL_TOLD[command]]
     with contextlib.ExitStack() as stack:
         if command in ("host", "monitor"):
             stack.enter_context(simulated(folder))
-        process = stack.enter_context(start(UNTIL_TOLD[command], folder))
+        process = stack.enter_context(start(arguments, folder))
         assert process.stdout is not None
         process.stdout.readline()
         process.stdout.readline()

@@ -315,5 +315,5 @@ def test_loop_over_events_ends_with_the_host(make_hand: Callable[..., HandConfig
         reader.start()
     reader.join(10)
     assert not reader.is_alive()
-    with pytest.raises(ValueError, match="capacity: got 0, must be at least 1"):
+    with pytest.raises(ValueError, match="capacity: got 0, must be an integer of at least 1"):
         host.events(capacity=0)

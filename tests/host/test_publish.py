@@ -93,7 +93,7 @@ def test_closed_and_forgotten_subscriptions_get_nothing(publisher: Publisher) ->
 @pytest.mark.parametrize(
     ("capacity", "patch", "message"),
     [
-        (0, None, "capacity: got 0, must be at least 1"),
+        (0, None, "capacity: got 0, must be an integer of at least 1"),
         (1, "middle", "patch: got 'middle', must be one of left, right"),
     ],
 )

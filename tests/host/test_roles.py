@@ -129,7 +129,7 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
 ) -> None:
     """Whenever it comes: all but the scan under way is whole, and the command ends with 0."""
     file = str(baseline_file(rack, tmp_path))
-    hand = changed(hand, bus={"role": "guest"}, patch={"baseline": file}, sync={"period_ms": 40})
+    hand = changed(hand, bus={"role": "guest"}, patch={"baseline": file}, sync={"period_ms": 100})
     for patch in hand.patches:
         listener.send(0x600 + patch.node_id, bytes.fromhex("2b 17 10 00 64 00 00 00"))  # a heartbeat
     joined = 0
@@ -137,7 +137,7 @@ def test_a_guest_that_joins_while_patches_run_tears_no_scan(
         assert eventually(lambda: {n.nmt_state for n in rack.nodes.values()} == {NmtState.OPERATIONAL})
         for _ in range(8):
             with Host.from_config(hand) as host:
-                take(host.fields(timeout_s=10), 8)
+                take(host.fields(timeout_s=10), 4)
                 assert eventually(functools.partial(all_operational, host))
                 assert faults_and_notes(host)[0] == []
             assert discrepancies(host.stats()) == []

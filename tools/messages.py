@@ -26,7 +26,7 @@ class Message(NamedTuple):
 
 
 def messages(folder: Path) -> Iterator[Message]:
-    """Yield the messages in all modules below ``folder``, file by file."""
+    """Yield the messages in all modules under ``folder``, file by file."""
     for file in sorted(folder.rglob("*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))
         silent = {id(node) for node in _docstrings(tree)}

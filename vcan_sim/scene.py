@@ -158,5 +158,5 @@ def _glide(share: float) -> float:
     if s > 0.5:
         return 1.0 - _glide(1.0 - s)
     ramped = min(s / _RAMP, 1.0)
-    gained = _RAMP * ramped**3 * (1.0 - 0.5 * ramped)  # integral of the speed 3 s² − 2 s³
+    gained = _RAMP * ramped**3 * (1.0 - 0.5 * ramped)  # integral of the speed, which is 3 s² − 2 s³
     return (gained + max(s - _RAMP, 0.0)) / (1.0 - _RAMP)

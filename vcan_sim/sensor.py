@@ -84,7 +84,7 @@ class SimulatedPatch:
         """Return the time of a reading, ns.
 
         Args:
-            device_time_us: Lower 32 bits of the node's time of the reading, µs; the lowest 6 bits are
+            device_time_us: Lower 32 bits of the node's clock at the reading, µs; the lowest 6 bits are
                 ignored, because a checked summary does not carry them.
 
         Raises:

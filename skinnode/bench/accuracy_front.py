@@ -86,7 +86,7 @@ def _timed_us(call: Callable[[], object]) -> float:
 
 
 def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tuple[float, float, bool]:
-    """Return the time in µs per wire, the error, and whether every wire converged."""
+    """Return the time per wire (µs), the error, and whether every wire converged."""
     frames = scene.thinned(samples)
     call = functools.partial(solve_path, scene.layout, frames, operator=operator, schedule=schedule)
     path = call()
@@ -95,7 +95,7 @@ def _path(scene: Scene, operator: str, schedule: Schedule, samples: int) -> tupl
 
 
 def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[float, float]:
-    """Return the time in µs per wire and the error."""
+    """Return the time per wire (µs) and the error."""
     problem = PatchProblem.of(scene.layout)
     truth = problem.rest + scene.truth_m.reshape(len(problem.rest), -1) / scene.layout.pitch_m
     frames = scene.thinned(samples) * problem.gain

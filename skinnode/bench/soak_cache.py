@@ -18,7 +18,7 @@ _COMPILE_S: Final = 600.0
 
 
 def fill(folder: Path) -> None:
-    """Fill a cache below ``folder`` with the kernels that a soak needs.
+    """Fill a cache under ``folder`` with the kernels that a soak needs.
 
     They are copied from the user's cache, or compiled in a child process if that cache is empty. The user's
     cache is not changed.
@@ -38,12 +38,12 @@ def fill(folder: Path) -> None:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return the environment of a process that keeps its kernels below ``folder``."""
+    """Return the environment of a process that keeps its kernels under ``folder``."""
     return {**os.environ, CACHE_ENVIRONMENT: str(folder)}
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage cache files below ``folder``, alternately truncating one and filling one with random bytes.
+    """Damage cache files under ``folder``, alternately truncating one and filling one with random bytes.
 
     The same seed damages the same files. Returns one line per file.
     """

@@ -67,7 +67,7 @@ def beyond(deviations: float) -> float:
 
 
 def limit_of(coordinates: int) -> float:
-    """Return z(n), as defined in the module docstring, for n ``coordinates``, but at least 5."""
+    """Return z(n), as defined in the module docstring, for n ``coordinates``; never less than 5."""
     from scipy.special import ndtri
 
     if coordinates == 0:

@@ -71,12 +71,12 @@ class PlannedFrame:
 
     @property
     def load(self) -> float:
-        """Fraction of the bus used with maximum-length frames."""
+        """Bus load with maximum-length frames, as a fraction."""
         return self.frames_per_s * self.worst_s
 
     @property
     def typical_load(self) -> float:
-        """Fraction of the bus used with random data."""
+        """Bus load with random data, as a fraction."""
         return self.frames_per_s * self.typical_s
 
 
@@ -110,12 +110,12 @@ class BusPlan:
 
     @property
     def load(self) -> float:
-        """Fraction of the bus used with maximum-length frames; 1 is a full bus."""
+        """Bus load with maximum-length frames, as a fraction; 1 is a full bus."""
         return sum(frame.load for frame in self.frames)
 
     @property
     def typical_load(self) -> float:
-        """Fraction of the bus used with random data."""
+        """Bus load with random data, as a fraction."""
         return sum(frame.typical_load for frame in self.frames)
 
     @property

@@ -209,7 +209,7 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 
 
 class BusLoad:
-    """Counter of frames and their exact number of bits.
+    """Counter of frames and of their exact total length in bits.
 
     Adding a frame is cheap, because bits are computed in batches. The counter is not thread-safe.
 

@@ -37,8 +37,8 @@ def doctor(
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
     It only listens and reads, so it does not disturb a running hand. It judges the skin from scans; a hand
-    that is not running sends scans only with --active. Do not touch the skin meanwhile. Exit status 0 if no
-    fault was found, 1 if one was found, 2 if it could not run.
+    that is not running sends scans only with --active. Do not touch the skin while the command runs.
+    Exit status 0 if no fault was found, 1 if one was found, 2 if it could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

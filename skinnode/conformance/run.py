@@ -25,7 +25,7 @@ SILENT_CASES: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Results of a run, and problems in restoring the configuration."""
+    """Results of a run, and any problems while restoring the configuration."""
 
     results: tuple[Result, ...]
     problems: tuple[str, ...]

@@ -91,7 +91,7 @@ class BusConnection:
             Whether the condition became true.
 
         Raises:
-            BusError: The bus failed meanwhile.
+            BusError: The bus failed during the wait.
         """
         end_s = time.monotonic() + within_s
         while not condition():

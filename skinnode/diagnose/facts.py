@@ -149,5 +149,5 @@ class BusFacts:
 
     @property
     def running(self) -> bool:
-        """Whether a host runs the hand."""
+        """Whether a host is running the hand."""
         return any(patch.found is not None and patch.found.state == "operational" for patch in self.patches)

@@ -108,7 +108,7 @@ def parse_address(text: str) -> tuple[int, int | None]:
     match = _ADDRESS.fullmatch(text)
     subindex = None if match is None or match[2] is None else int(match[2], 0)
     if match is None or (subindex or 0) > 255:
-        raise ConfigError("INDEX", text, "an index in hexadecimal, such as 1018, or one with :SUB, 0 to 255")
+        raise ConfigError("INDEX", text, "a hexadecimal INDEX, such as 1018, or INDEX:SUB with SUB 0 to 255")
     return int(match[1], 16), subindex
 
 
@@ -155,7 +155,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
             return value.to_bytes(entry.size, "little", signed=entry.data_type in SIGNED)
     except (ValueError, OverflowError, struct.error):
         raise ConfigError("--write", text, f"a value of {entry}: {kind}") from None
-    where = f"{entry} is {kind}" if entry.data_type else f"only the EDS (--eds FILE) has the type of {entry}"
+    where = f"{entry} is {kind}" if entry.data_type else f"only the EDS (--eds FILE) defines {entry}'s type"
     raise ConfigError("--write", text, f"--hex and bytes in hexadecimal: {where}")
 
 

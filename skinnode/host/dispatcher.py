@@ -69,7 +69,7 @@ class BusStats:
     """Exact total length of all data frames received and sent, bits; the value is up to a tenth of a second
     old."""
     load: float
-    """Fraction of the bus capacity used over the last second."""
+    """Bus load over the last second, as a fraction of the capacity."""
 
 
 @dataclass(frozen=True, slots=True)

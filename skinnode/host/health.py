@@ -168,7 +168,7 @@ class BusHealth:
     controller: BusState | None = None
     """Newest reported state of the controller; None if none was reported."""
     no_sync: bool = False
-    """Whether another master runs the bus and its SYNC has not arrived for :data:`SYNCS_MISSED` periods."""
+    """Whether another master runs the bus and its SYNC has been absent for :data:`SYNCS_MISSED` periods."""
 
 
 @dataclass(frozen=True, slots=True)

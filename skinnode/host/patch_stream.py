@@ -66,7 +66,7 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Recorder of the events, besides frames, that decide which scans a stream passes on. Mainline only."""
+    """Recorder of the events other than frames that decide which scans a stream passes on. Mainline only."""
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Record that :meth:`PatchStream.resume` began to pass scans on."""

@@ -170,7 +170,7 @@ class Subscription:
     def _open(self, item: FieldFrame | End) -> FieldFrame | None:
         if isinstance(item, FieldFrame):
             return item
-        self._wake()  # wake the other readers: each must get the end
+        self._wake()  # wake the other readers: each must receive the end marker
         if item.error is not None:
             raise item.error
         return None

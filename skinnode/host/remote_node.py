@@ -31,8 +31,8 @@ takes two such waits longer."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
-"""Time, s, and number of SYNC periods without a scan after which a node's configuration is read back (the
-longer applies): the stream must recover within a second."""
+"""Time, s, and number of SYNC periods without a scan after which a node's configuration is read back
+(whichever is longer): the stream must recover within a second."""
 
 
 class RemoteNode:
@@ -91,7 +91,7 @@ class RemoteNode:
         abandoned: Callable[[], bool],
         on_answer: Callable[[PatchConfig], None] | None = None,
     ) -> ScanSolver:
-        """Configure the node; scans are withheld meanwhile.
+        """Configure the node, with its scans withheld.
 
         Args:
             deadline_s: Maximum time to its first response, s.

@@ -19,7 +19,7 @@ from skinnode.solve.tracker import Tracker
 
 
 class ScanSolver:
-    """Decoder and solver of one patch's scans. Owned by one thread at a time.
+    """Decoder and solver for one patch's scans. Owned by one thread at a time.
 
     Args:
         facts: Layout, code scale and baseline of the patch.

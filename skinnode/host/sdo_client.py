@@ -222,8 +222,7 @@ class RemoteOd:
         if kept != value:
             raise NodeError(
                 self.node_id,
-                f"object {_name(index, subindex)}: read back {_shown(kept)}, "
-                f"expected {_shown(value)} as written",
+                f"object {_name(index, subindex)}: read back {_shown(kept)} after writing {_shown(value)}",
             )
 
     def _transfer(self, index: int, subindex: int, verb: str, ask: Callable[[], Any]) -> Any:

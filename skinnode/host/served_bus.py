@@ -46,7 +46,7 @@ class ServedBus:
         )
 
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
-        """Return whether another master's SYNC has not arrived for :data:`SYNCS_MISSED` periods.
+        """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
 
         The time of the newest dispatched frame counts as now, so that a delay of the host does not count.
 

@@ -22,8 +22,8 @@ BRING_UP_THREADS: Final = 16
 """Maximum number of nodes configured in parallel; more would only wait for the bus."""
 
 _BRING_UPS: Final = 3
-"""Maximum number of attempts to configure a node that boots meanwhile, as nodes just found by LSS do, or
-whose configuration raises an unexpected exception."""
+"""Maximum number of attempts to configure a node that boots during an attempt, as nodes just found by LSS
+do, or whose configuration raises an unexpected exception."""
 
 _START_AGAIN_NAPS: Final = 50
 """Number of polling pauses, a quarter of a second in total, after which an unconfirmed start command is sent

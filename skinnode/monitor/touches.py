@@ -21,7 +21,7 @@ LEAST_TOUCH_M: Final = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touch:
-    """One contact on a patch; unknown figures are None.
+    """One contact on a patch; unknown values are None.
 
     The posterior estimates forces. An exact field without a known stiffness gives only place, area and depth.
     """

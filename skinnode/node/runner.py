@@ -53,7 +53,7 @@ class NodeRunner:
         self._fd = port.config.fd
         self.nodes = tuple(nodes)
         if not self.nodes:
-            raise ValueError("nodes: got none, must be at least one")
+            raise ValueError("nodes: got none, must contain at least one")
         ids = [node.node_id for node in self.nodes if node.node_id != NOT_CONFIGURED]
         if len(set(ids)) < len(ids):
             raise ValueError(f"nodes: got node-IDs {sorted(ids)}, must differ")
@@ -145,7 +145,7 @@ class NodeRunner:
                     with contextlib.suppress(BusError):
                         self._port.reopen()
                 self._stopping.wait(_RETRY_S)
-            # A turn without frames does not show that the bus works.
+            # An iteration without frames does not show that the bus works.
             if self._port.sent + self._heard > moved:
                 failing_since_s = None
             if self._bus_state is BusState.OFF and self._port.sent > self._sent_before:

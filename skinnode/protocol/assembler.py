@@ -23,7 +23,7 @@ lacks codes of chunks that were not sent again, is published as *unchecked*, and
 rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks have been received.
 
 **Order of counters.** A counter up to half the counter range ahead is newer; any other counter is late, and
-its frame is dropped. After a timeout without an accepted frame any counter starts a new stream, because the
+its frame is dropped. After a timeout without an accepted frame, any counter starts a new stream, because the
 node or the SYNC producer may have been restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the others keep

@@ -4,10 +4,10 @@ A patch with U×K codes sends them in *chunks*: TPDO1 carries a u8 chunk index, 
 of 16 bits (or 2 of 24 bits). Codes are in row-major order, upper wire first. TPDO2, the *summary*, ends each
 scan and carries a check over all codes of the matrix (:mod:`skinnode.protocol.scan_check`).
 
-Over CAN FD a chunk is part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30 codes
-of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping padded to
-the next valid CAN FD length. A patch with more columns splits each wire into several chunks, as equal in size
-as possible.
+Over CAN FD a chunk carries part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30
+codes of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping
+padded to the next valid CAN FD length. A patch with more columns splits each wire into several chunks, as
+equal in size as possible.
 
 ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).

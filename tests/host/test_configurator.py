@@ -253,7 +253,7 @@ def test_frames_of_the_bus_differ(make_hand: Callable[..., HandConfig]) -> None:
 def test_configuration_that_is_not_kept(make_hand: Callable[..., HandConfig]) -> None:
     tamper = answer_instead(0x1017, 0, b"\x00\x00")
     assert str(failure_of(make_hand(patches=1), lambda port: node(port, 5, tamper=tamper))) == (
-        "node 5: object 0x1017:0: read back 0x0, expected 0xFA as written"
+        "node 5: object 0x1017:0: read back 0x0 after writing 0xFA"
     )
 
 

@@ -139,7 +139,8 @@ def check_losses(bus: BusFacts) -> Iterator[Finding]:
                 "codes differ from those that the node packed",
                 Sure.CERTAIN,
                 f"{stats.scans_corrupt} of {scans + stats.scans_corrupt} scans failed the check",
-                "check gateways on the path, memory and software of the node; CAN itself detects bus errors",
+                "check the node's memory and software, and any gateways on the path; "
+                "CAN itself detects bus errors",
             )
         wrong = stats.bad_length + stats.bad_index + stats.bad_counter + stats.bad_form
         if wrong:

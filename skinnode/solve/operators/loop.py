@@ -1,8 +1,8 @@
 """Iteration loop of all operators, with reverse communication: the caller evaluates the functions.
 
     begin      start from x, r and J in the workspace
-    propose    factor J; unless x is a root, make Newton's step the next ``trial``
-    shorten    if Newton's step leaves the trust region, replace the trial by one inside it
+    propose    factor J; unless x is a root, make the Newton step the next ``trial``
+    shorten    if the Newton step leaves the trust region, replace the trial by one inside it
     assess     given r at ``trial`` in ``r_trial``, accept the step or not and update the radius
 
 The same compiled steps therefore serve the compiled solver of a skin wire and any pair of Python callables.
@@ -92,7 +92,7 @@ def set_trial(operator: int, w: Work) -> None:
 
 @njit_part
 def propose(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
-    """Set Newton's step as the next trial point.
+    """Set the Newton step as the next trial point.
 
     Returns TRY with ``trial``, ``step`` and ``js`` set, OUTSIDE if the step is longer than the radius or
     does not exist (call :func:`shorten`), or a Status.
@@ -173,13 +173,13 @@ def assess(operator: int, w: Work, tol_f: float, tol_x: float) -> int:
 
 @njit
 def start(w: Work) -> int:
-    """Call :func:`begin` on behalf of Python code."""
+    """Call :func:`begin` for a Python caller."""
     return begin(w)
 
 
 @njit
 def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> int:
-    """Call :func:`assess` for the last trial, then :func:`propose`, on behalf of Python code.
+    """Call :func:`assess` for the last trial, then :func:`propose`, for a Python caller.
 
     ``went`` is the result of the last call, initially ``REJECTED``. Returns TRY (evaluate r at ``trial`` into
     ``r_trial``), ACCEPTED (evaluate J at ``x`` into ``jt``) or a Status.
@@ -194,5 +194,5 @@ def advance(operator: int, w: Work, went: int, tol_f: float, tol_x: float) -> in
 
 @njit
 def final_error(w: Work, inverse: Float) -> float:
-    """Call :func:`estimate_error` on behalf of Python code."""
+    """Call :func:`estimate_error` for a Python caller."""
     return estimate_error(w, inverse)

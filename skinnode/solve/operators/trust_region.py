@@ -53,7 +53,7 @@ def slope_of(w: Work) -> float:
 
 @njit_part
 def measure_newton(w: Work) -> None:
-    """Update D and the length of Newton's step; set the initial radius."""
+    """Update D and the length of the Newton step; set the initial radius."""
     n, s = w.x.size, w.s
     for j in range(n):
         w.scale[j] = max(w.scale[j], math.sqrt(dot(w.jt[j], w.jt[j])))

@@ -180,9 +180,9 @@ class Adaptive:
 
     Each wire has its own step length and takes an Euler step along ∂X/∂R from the factors of the last
     Jacobian, then operator steps. The next step length is chosen to maintain the contraction ratio of
-    Newton's method: Euler's error grows with the square of the step length (Deuflhard 2004, section 5.1.3),
-    and F is smooth on the scale of the clearance between the layers. A step that does not reach a root on the
-    branch of the rest position is undone and halved.
+    Newton's method: the error of an Euler step grows with the square of its length (Deuflhard 2004, section
+    5.1.3), and F is smooth on the scale of the clearance between the layers. A step that does not reach a
+    root on the branch of the rest position is undone and halved.
 
     A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
     meet. If a wire gets stuck there, or its root is too rough to be a press, it is solved again by

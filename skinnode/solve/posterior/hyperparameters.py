@@ -81,13 +81,13 @@ class Hyperparameters:
         self._least = min(least, self._most)
 
     def spread(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads all over the patch, then set the scale suggested by the frame."""
+        """Expect equal loads over the whole patch, then set the scale suggested by the frame."""
         self._prior.spread(self._fixed or self._expected)
         if self._fixed is None:
             self._prior.scale2 = self._bounded(self._estimator.guess_scale(observation, members))
 
     def spread_as_seen(self, observation: Observation, members: Index) -> None:
-        """Expect equal loads all over the patch, at the scale that the frame suggests with the old prior."""
+        """Expect equal loads over the whole patch, at the scale the frame suggests under the old prior."""
         guess = self._fixed or self._bounded(self._estimator.guess_scale(observation, members))
         self._prior.spread(guess)
 

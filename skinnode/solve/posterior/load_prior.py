@@ -1,6 +1,6 @@
 """Prior of the loads on a patch and of the displacement caused by them.
 
-At first, equal loads are expected all over the patch, at one scale s². Once loads are found, the prior
+At first, equal loads are expected over the whole patch, at one scale s². Once loads are found, the prior
 expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin next to a contact
 moves only as far as the loads of the contact require. Compared with one scale for the whole patch, this
 reduces the error by a factor of two to three, and the error of a narrow contact no longer exceeds the
@@ -52,7 +52,7 @@ class LoadPrior:
         scale2: s², pitch².
         share: (Q,) load variance of each cell relative to s²; the mean is 1.
         covariance: (U f, U f) C.
-        uniform: (U f, U f) C if equal loads are expected all over the patch.
+        uniform: (U f, U f) C if equal loads are expected over the whole patch.
         response: (U f, 3Q) displacement caused by unit loads, pitches.
         version: Number of times C has been rebuilt.
     """
@@ -69,7 +69,7 @@ class LoadPrior:
         self._loads: tuple[Float, Float] | None = None  # displacement and its loads
 
     def spread(self, scale2: float) -> None:
-        """Expect equal loads all over the patch, at scale s²."""
+        """Expect equal loads over the whole patch, at scale s²."""
         self.scale2 = scale2
         self.share[:] = 1.0
         self.covariance[:] = self.uniform

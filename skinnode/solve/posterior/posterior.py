@@ -382,7 +382,7 @@ class Posterior:
         displacement = problem.displacement_m(problem.rest + self._trusted)
         std, core = np.zeros_like(self._trusted), np.zeros_like(self._trusted)
         std[:, self._free], core[:, self._free] = estimator.std, estimator.core
-        if held.all():  # allow for half of the move that the gate may overlook
+        if held.all():  # cover half of the displacement that the gate may overlook
             for each in (std, core):
                 each[:, self._free] = np.maximum(each[:, self._free], 0.5 * self._overlooked)
         if self._contacts is not None and self._known and not held.all():

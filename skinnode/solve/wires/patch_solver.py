@@ -154,7 +154,7 @@ class PatchSolver:
         self._still[u] = self.problem.share_at_rest[u, rest].sum(axis=0)
 
     def solve_rest(self) -> Index:
-        """Solve the rest position to get its inverse; return the sign of det J (U,), 0 if there is none."""
+        """Compute J⁻¹ at the rest position; return the sign of det J (U,), 0 if that is 0 or undefined."""
         todo, weight = np.full(len(self.x), wires.SOLVE, np.uint8), np.ones_like(self.a_solved)
         self.x[:] = self.problem.rest
         options = solve_options(self.operator, wires.COVARIANCE, REST_TOLERANCE, REST_TOLERANCE, 1)

@@ -44,6 +44,6 @@ def test_an_error_frame_is_a_fault_of_the_bus(hand: HandConfig, fleet: Fleet) ->
     with Host.from_config(hand) as host, can.Bus(interface="virtual", channel=bus.channel) as driver:
         assert "can0: 1 error frame" not in faults_and_notes(host)[0]
         driver.send(can.Message(arbitration_id=0x04, data=bytes(8), is_error_frame=True))
-        assert eventually(lambda: host.bus_health("can0").error_frames == 1)
+        assert eventually(lambda: host.bus_health("can0").error_frames == 1), host.stats()
         assert "can0: 1 error frame" in faults_and_notes(host)[0]
     assert discrepancies(host.stats()) == []

@@ -2,22 +2,22 @@
 
 **Containment.** No exception ends a thread of the host. An exception raised while serving a patch makes that
 patch faulty and is recorded as the reason: its scans are withheld, and it is brought up again after a pause
-of 0.1 s that doubles with each defect, up to 1 s; a boot-up of the node ends the pause. An exception raised
-while serving a bus pauses the bus, or closes and reopens its interface; the pauses are the same. An exception
-raised while serving a subscriber, a callback or a tap loses only the item meant for it. All exceptions are
-counted by subject (``Host.stats().defects``), published as events, and logged once for each distinct message;
-see :mod:`skinnode.host.containment`.
+of 0.1 s that doubles with each defect, up to 1 s; a boot-up of the node ends the pause. After an exception
+raised while serving a bus, the bus is paused, or its interface is closed and reopened; the pauses are the
+same. If an exception is raised while serving a subscriber, a callback or a tap, only the item meant for it is
+lost. All exceptions are counted by subject (``Host.stats().defects``), published as events, and logged once
+for each distinct message; see :mod:`skinnode.host.containment`.
 
 ==========  ==============================  ==============================  ==============================
 thread      calls                           an exception there affects      recovers
 ==========  ==============================  ==============================  ==============================
-receive     the port                        the bus: it is away             interface reopened
-receive     anything else                   a look at the interface         20 ms later
+receive     the port                        the bus: it is unavailable      interface reopened
+receive     anything else                   one poll of the interface       20 ms later
 mainline    handlers, pollers, jobs of a    the frame or call; the patch    patch brought up again
             patch                           is faulty
-mainline    other handlers, listeners       the frame or batch, for them    with the next mainline    its
-queue, counting, the load   the bus: it pauses, or lacks a  after the pause
-                                            figure
+mainline    other handlers, listeners       the frame or batch, for them    with the next
+mainline    its queue, counting, the load   the bus: it pauses, or its      after the pause
+                                            statistics are incomplete
 reopen      the port, a new receive thread  that attempt                    after the pause
 sync        a bus                           one SYNC of that bus            with the next SYNC
 solve       decoding, solving               the scan; the patch is faulty   patch brought up again

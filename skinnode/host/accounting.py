@@ -1,6 +1,6 @@
 """Check that a host's counters add up: everything received was passed on or is counted as lost.
 
-Counters are read one after the other, not at one instant, so check a host that is closed or idle.
+Counters are read one after another rather than simultaneously, so check only a closed or idle host.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from skinnode.text.words import counted
 
 
 def discrepancies(stats: HostStats) -> list[str]:
-    """Return one line for each sum that does not add up; an empty list if all sums agree.
+    """Return one line for each mismatch between sums; an empty list if all sums agree.
 
     ===========  ==========================================================================================
     of a bus     frames read = received + ignored + error frames + dropped + waiting
@@ -44,7 +44,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a bus's losses and errors as text by counter name; an empty dictionary if there were none."""
+    """Return a phrase for each counter of a bus's losses and errors that is not zero, by counter name."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -56,7 +56,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a patch's losses as text by counter name; an empty dictionary if there were none."""
+    """Return a phrase for each counter of a patch's losses that is not zero, by counter name."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),
@@ -70,7 +70,7 @@ def losses_of_stream(stream: StreamStats) -> dict[str, str]:
 
 
 def frames_counted(assembler: AssemblerStats) -> int:
-    """Return the number of chunks and summaries in the assembler's counters."""
+    """Return the total number of chunks and summaries recorded in the assembler's counters."""
     return (
         assembler.chunks_accepted
         + assembler.summaries_accepted

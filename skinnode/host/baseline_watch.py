@@ -21,8 +21,8 @@ _DOUBT_NS: Final = 2_000_000_000
 
 _REGISTER_NS: Final = 500_000_000
 """Minimum interval between readings of an error register that is not zero. The emergency message that clears
-an error may be lost, yet the patch must count as operational within a second of the end of the error. These
-readings take four SDO frames per second."""
+an error may be lost, yet the patch must be considered operational within a second of the end of the error.
+These readings require four SDO frames per second."""
 
 
 class BaselineWatch:
@@ -104,7 +104,8 @@ class BaselineWatch:
 def note_baseline(node: Supervised) -> None:
     """Record the baseline with which scans are now solved, and count it if it is new.
 
-    A bring-up may also find a new baseline: after a failed reading, or if it changed while the node was away.
+    A bring-up may also find a new baseline: after a failed reading, or if the baseline changed while the node
+    was away.
     """
     facts, before = node.remote.facts, node.baseline_ohm
     assert facts is not None  # called only after bring-up

@@ -1,4 +1,4 @@
-"""Call a user-supplied function with each field, on a separate thread, so that it delays nothing else."""
+"""Call a user's function with each field, on a separate thread, so that the calls delay nothing else."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LAST_CALL_S: Final = 1.0
 
 
 class FieldCallback:
-    """Callback that receives each field until :meth:`close` or the end of the host.
+    """Callback that receives each field until :meth:`close` or until the host closes.
 
     Exceptions raised by the function are counted, and the first is logged with its traceback; the next field
     is delivered nevertheless. Threads: a dedicated thread calls the function; any thread may call the
@@ -64,7 +64,7 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether the function is no longer called."""
+        """Whether calls of the function have ended."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -74,7 +74,7 @@ class FieldCallback:
         """Wait for the next field and process it. Returns False when there are no more fields."""
         try:
             field = self._fields.take(None)
-        except SkinError as error:  # this error stopped the host; every subscriber gets it
+        except SkinError as error:  # this error stopped the host; every subscriber receives it
             _log.debug("callback %s: %s", _name(self._function), error)
             return False
         if field is None:
@@ -89,7 +89,7 @@ class FieldCallback:
 
 
 class Callbacks:
-    """All callbacks of a host. Exceptions raised outside their functions are reported to ``defects``."""
+    """All callbacks of a host. Exceptions raised outside the user's functions are reported to ``defects``."""
 
     def __init__(self, defects: Defects | None = None) -> None:
         self._defects = defects
@@ -111,7 +111,7 @@ class Callbacks:
         return callback
 
     def join(self) -> None:
-        """Wait for all callbacks to end; their subscriptions must have ended."""
+        """Wait for all callbacks to end; their subscriptions must already have ended."""
         for callback in self._all:
             callback.join()
 

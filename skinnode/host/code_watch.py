@@ -7,10 +7,10 @@ all equal is at most that value to the power of n·m. For a run of equal scans t
 must be below ``FALSE_ALARM``, with σ from the hand file. A converter quieter than the file states may repeat
 its codes for hours. Therefore the stream itself must also have shown noise, that is, ``FLICKERS`` scans in
 which a code returned to its previous value (a touch or creeping rubber moves codes in one direction only),
-and the run must be ``LONGER`` times as long as any run that ended by itself. A converter that never flickers
-is never reported as frozen. Scans that contain only the changed chunks, or lack chunks, are ignored. One
-false alarm remains possible: a converter with a third of the noise in the hand file flickers while rubber
-creeps and is constant afterwards, so it may be reported once.
+and the run must be ``LONGER`` times as long as any earlier run that ended on its own. A converter that never
+flickers is never reported as frozen. Scans that contain only the changed chunks, or lack chunks, are ignored.
+One false alarm remains possible: if a converter has only a third of the noise stated in the hand file, its
+codes flicker while rubber creeps and are constant afterwards, so the converter may be reported once.
 
 **Wires.** A wire is open or shorted if all its crossings are open or shorted in a complete scan. Noise and
 drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
@@ -18,10 +18,10 @@ consecutive windows. Taking the second difference of a code over time removes st
 if the mean square of this difference exceeds ``NOISY`` times both that of the median wire on its side and
 that of the expected noise. A wire drifts if the resistances of all its crossings changed by the same fraction
 of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and its neighbours did not
-follow. A touch, in contrast, is uneven along a wire, and the rubber moves the adjacent wires as well.
-Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) exceeded ``DRIFT`` on a wire at 780,000
-instants; none was mistaken for drift. Consequently, two neighbours that drift alike are not reported, nor is
-a wire while it is touched.
+follow. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads it to the
+adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) changed a wire by more
+than ``DRIFT`` at 780,000 instants; none was mistaken for drift. Consequently, two neighbours that drift alike
+are not reported, nor is a wire while it is touched.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ FALSE_ALARM: Final = 1e-12
 """Maximum probability of a false alarm per run of equal scans: one alarm in 25 years for a hand of 16 patches
 at 80 scans/s."""
 FLICKERS: Final = 10
-"""Number of scans with a code returning to its previous value that proves noise in the codes."""
+"""Number of scans in which a code must return to its previous value to prove that the codes contain noise."""
 LONGER: Final = 4
-"""Minimum ratio of the length of a frozen run to that of the longest run that ended by itself."""
+"""Minimum ratio of the length of a frozen run to that of the longest run that ended on its own."""
 LEAST_RUN: Final = 5
 """Minimum length of a frozen run, scans."""
 WINDOW: Final = 16
@@ -54,7 +54,7 @@ WINDOW: Final = 16
 WINDOWS: Final = 3
 """Number of consecutive windows in which a wire must be noisy or drift."""
 NOISY: Final = 25.0
-"""Minimum ratio of noise power: five times the noise amplitude."""
+"""Minimum ratio of noise powers: a noisy wire has at least five times the noise amplitude."""
 DRIFT: Final = 1e-3
 """Minimum drift as a fraction of R0: a tenth of the change that a light touch causes in the wire pairs below
 it."""
@@ -143,7 +143,7 @@ class CodeWatch:
         self.frozen = self._run >= LEAST_RUN and self._run >= self._needed
 
     def _impossible(self, codes: Codes) -> float:
-        """Return how many scans in a row cannot have all these codes equal, given the expected noise."""
+        """Return how many consecutive scans cannot all have these codes, given the expected noise."""
         measured = codes[codes <= self._scale.steps]
         if not measured.size or not self._relative_noise:
             return math.inf
@@ -191,8 +191,8 @@ class CodeWatch:
             off = np.abs(ratio - (gain[:, None] if axis else gain))
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
-            # The distance from rest counts too: if a touch moved the median wire, the untouched wires deviate
-            # from it.
+            # The distance from rest also matters: if a touch moved the median wire, the untouched wires
+            # deviate from it.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])

@@ -31,7 +31,7 @@ from skinnode.protocol.profile import PatchProfile
 from skinnode.text.words import counted
 
 BOOT_DEADLINE_S: Final = 3.0
-"""Maximum time to the first response of a node, s; controllers boot and tare within a second."""
+"""Maximum time until the first response from a node, s; controllers boot and tare within a second."""
 
 HEARTBEATS_WATCHED: Final = 3
 """Number of host heartbeats that a node may miss before it stops sending, if the host sends heartbeats."""
@@ -115,7 +115,7 @@ class Configurator:
             if time.monotonic() > end_s:
                 raise NodeTimeout(
                     patch.node_id,
-                    f"patch {patch.name!r} on {patch.bus}: got no answer within {self.boot_deadline_s:g} s",
+                    f"patch {patch.name!r} on {patch.bus}: no response within {self.boot_deadline_s:g} s",
                 )
 
     def _identify(self, patch: PatchConfig, remote: RemoteOd) -> tuple[int, int]:
@@ -240,7 +240,7 @@ class Configurator:
                     raise _mismatch(patch, what, f"0x{mapped:08X}", f"0x{entry:08X}")
 
     def settle_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Return the baseline with which the node encodes; first write the file's baseline if it differs.
+        """Return the node's baseline; first write the file's baseline if it differs.
 
         A node that is still taring itself returns zeros; it has until the boot deadline to finish.
 
@@ -275,7 +275,7 @@ class Configurator:
         return baseline
 
     def _read_baseline(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> Float:
-        """Read the baseline as one block, or value by value from a node without block transfer.
+        """Read the baseline as one block, or value by value if the node does not support block transfer.
 
         For 300 values, a block transfer takes 176 frames and single reads take 600. At 1 Mbit/s, the block
         transfer takes 86 ms at the node's own pace, and the single reads take 75 ms plus 300 response times;

@@ -63,7 +63,7 @@ class Pause:
 
 @dataclass(frozen=True, slots=True)
 class DefectStats:
-    """Statistics of the exceptions raised while serving one subject."""
+    """Statistics on the exceptions raised while serving one subject."""
 
     count: int
     newest: str | None

@@ -1,6 +1,7 @@
 """Count the frames of a bus and dispatch them to handlers by COB-ID. No thread, no clock.
 
-A :class:`~skinnode.host.link.BusLink` feeds it the frames of a bus; a replay feeds it a recording.
+A :class:`~skinnode.host.link.BusLink` feeds the dispatcher the frames of a bus; a replay feeds it a
+recording.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ Handler = Callable[[bytes, int], None]
 """Called with the data of a frame and the monotonic time at which it was received, ns."""
 
 _MARK_NS: Final = 100_000_000
-"""Interval at which the bits are summed."""
+"""Interval between sums of the bits, ns."""
 _MARKS: Final = 10
 """Number of intervals over which the load is averaged."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval between calls of the pollers. Their timeouts are at least 5 ms, and batches of frames
+"""Minimum interval between calls of the pollers, ns. Their timeouts are at least 5 ms, and batches of frames
 arrive a millisecond apart."""
 
 

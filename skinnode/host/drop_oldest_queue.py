@@ -25,7 +25,7 @@ class End:
 class DropOldestQueue(Generic[T]):
     """A queue of up to ``capacity`` items that ends with an :class:`End`. Thread-safe; writing never blocks.
 
-    An :class:`End` is never dropped, and every reader gets it, because :meth:`get` puts it back.
+    An :class:`End` is never dropped, and every reader receives it, because :meth:`get` puts it back.
     """
 
     def __init__(self, capacity: int) -> None:

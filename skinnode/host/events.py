@@ -17,7 +17,7 @@ from skinnode.host.publish import check_capacity
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
-"""Default number of events that a subscriber may lag behind before it loses the oldest."""
+"""Default number of events by which a subscriber may lag before it loses the oldest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class HealthEvent:
 class EventSubscription:
     """Subscription to a running host's events. Iterate over it until the host closes, or use :meth:`get`.
 
-    A full queue drops its oldest event, counted in ``dropped``. Any thread may read.
+    When the queue is full, its oldest event is dropped and counted in ``dropped``. Any thread may read.
     """
 
     def __init__(self, capacity: int) -> None:

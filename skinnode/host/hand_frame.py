@@ -100,7 +100,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """Return the latest time at which :meth:`next` returns the oldest frame; None without a frame."""
+        """Return the latest time at which :meth:`next` returns the oldest frame; None if there is none."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -116,8 +116,8 @@ class HandGatherer:
 class HandSubscription:
     """Subscription to hand frames. Iterate with ``for`` or ``async for``, or use :meth:`get`.
 
-    A slow reader loses the oldest fields, counted in ``dropped``, and then gets hand frames with patches
-    missing. One thread reads.
+    A slow reader loses the oldest fields, which are counted in ``dropped``, and then receives hand frames
+    with patches missing. One thread reads.
     """
 
     def __init__(self, fields: Subscription, gatherer: HandGatherer, timeout_s: float | None) -> None:
@@ -172,7 +172,7 @@ class HandSubscription:
             yield frame
 
     async def __aiter__(self) -> AsyncIterator[HandFrame]:
-        """Yield frames asynchronously, otherwise like :meth:`__iter__`."""
+        """Yield frames asynchronously; otherwise like :meth:`__iter__`."""
         while True:
             end_ns = _end_ns(self._timeout_s)
             while (frame := self._gatherer.next(time.monotonic_ns())) is None:

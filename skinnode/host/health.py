@@ -18,11 +18,11 @@ from skinnode.transport.bus_state import BusState
 _log = logging.getLogger(__name__)
 
 HEARTBEATS_MISSED: Final = 3
-"""Number of heartbeat periods without a heartbeat after which a node is lost. CiA 301 leaves this number to
-the integrator; a burst of frames may delay one heartbeat and a bus error may destroy another."""
+"""Number of heartbeat periods without a heartbeat after which a node is considered lost. CiA 301 leaves this
+number to the integrator; a burst of frames may delay one heartbeat and a bus error may destroy another."""
 
 SCANS_MISSED: Final = 3
-"""Number of SYNC periods without a scan after which a patch is stale."""
+"""Number of SYNC periods without a scan after which a patch is considered stale."""
 
 SYNCS_MISSED: Final = 5
 """Number of SYNC periods without SYNC after which another master's bus is reported as lacking SYNC; its
@@ -80,7 +80,7 @@ class PatchHealth:
     """Whether the node restarted by itself three times within ten seconds, the last time within the past 5
     s."""
     duplicate_id: bool = False
-    """Whether heartbeats arrive more often than a single node sends them."""
+    """Whether heartbeats arrive more often than a single node would send them."""
     conflicts: int = 0
     """Number of frames that contradict other frames of their scan: the node's counter is wrong, or two nodes
     share a node-ID."""
@@ -147,7 +147,7 @@ class BusHealth:
 
     bus: str
     away: str | None
-    """Why the interface is away; None while it works."""
+    """Why the interface is unavailable; None while it works."""
     load: float
     """Fraction of the last second during which frames occupied the bus."""
     error_frames: int

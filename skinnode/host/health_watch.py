@@ -14,7 +14,7 @@ from skinnode.host.health import BusHealth, PatchHealth
 from skinnode.text.words import counted
 
 _CHECK_S: Final = 0.05
-"""Interval between checks, s; a shorter change is visible only in the counters."""
+"""Interval between checks, s; a change that does not last this long may be visible only in the counters."""
 
 _QUIET_NS: Final = 1_000_000_000
 """Minimum interval between events for a counter that keeps growing."""
@@ -44,7 +44,7 @@ _BUS_COUNTERS: Final = {
 
 
 class HealthWatch:
-    """Watch that compares the health of all patches and buses with the last check and publishes changes.
+    """Watch that publishes changes in the health of all patches and buses since the last check.
 
     Threads: a dedicated thread runs the checks, from construction to :meth:`close`.
     """

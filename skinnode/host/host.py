@@ -136,13 +136,13 @@ class Host:
     ) -> Iterator[Host]:
         """Bring a hand up; shut it down at the end of the ``with`` block.
 
-        Once it is up, the host survives all errors: see :meth:`health` and :meth:`stats`.
+        Once the hand is up, the host survives all errors: see :meth:`health` and :meth:`stats`.
 
         Args:
             hand: The hand.
             interface: python-can interface to use in place of the hand's.
             channel: Channel to use in place of the hand's; only for a hand with one bus.
-            boot_deadline_s: Maximum time to the first response of a node, s.
+            boot_deadline_s: Maximum time until the first response from a node, s.
             cancelled: Called repeatedly during bring-up; once it returns True, bring-up ends with
                 BringUpCancelled.
             tap: Records the traffic, bring-up included: a :class:`skinnode.record.Recorder`.
@@ -174,7 +174,7 @@ class Host:
 
         Args:
             timeout_s: Time without a field after which the loop raises TimeoutError, s; None: no limit.
-            capacity: Number of fields that the loop may lag behind before it loses the oldest; the hand
+            capacity: Number of fields by which the loop may lag before it loses the oldest; the hand
                 file's capacity by default.
             patch: Patch whose fields are delivered; all patches by default.
 
@@ -188,11 +188,11 @@ class Host:
         """Subscribe to hand frames, each with all patches' fields for one SYNC.
 
         Iterate with ``for`` or ``async for``. A frame waits at most two SYNC periods for a patch's field, and
-        does not wait for a patch that is away.
+        does not wait for a patch that is absent.
 
         Args:
             timeout_s: Time without a hand frame after which the loop raises TimeoutError, s; None: no limit.
-            capacity: Number of hand frames that the loop may lag behind; the hand file's capacity by default.
+            capacity: Number of hand frames by which the loop may lag; the hand file's capacity by default.
 
         Raises:
             ValueError: if the patches of the hand do not follow one SYNC with a counter.
@@ -219,7 +219,7 @@ class Host:
         Args:
             function: Called with each field.
             patch: Patch whose fields are delivered; all patches by default.
-            capacity: Number of fields that the function may lag behind; the hand file's capacity by default.
+            capacity: Number of fields by which the function may lag; the hand file's capacity by default.
 
         Raises:
             TypeError: if ``function`` is not callable, or is async.
@@ -270,7 +270,7 @@ class Host:
         """Subscribe to changes in the health of patches, wires and buses from now until the host closes.
 
         Args:
-            capacity: Number of events that the subscriber may lag behind before it loses the oldest.
+            capacity: Number of events by which the subscriber may lag before it loses the oldest.
 
         Raises:
             ValueError: if ``capacity`` is below 1.
@@ -297,7 +297,7 @@ class Host:
         return {each.subject: each.stats() for each in (self._defects, *of_buses, *of_patches)}
 
     def tap(self, tap: HostTap) -> Callable[[], None]:
-        """Record the traffic with ``tap`` from now until the host closes. Only one tap at a time.
+        """Record the traffic with ``tap`` from now until the host closes. Only one tap may be active.
 
         Returns:
             A function that ends the recording.
@@ -316,9 +316,9 @@ class Host:
     def tare(self, patch: str, *, deadline_s: float | None = None) -> None:
         """Tare a patch: its current resistances become the baseline.
 
-        Returns once the host has read the new baseline and solves with it. The event ``baselines`` confirms
-        it to all subscribers. The command is RPDO1. The node loses the baseline at power-off unless it is
-        stored (0x1010).
+        Returns once the host has read the new baseline and uses it to solve scans. The event ``baselines``
+        confirms the new baseline to all subscribers. The command is RPDO1. The node loses the baseline at
+        power-off unless it is stored (0x1010).
 
         Args:
             patch: Name of the patch.

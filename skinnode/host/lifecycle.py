@@ -1,4 +1,4 @@
-"""Start and shutdown of a host: its parts start in order and end in reverse order."""
+"""Start-up and shutdown of a host: its parts start in order and end in reverse order."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class StartOptions:
     """Start options. Raises ValueError if the deadline is negative, infinite or not a number."""
 
     boot_deadline_s: float = BOOT_DEADLINE_S
-    """Maximum time to the first response of a node, s."""
+    """Maximum time until the first response from a node, s."""
     cancelled: Callable[[], bool] = never
     """Called repeatedly during bring-up; once it returns True, bring-up raises BringUpCancelled."""
     tap: HostTap | None = None

@@ -27,9 +27,9 @@ _REOPEN_S: Final = 0.1
 class BusLink(Dispatcher):
     """An open bus, from construction to :meth:`close` or the end of a ``with`` block.
 
-    An exception in a handler, a poller, a listener or a job loses that frame or call; an exception in the
-    mainline's own work pauses the bus, while received frames wait. An interface that fails after opening is
-    reopened until it works.
+    If a handler, a poller, a listener or a job raises an exception, that frame or call is lost; after an
+    exception in the mainline's own work, the bus is paused while received frames wait. An interface that
+    fails after opening is reopened until it works.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
     :class:`~skinnode.host.mainline.Mainline` calls the rest. A separate thread reopens the interface.
@@ -57,12 +57,12 @@ class BusLink(Dispatcher):
         self._sent_listeners: tuple[Callable[[Frame], None], ...] = ()
         self._jobs: deque[tuple[Callable[[], object], Defects]] = deque()
         self.failure: BusError | None = None
-        """Why the bus is away; None while it works."""
+        """Why the bus is unavailable; None while it works."""
         self._due_s = 0.0  # time from which a reopened interface counts as working, unless it fails first
         self._outages = 0
         self.t_dispatched_ns = 0
         """Monotonic time up to which all received frames have been dispatched."""
-        self._rests = False  # True while the bus is away, and for a while after a defect
+        self._rests = False  # True while the bus is unavailable, and for a while after a defect
         self._rest_end_s = 0.0
         self._opening = False
         self._pause = Pause()
@@ -104,8 +104,8 @@ class BusLink(Dispatcher):
         Args:
             node_id: Node-ID of the node.
             on_answer: Called with the monotonic time of each SDO response, on the mainline.
-            defects: As in :meth:`handle`; if given, an exception in a transfer that is retried is counted for
-                the bus.
+            defects: As in :meth:`handle`; if given, an exception that causes a transfer to be retried is
+                counted for the bus.
         """
 
         def on_response(data: bytes, t_ns: int) -> None:
@@ -232,7 +232,7 @@ class BusLink(Dispatcher):
             except Exception as error:
                 owner.report("a job of the mainline", error)
         # While frames wait, here or in the interface, the time of the newest dispatched frame counts as now,
-        # so that a delay of the host makes no node appear late.
+        # so that a delay in the host does not make any node appear late.
         if batch:
             self.dispatch(batch)
             self.t_dispatched_ns = batch[-1].t_ns
@@ -253,7 +253,7 @@ class BusLink(Dispatcher):
             self._begin_reopening()
 
     def _go_away(self, error: Exception) -> None:
-        """Mark the bus as away and start reopening its interface."""
+        """Mark the bus as unavailable and start reopening its interface."""
         self._rests = self._opening = True
         if not isinstance(error, BusError):
             self.defects.report("receiving", error)

@@ -37,11 +37,12 @@ STORE_ANSWER_S: Final = 2.0
 it synchronises to disk. CANopenNode's LSS master waits 1 s for any response."""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts in a fastscan, where every negative answer costs one, s; the longer timeout is used if the first
-attempt found no node."""
+"""Timeouts of the requests in a fastscan, s; every negative answer costs one timeout, and the longer is used
+if the first attempt found no node."""
 
 _TRIES: Final = 2
-"""Number of unanswered requests after which no node is assumed to exist; a busy machine may miss one."""
+"""Number of requests without a response after which a node is assumed not to exist; a busy computer may miss
+a response."""
 
 _SETTLE: Final = 0.2
 """Maximum spread in time of several slaves' responses to one request, as a fraction of the timeout."""
@@ -57,14 +58,14 @@ _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
 
 
 class LssFailed(BusError):
-    """A slave refused a service, or did not answer."""
+    """A slave refused a service, or did not respond."""
 
 
 class LssMaster:
     """LSS master on one bus. Sends with ``send``; :meth:`on_response` takes the frames with COB-ID 0x7E4.
 
-    Threads: only one thread at a time may use it, but concurrent calls of :meth:`give_node_id` wait for each
-    other; the mainline calls :meth:`on_response`.
+    Threads: only one thread at a time may use it, but concurrent calls of :meth:`give_node_id` are
+    serialised; the mainline calls :meth:`on_response`.
     """
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
@@ -138,7 +139,7 @@ class LssMaster:
         return None
 
     def _scan_part(self, part: int, answer_s: float) -> int | None:
-        """Return one part of the address of a node still in the scan; None if no node remains."""
+        """Return one part of the address of a node still in the fastscan; None if no node remains."""
         following = (part + 1) % _PARTS
         for likely in _LIKELY[part] if part < len(_LIKELY) else ():
             if self._scan(likely, 0, part, following, answer_s) is not None:
@@ -152,7 +153,7 @@ class LssMaster:
     def _scan(self, value: int, bit: int, part: int, following: int, answer_s: float) -> bytes | None:
         data = value.to_bytes(4, "little") + bytes((bit, part, following))
         answer = self._ask(LssCommand.FASTSCAN, data, bytes((LssCommand.IDENTIFIED,)), answer_s)
-        if answer is not None:  # other slaves may answer a little later; wait before the next request
+        if answer is not None:  # other slaves may respond a little later; wait before the next request
             time.sleep(answer_s * _SETTLE)
         return answer
 
@@ -241,16 +242,16 @@ class LssMaster:
         answer = self._ask(command, data, answer_s=answer_s)
         if answer is None:
             time.sleep(_UNDER_WAY_S)
-            raise LssFailed(f"{what}: got no LSS answer within {answer_s:g} s")
+            raise LssFailed(f"{what}: no LSS response within {answer_s:g} s")
         return answer
 
     def _ask(
         self, command: int, data: bytes = b"", expected: bytes | None = None, answer_s: float = ANSWER_S
     ) -> bytes | None:
-        """Send a request and return the first response in time that starts with ``expected``.
+        """Send a request and return the first response that starts with ``expected``.
 
         ``expected`` is the command by default. Other responses belong to earlier requests. Returns None if no
-        such response arrives.
+        such response arrives in time.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

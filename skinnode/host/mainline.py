@@ -18,7 +18,7 @@ _WAIT_S: Final = 0.02
 
 
 class Mainline:
-    """Thread that receives and dispatches on ``links`` until :meth:`stop` or the end of a ``with`` block.
+    """Thread that dispatches the frames received on ``links`` until :meth:`stop` or the end of a ``with``.
 
     A failure on one bus does not affect the others.
 

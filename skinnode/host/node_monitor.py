@@ -1,4 +1,4 @@
-"""Collect what a node sends besides scans, and derive the health of its patch from it."""
+"""Collect the messages that a node sends besides scans, and derive the health of its patch from them."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class NodeMonitor:
     def on_emergency(self, data: bytes, t_ns: int) -> None:
         """Process an EMCY: u16 code, u8 error register, five manufacturer bytes.
 
-        Code 0 means that the error is gone.
+        Code 0 means that the error has been cleared.
         """
         if len(data) != 8:
             self.on_reject(CodecError(emcy_cob_id(self.node_id), data, "8 bytes (EMCY)"))

@@ -20,11 +20,11 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Maximum time from the start command to a heartbeat that reports operational, s: four heartbeats."""
+"""Maximum time from the start command to a heartbeat that reports operational, s: four heartbeat periods."""
 
 _PROBE_NS: Final = 250_000_000
 """Interval between requests to an absent node: its boot-up message may have been lost, and a node that sends
-no heartbeat would never be noticed. For four nodes, the requests take 0.1 % of a bus."""
+no heartbeat would never be noticed. For four nodes, the requests take 0.1 % of the capacity of a bus."""
 
 _SEARCH_NS: Final = 1_000_000_000
 """Interval between LSS searches for an absent node."""
@@ -80,7 +80,7 @@ class NodeSupervision:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            with contextlib.suppress(BusError):  # the bus is away or full; the next turn tries again
+            with contextlib.suppress(BusError):  # the bus is unavailable or full; a later turn tries again
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
         if remote.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
@@ -90,7 +90,7 @@ class NodeSupervision:
     def _begin(self, node: Supervised, now_ns: int) -> None:
         """Start configuring the node, unless another job still uses it.
 
-        Such a job is aborted, and the next turn tries again.
+        Such a job is aborted, and the configuration is started on a later turn.
         """
         if node.job is not None and not node.job.done():
             node.abandon.set()
@@ -109,7 +109,7 @@ class NodeSupervision:
         remote, job = node.remote, node.job
         assert job is not None  # a job exists in this phase
         if remote.monitor.boot_ups != remote.boot_ups:
-            node.abandon.set()  # it booted again: the configuration written so far is lost
+            node.abandon.set()  # the node booted again: the configuration written so far is lost
         if not job.done():
             return
         if node.abandon.is_set():
@@ -172,7 +172,10 @@ class NodeSupervision:
         self._await_again(node, now_ns, was_silent=True)  # even if refused: another node may replace it
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
-        """Mark a patch as faulty after a defect. If this raises an exception, the next turn repeats it."""
+        """Mark a patch as faulty after a defect.
+
+        If this raises an exception, the call is retried on the next turn.
+        """
         remote = node.remote
         count = remote.defects.count
         node.abandon.set()

@@ -104,12 +104,12 @@ class StreamOptions:
     on_scan: Callable[[Scan], None] = _ignore
     """Called immediately with each assembled scan."""
     watch: Callable[[Scan], None] = _ignore
-    """Called with each assembled scan :data:`WATCH_AFTER_NS` later."""
+    """Called with each assembled scan after a delay of :data:`WATCH_AFTER_NS`."""
     partial: Partial = "pass"
     """``pass`` or ``withhold``: what to do with incomplete scans."""
     under_way: bool = False
-    """Whether another master starts the node, so that it may already be sending when scans are first passed
-    on."""
+    """Whether another master starts the node, so that the node may already be sending when scans are first
+    passed on."""
 
 
 class PatchStream:
@@ -196,7 +196,7 @@ class PatchStream:
             solver: Decodes and solves the scans.
             withholdings: Number of withholdings known to the caller; if there have been more since, nothing
                 happens.
-            anew: Whether the node has been started anew, so that frames received before belong to another
+            anew: Whether the node has been started anew, so that frames received earlier belong to another
                 stream.
         """
         if withholdings != self.withholdings:

@@ -22,7 +22,7 @@ def check_timeout(timeout_s: float | None) -> None:
     """Check a timeout.
 
     Raises:
-        ValueError: if it is negative, not a number, or too long for the system.
+        ValueError: if the timeout is negative, not a number, or longer than the system supports.
     """
     if timeout_s is not None and not 0 <= timeout_s <= threading.TIMEOUT_MAX:
         raise ValueError(f"timeout_s: got {timeout_s!r}, must be from 0 to {threading.TIMEOUT_MAX:.0f}")
@@ -32,7 +32,7 @@ def check_capacity(capacity: int) -> None:
     """Check the capacity of a queue.
 
     Raises:
-        ValueError: if it is not an integer of at least 1.
+        ValueError: if the capacity is not an integer of at least 1.
     """
     if not isinstance(capacity, int) or capacity < 1:
         raise ValueError(f"capacity: got {capacity!r}, must be an integer of at least 1")
@@ -41,9 +41,9 @@ def check_capacity(capacity: int) -> None:
 class Subscription:
     """Subscription to fields, newest last. Iterate with ``for`` or ``async for``, or use :meth:`get`.
 
-    A full queue drops its oldest field, counted in ``dropped``. The subscription ends with :meth:`close`, at
-    the end of a ``with`` block, or when the last reference to it is deleted. Any thread or event loop may
-    read.
+    When the queue is full, its oldest field is dropped and counted in ``dropped``. The subscription ends with
+    :meth:`close`, at the end of a ``with`` block, or when the last reference to it is deleted. Any thread or
+    event loop may read.
     """
 
     def __init__(self, capacity: int, timeout_s: float | None, patches: frozenset[str]) -> None:
@@ -118,7 +118,7 @@ class Subscription:
         self._subscribed = frozenset()
 
     def end(self) -> None:
-        """Stop accepting fields, and end the reading loop after the fields still queued. Any thread."""
+        """Stop accepting fields, and end the reading loop once it has read the queued fields. Any thread."""
         self.close()
         self.offer(End(), "")
 
@@ -139,7 +139,7 @@ class Subscription:
             yield field
 
     async def __aiter__(self) -> AsyncIterator[FieldFrame]:
-        """Yield fields asynchronously, otherwise like :meth:`__iter__`."""
+        """Yield fields asynchronously; otherwise like :meth:`__iter__`."""
         while True:
             try:
                 field = await self.take_async(self._timeout_s)

@@ -72,7 +72,7 @@ def receive_patch(
 
     Args:
         patch: The patch.
-        hand: The hand that it belongs to.
+        hand: The hand to which the patch belongs.
         dispatcher: Dispatches the frames of its bus.
         ticks: The SYNC counters of its bus.
         output: Where scans are solved. Exceptions are reported to its ``defects``; if this is None, they are

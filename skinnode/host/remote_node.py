@@ -23,11 +23,11 @@ from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
 """Maximum wait for a short job on the mainline, which runs jobs fifty times a second unless the node's bus is
-away, s."""
+unavailable, s."""
 
 _ANSWER_S: Final = 0.05
-"""Wait for the responses to a single SDO request, s. If no other node has the node-ID, a failed bring-up
-takes two such waits longer."""
+"""Time to wait for the responses to a single SDO request, s. If no other node has the node-ID, a failed
+bring-up takes longer by two such waits."""
 
 _MUTE_S: Final = 0.4
 _MUTE_SCANS: Final = 5
@@ -107,7 +107,7 @@ class RemoteNode:
         """
         self.boot_ups = self.monitor.boot_ups
         if self.monitor.running and self.monitor.nmt_state == NmtState.STOPPED and not self.has_other_master:
-            nmt_master.stand_by(self.link.send, self.patch.node_id)  # stopped nodes answer no SDO request
+            nmt_master.stand_by(self.link.send, self.patch.node_id)  # stopped nodes serve no SDO request
 
         def answered(patch: PatchConfig) -> None:
             self.boot_ups = self.monitor.boot_ups  # earlier boot-ups were expected
@@ -220,7 +220,7 @@ class RemoteNode:
             The number that :meth:`start` needs.
 
         Raises:
-            NodeTimeout: if the mainline is delayed, for example while the bus is away.
+            NodeTimeout: if the mainline is delayed, for example while the bus is unavailable.
         """
         answer: queue.SimpleQueue[int] = queue.SimpleQueue()
         self.link.call(lambda: answer.put(self.stream.withhold()), self.defects)
@@ -228,7 +228,7 @@ class RemoteNode:
             return answer.get(timeout=_MAINLINE_S)
         except queue.Empty:
             raise NodeTimeout(
-                self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: the bus is away"
+                self.patch.node_id, f"patch {self.patch.name!r} on {self.patch.bus}: the bus is unavailable"
             ) from None
 
     def probe(self) -> None:
@@ -241,7 +241,7 @@ class RemoteNode:
         self.link.send(od.sdo_request_cob_id(self.patch.node_id), request)
 
     def _answers_to_one_question(self) -> int:
-        """Return how many responses a single SDO request gets: two if two nodes have this node-ID.
+        """Return the number of responses to a single SDO request: two if two nodes have this node-ID.
 
         The result is the smaller of two requests' counts, because a response to an earlier request may be
         late.

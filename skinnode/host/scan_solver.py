@@ -68,7 +68,7 @@ class ScanSolver:
         return ResistanceFrame(resistance_ohm, valid, stamp)
 
     def solve(self, scan: Scan, stamp: ScanStamp) -> tuple[FieldFrame, int]:
-        """Solve a scan. The noise combines that of the front end and that of the codes.
+        """Solve a scan. The noise of the front end and that of the codes are combined.
 
         Returns:
             The stamped field, with read-only arrays, and the number of codes that are not measurements.

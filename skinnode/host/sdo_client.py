@@ -30,7 +30,8 @@ from skinnode.host.sdo_streams import BlockDownload, BlockUpload, Client, Downlo
 from skinnode.text.words import counted
 
 ATTEMPTS: Final = 3
-"""Maximum number of attempts at a transfer that gets no response, or the response to an earlier transfer."""
+"""Maximum number of attempts at a transfer that receives no response, or the response to an earlier
+transfer."""
 
 _SILENCES: Final = ("No SDO response", "could not be retransmitted")
 """canopen's messages for a missing response; the second is used after segments have been requested again."""
@@ -165,7 +166,7 @@ class RemoteOd:
         return bytes(self._transfer(index, 0, "block read", ask))
 
     def read_large(self, index: int, most: int = MAX_UPLOAD_BYTES) -> bytes:
-        """Read a long value by block transfer, or by segments if the node refuses that."""
+        """Read a long value by block transfer, or by segments if the node refuses block transfer."""
         try:
             return self.read_block(index, most)
         except SdoAbort:
@@ -215,7 +216,7 @@ class RemoteOd:
         """Write the value and read it back.
 
         Raises:
-            NodeError: if the node kept another value.
+            NodeError: if the node kept a different value.
         """
         self.write(index, subindex, kind, value)
         kept = self.read(index, subindex, kind)
@@ -287,18 +288,18 @@ class RemoteOd:
             return SdoAbort(self.node_id, failure.code, f"{where}: {text}")
         if any(silence in str(failure) for silence in _SILENCES):
             waited_s = ATTEMPTS * self._client.RESPONSE_TIMEOUT
-            return NodeTimeout(self.node_id, f"{where}: got no answer within {waited_s:.1f} s")
+            return NodeTimeout(self.node_id, f"{where}: no response within {waited_s:.1f} s")
         if "returned a value for" in str(
             failure
         ):  # the response to another client's request, or from another node
-            got = f"{where}: got the answer for another object"
+            got = f"{where}: got the response for another object"
             why = f"two nodes answer with node-ID {self.node_id}, or another SDO client is using it"
             return NodeError(self.node_id, f"{got}; {why}")
         if isinstance(failure, SdoError):
-            return NodeError(self.node_id, f"{where}: got {failure}, expected an answer as in CiA 301")
+            return NodeError(self.node_id, f"{where}: got {failure}, expected a response as in CiA 301")
         return NodeError(
             self.node_id,
-            f"{where}: the transfer failed ({one_line(failure)}), expected an answer as in CiA 301",
+            f"{where}: the transfer failed ({one_line(failure)}), expected a response as in CiA 301",
         )
 
 

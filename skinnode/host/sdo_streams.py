@@ -56,7 +56,7 @@ class Client(SdoClient):
         self._abort_code: int = AbortCode.TIMED_OUT
 
     def abort(self, abort_code: int = AbortCode.TIMED_OUT) -> None:
-        """Store the code for :meth:`give_up`, which gets the object as an argument."""
+        """Store the code for :meth:`give_up`, which receives the object as an argument."""
         self._abort_code = abort_code
 
     def request_response(self, sdo_request: bytes) -> bytes:

@@ -25,7 +25,7 @@ class ServedBus:
     lss: LssMaster
 
     def health(self, *, no_sync: bool) -> BusHealth:
-        """Return the health of the bus; ``no_sync`` is copied to it."""
+        """Return the health of the bus; ``no_sync`` is copied into the result."""
         masters, stats, failure = self.other_masters.stats(), self.link.stats(), self.link.failure
         return BusHealth(
             bus=self.link.config.name,
@@ -48,7 +48,7 @@ class ServedBus:
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
         """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
 
-        The time of the newest dispatched frame counts as now, so that a delay of the host does not count.
+        The time of the newest dispatched frame counts as now, so that a delay in the host does not count.
 
         Args:
             t_up_ns: Monotonic time at which bring-up of the host was complete.

@@ -1,4 +1,4 @@
-"""Start of a host: configure all nodes in parallel, and make them operational."""
+"""Start a host: configure all nodes in parallel, and make them operational."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class BringUpCancelled(SkinError):
 
 
 class _Defective(NodeError):
-    """The host had a defect at each attempt to configure the node."""
+    """The host had a defect in each attempt to configure the node."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
@@ -54,7 +54,7 @@ def configure_all(
     Args:
         nodes: The nodes.
         missing: ``wait`` if silent nodes may join later, ``refuse`` if all must be present.
-        deadline_s: Maximum time to the first response of a node, s.
+        deadline_s: Maximum time until the first response from a node, s.
         cancelled: Called repeatedly; once it returns True, configuration ends.
 
     Returns:
@@ -177,7 +177,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a frame from a node that must not be sent requests; raise NodeTimeout after the deadline."""
+    """Wait for a frame from a node that may not be sent requests; raise NodeTimeout after the deadline."""
     end_s = time.monotonic() + deadline_s
     while not node.heard:
         if abandoned():
@@ -205,10 +205,10 @@ def _silence(
     names = ", ".join(f"{other.node_id} ({other.name})" for other in silent)
     if len(silent) == len(on_bus):
         return BusError(
-            f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: got no answer within "
+            f"{bus.name}: interface {bus.interface!r}, channel {bus.channel!r}: no response within "
             f"{deadline_s:g} s from any node: {names}"
         )
     return NodeTimeout(
         patch.node_id,
-        f"patch {patch.name!r} on {bus.name}: got no answer within {deadline_s:g} s from {names}",
+        f"patch {patch.name!r} on {bus.name}: no response within {deadline_s:g} s from {names}",
     )

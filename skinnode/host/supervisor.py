@@ -1,4 +1,4 @@
-"""Keep the nodes of a running hand running.
+"""Keep the nodes of a running hand in operation.
 
 A node that comes back, or appears late, is configured and started; a changed baseline is read again. Nodes do
 not affect each other. One thread decides fifty times a second what to do, based on the facts that the

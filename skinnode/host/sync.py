@@ -27,11 +27,11 @@ class SyncStats:
 
     sent: int
     missed: int
-    """Number of periods skipped because the thread ran too late."""
+    """Number of periods skipped because the thread woke too late."""
     failed: int
     """SYNC messages that a bus did not accept."""
     latest_ns: int
-    """Longest delay of a SYNC after its due time."""
+    """Longest delay of a SYNC relative to its due time."""
     received: int = 0
     """SYNC messages of other producers on buses that another master runs."""
     irregular: int = 0
@@ -99,7 +99,7 @@ class SyncProducer:
 
     The counter runs from 1 to its overflow value (CiA 301, 0x1019). SYNC number n is due n periods after the
     first; if the thread wakes a whole period late, it skips that period rather than sending two SYNC messages
-    in a row. A SYNC that has begun is sent on all buses.
+    in a row. Once a SYNC has been sent on one bus, it is sent on all buses.
 
     Threads: a dedicated thread sends.
 
@@ -174,7 +174,7 @@ class SyncProducer:
             self._wait(due_ns)
             now_ns = time.monotonic_ns()
         self._latest_ns = max(self._latest_ns, now_ns - due_ns)
-        payload = bytes([ticks.note(self._number, now_ns)])  # before sending, so that the scans find it
+        payload = bytes([ticks.note(self._number, now_ns)])  # before sending, so that scans find this SYNC
         send(SYNC_COB_ID, payload)
 
     def _wait(self, until_ns: int) -> bool:

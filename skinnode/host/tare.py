@@ -1,4 +1,4 @@
-"""Tare a patch: the node takes a new baseline, and the host reads it and solves with it."""
+"""Tare a patch: the node takes a new baseline, and the host reads it and uses it to solve scans."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A pool of worker threads that run submitted jobs in order.
 
-Submitting a job costs the mainline only half a microsecond, because unlike ThreadPoolExecutor this pool has
+Submitting a job costs the mainline only half a microsecond, because, unlike ThreadPoolExecutor, this pool has
 no result objects and no lock except the queue's. An exception in a job is passed to the function submitted
 with the job, and the thread continues with the next job.
 """
@@ -36,7 +36,7 @@ class Workers:
             thread.start()
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Run ``job`` on the next free thread; ``on_error`` gets its exception."""
+        """Run ``job`` on the next free thread; ``on_error`` receives its exception."""
         self._jobs.put((job, on_error))
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class Inline:
     """Stand-in for :class:`Workers` that runs each job at once, on the submitting thread."""
 
     def submit(self, job: Job, on_error: OnError) -> None:
-        """Run ``job``; ``on_error`` gets its exception."""
+        """Run ``job``; ``on_error`` receives its exception."""
         try:
             job()
         except Exception as error:

@@ -38,6 +38,6 @@ for every chunk, and 7 % with 2 ms of slack. Each node then sends bursts of thre
 
 A kernel with 100 timer ticks per second wakes a thread 10 to 20 ms late, and a busy machine wakes it later
 still. With ``catch_up_ns`` at 10 ms, nodes in a User Mode Linux guest skipped a third of their scans at
-10 scans/s and kept reporting an overrun (0x8110). At 50 ms they skip no scan. The mean pace is unchanged, but
-a thread that was delayed by 50 ms sends 50 ms of chunks in one burst.
+10 scans/s and kept reporting an overrun (0x8110). At 50 ms, they skipped no scans. The mean pace is
+unchanged, but a thread that was delayed by 50 ms sends 50 ms of chunks in one burst.
 """

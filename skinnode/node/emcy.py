@@ -20,7 +20,8 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum messages held back by the inhibit time, a stopped node or the bus; the oldest are dropped."""
+"""Maximum number of messages held back by the inhibit time, a stopped node or the bus; the oldest are
+dropped."""
 _RESERVED_BIT: Final = 1 << 30
 
 
@@ -136,7 +137,7 @@ class EmcyProducer:
         self._try(t_ns)
 
     def _try(self, t_ns: int) -> None:
-        """Send the queued messages if the bus accepts them; otherwise leave them to the next timer event.
+        """Send the queued messages if the bus accepts them; otherwise leave them for the next timer event.
 
         A BusError is suppressed, because the caller still has to handle the error that it is reporting.
         """

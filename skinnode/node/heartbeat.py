@@ -48,7 +48,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns if period_ms else NO_DEADLINE_NS
 
     def beat(self, t_ns: int) -> bool:
-        """Return whether a heartbeat is due at ``t_ns``, and if so schedule the next one."""
+        """Return whether a heartbeat is due at ``t_ns``, and if so, schedule the next one."""
         if t_ns < self.deadline_ns:
             return False
         self.deadline_ns += self.period_ns

@@ -1,8 +1,8 @@
 """LSS slave (CiA 305 v3.0): sets the node-ID and bit rate, and answers searches for nodes.
 
-The slave takes and returns bytes, without a bus or clock. Callbacks store the configuration and change the
-bit rate; :attr:`LssSlave.may_boot` shows whether the node must boot. LSS requests are served in every NMT
-state. A node without a node-ID serves only LSS.
+The slave takes and returns bytes, and needs neither a bus nor a clock. Callbacks store the configuration and
+change the bit rate; :attr:`LssSlave.may_boot` shows whether the node must boot. LSS requests are served in
+every NMT state. A node without a node-ID serves only LSS.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class LssSlave:
         )
 
     def reset_node(self) -> None:
-        """Copy the persistent node-ID to the pending node-ID, as required at NMT *reset node*.
+        """Copy the persistent node-ID to the pending node-ID, as required on NMT *reset node*.
 
         A pending node-ID that was never stored is lost. Call :meth:`reset_communication` afterwards.
 
@@ -109,7 +109,7 @@ class LssSlave:
         self.pending_node_id = self._persistent_node_id
 
     def reset_communication(self) -> None:
-        """Copy the pending node-ID to the active node-ID, as required at NMT *reset communication*."""
+        """Copy the pending node-ID to the active node-ID, as required on NMT *reset communication*."""
         self.node_id = self.pending_node_id
         self._enter(LssState.WAITING)
         self._scan_part = 0

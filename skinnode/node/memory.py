@@ -67,7 +67,7 @@ class Memory(Protocol):
     """Interface of a memory."""
 
     def load(self) -> Kept | None:
-        """Return the content saved last; None if nothing was ever saved.
+        """Return the last saved content; None if nothing was ever saved.
 
         Raises:
             MemoryFault: if the memory has no usable content.
@@ -88,7 +88,7 @@ class VolatileMemory:
         self._kept: Kept | None = None
 
     def load(self) -> Kept | None:
-        """Return the content saved last; None if nothing was saved."""
+        """Return the last saved content; None if nothing was saved."""
         return self._kept
 
     def save(self, kept: Kept) -> None:

@@ -21,7 +21,8 @@ from skinnode.node.memory import Fault, Kept, MemoryFault, Parameters
 
 _FORMAT: Final = "skinnode node memory 1"
 _MOST_BYTES: Final = 1 << 24
-"""Maximum bytes read from a file; 512 PDOs and the largest baseline need less than a tenth of this."""
+"""Maximum number of bytes read from a file; 512 PDOs and the largest baseline need less than a tenth of
+this."""
 
 
 class FileMemory:

@@ -24,13 +24,15 @@ _RETRY_S: Final = 0.02
 """Pause after a bus error, s; a full queue drains within this time."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum frames served before a node is reported silent; half a second of a full bus at 1 Mbit/s."""
+"""Maximum number of frames served before a node is reported as silent; a full bus at 1 Mbit/s carries this
+number in half a second."""
 
 OFF_AFTER_S: Final = 0.1
-"""Duration of unbroken bus errors after which nodes treat the bus as off, s; a full queue drains sooner."""
+"""Duration of uninterrupted bus errors after which nodes treat their controller as bus-off, s; a full queue
+drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""Duration of unbroken bus errors after which the interface is reopened, s, in case it was replugged."""
+"""Duration of uninterrupted bus errors after which the interface is reopened, s, in case it was replugged."""
 
 
 class NodeRunner:
@@ -168,7 +170,7 @@ class NodeRunner:
     def _turn(self) -> None:
         """Serve all timers and at most one frame; return when a timer is due, or after a limited wait."""
         nodes, clock = self.nodes, time.monotonic_ns
-        # All nodes get the same time, so that nodes started together share one wake-up of the thread.
+        # All nodes receive the same time, so that nodes started together share one wake-up of the thread.
         now_ns, first_ns = clock(), NO_DEADLINE_NS
         silent = any(now_ns >= node.silent_from_ns for node in nodes)
         failure = self._catch_up(now_ns) if silent else None

@@ -9,7 +9,7 @@ from skinnode.node.clock import NO_DEADLINE_NS
 
 
 class Timers:
-    """Heap with one time per key. Setting, moving or taking a time costs O(log n), amortised."""
+    """Heap with one time per key. Setting, moving or removing a time costs O(log n), amortised."""
 
     def __init__(self) -> None:
         self._due: dict[int, int] = {}

@@ -44,8 +44,8 @@ COMPLAINTS_KEPT: Final = 100
 
 _MOST: Final = 2**63 - 1
 _LONGEST_LINE: Final = 2 << 20
-"""Maximum bytes per line: enough for the facts of the largest patch. A longer line is read as several
-lines."""
+"""Maximum length of a line, bytes: enough for the facts of the largest patch. A longer line is read as
+several lines."""
 _OF_PATCHES: Final = ("resumed", "withheld", "polled", "overtaken")
 
 

@@ -37,7 +37,7 @@ SYNC_S: Final = 1.0
 ms."""
 
 CAPACITY: Final = 50_000
-"""Maximum number of batches queued for the disk: several seconds of four fully loaded buses."""
+"""Maximum number of batches queued for the disk: several seconds of traffic on four fully loaded buses."""
 
 _ALLOWED: Final = "a folder (created if needed), or a file ending in .log or .blf"
 
@@ -63,10 +63,10 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 
 
 def make_folder(path: Path) -> Path | None:
-    """Create the folder ``path`` with its parents, and return it; None if it existed already.
+    """Create the folder ``path`` with its parents, and return it; None if it already existed.
 
-    A name with a suffix counts as a misspelt recording file. Raises ConfigError for such a name, or if the
-    folder cannot be created.
+    A name with a suffix is treated as that of a misspelt recording file. Raises ConfigError for such a name,
+    or if the folder cannot be created.
     """
     if path.is_dir():
         return None
@@ -99,8 +99,8 @@ class Recorder:
 
     A recording that begins before the host starts is replayed bit for bit. A recording that begins while the
     host runs (:meth:`Host.tap`) lacks the state of the solvers. A ``with`` block that fails before the first
-    frame leaves no file. If the disk fails, the recording ends, one log line reports it, and the host
-    continues. An entry that raises any other exception is lost and counted in ``dropped``.
+    frame leaves no file. If the disk fails, the recording ends, one log line reports the failure, and the
+    host continues. An entry that raises any other exception is lost and counted in ``dropped``.
 
     Args:
         hand: The hand.
@@ -246,7 +246,7 @@ class Recorder:
             self._defects.report("recording", error)
 
     def _flush(self, *, to_disk: bool) -> None:
-        """Flush the journal before the log, so that it never lags behind the log."""
+        """Flush the journal before the log, so that the journal never lags behind the log."""
         if self._lost != self._lost_reported:
             lost, self._lost_reported = self._lost - self._lost_reported, self._lost
             self._write_event("", time.monotonic_ns(), "dropped", frames=lost)
@@ -274,7 +274,7 @@ class Recorder:
 
 
 def channels(hand: HandConfig) -> dict[str, str]:
-    """Return the log channel of each bus: its name if candump allows that name, otherwise a numbered one."""
+    """Return the log channel of each bus: its name if candump allows it, otherwise a numbered name."""
     names = {}
     for number, bus in enumerate(hand.buses):
         plain = bus.name.isascii() and bus.name.isalnum() and not bus.name.isdigit() and len(bus.name) < 16

@@ -4,9 +4,10 @@ The dispatcher, assembler, decoder, stream, solver and publisher are those of th
 each scan is solved when its last frame is dispatched.
 
 **Same as live.** Scans that were solved live give bit-identical fields if the recording began before the host
-started and is complete, if build and processor are the same, and if no deadline cut a solve short. Times are
-on the recording host's clock, to 1 µs, the resolution of log files. If frames are missing or damaged, journal
-events are placed by time instead of by frame count, and the times of later frames end incomplete scans.
+started and is complete, if the build and the processor are the same, and if no deadline cut a solve short.
+Times are on the recording host's clock, to 1 µs, the resolution of log files. If frames are missing or
+damaged, journal events are placed by time instead of by frame count, and incomplete scans are ended on the
+basis of the times of later frames.
 """
 
 from __future__ import annotations
@@ -174,7 +175,7 @@ class Replay:
         return self._stopped or self._cancelled()
 
     def health(self, patch: str) -> PatchHealth:
-        """Return the health of a patch at this point of the replay. Raises KeyError for an unknown patch."""
+        """Return the health of a patch at this point in the replay. Raises KeyError for an unknown patch."""
         heard = self._buses[self.hand.patch(patch).bus].patches[patch]
         return heard.monitor.health(self._now_ns, self.hand.bring_up.heartbeat_s, self.hand.sync.period_s)
 

@@ -50,7 +50,7 @@ class _Container(NamedTuple):
     end: int
     """Offset from which to look for the next container, bytes."""
     objects: bytes | None
-    """Content, as far as it is readable; None if nothing is."""
+    """Content, as far as it is readable; None if none of it is."""
     intact: bool = False
 
 

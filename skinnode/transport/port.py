@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig
 
 VIRTUAL_QUEUE_FRAMES: Final = 32768
-"""Queue capacity of an endpoint on python-can's virtual bus: about 4 s of a fully loaded bus at 1 Mbit/s.
-Without a limit, an endpoint that is never read would fill the memory."""
+"""Queue capacity of an endpoint on python-can's virtual bus: about 4 s of traffic on a fully loaded bus at 1
+Mbit/s. Without a limit, an endpoint that is never read would fill the memory."""
 
 RECEIVE_BUFFER_BYTES: Final = 1 << 22
 """Size of the receive buffer requested from the kernel, if the interface is a socket; a waiting frame takes
@@ -48,16 +48,16 @@ _OLDEST_STAMP_S: Final = 10.0
 the time of reading is used."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Errors by which the kernel reports, once per socket, that its interface went down; a send call may get such
-an error instead of a receive call."""
+"""Errors by which the kernel reports, once per socket, that its interface went down; a send call may receive
+such an error instead of a receive call."""
 
 _SOCKETCAN: Final = "socketcan"
 _MULTICAST: Final = "udp_multicast"
 _VIRTUAL: Final = "virtual"
 
 
-# In a program without logging, python-can's loggers would warn on stderr, even of errors that BusError
-# reports.
+# In a program without logging, python-can's loggers would print warnings on stderr, even about errors that
+# BusError reports.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 
@@ -255,7 +255,7 @@ class CanPort:
 
         Args:
             timeout_s: Maximum wait for the first frame, s.
-            most: Maximum number of frames. Interfaces other than socketcan return one at a time.
+            most: Maximum number of frames. Interfaces other than socketcan return one frame at a time.
 
         Raises:
             BusError: if the interface fails or is closed.
@@ -292,9 +292,9 @@ class CanPort:
             timeout_s = max(0.0, (end_ns - time.monotonic_ns()) * 1e-9)
 
     def reopen(self) -> None:
-        """Close and open the interface again after it failed; the counters continue.
+        """Close and reopen the interface after a failure; the counters are not reset.
 
-        While it is closed, sending raises BusError. The receiving thread must have ended first.
+        While the interface is closed, sending raises BusError. The receiving thread must have ended first.
 
         Raises:
             BusError: if the interface cannot be opened; a later call may succeed.
@@ -390,7 +390,7 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _is_garbage(error: Exception) -> bool:
-    """Return whether the multicast bus failed on the content of a packet, not on the network.
+    """Return whether the multicast bus failed because of a packet's content, not because of the network.
 
     In that case msgpack or a check of the message raised the error, not the socket.
     """

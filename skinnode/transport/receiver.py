@@ -20,17 +20,17 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Capacity of an intake: 2 s of a fully loaded bus at 1 Mbit/s (8,000 frames/s), longer than any pause that a
-host tolerates."""
+"""Capacity of an intake: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s), which covers more
+than the longest pause that a host tolerates."""
 
 _POLL_S: Final = 0.02
 """Maximum time that a thread waits for a frame before it checks whether to end, s."""
 
 
 GATHER_NS: Final = 1_500_000
-"""Pause after a batch, like the interrupt moderation of a network card: waking for each of 8,000 frames/s
-would cost more than handling them. The first frame after a silence is not delayed, and each frame keeps its
-arrival time."""
+"""Pause after a batch, like the interrupt moderation of a network card: waking 8,000 times a second, once per
+frame, would cost more than handling the frames. The first frame after a silence is not delayed, and each
+frame keeps its arrival time."""
 
 LONG_NS: Final = 5_000_000
 """Pause after a batch while the arrival of every awaited frame is predicted. An unpredicted frame may wait
@@ -73,7 +73,7 @@ class Intake:
             raise ValueError(f"capacity: got {capacity}, must be at least 1")
         self.port = port
         self.seen_ns = 0
-        """Monotonic time before which every frame that arrived is queued or dropped."""
+        """Monotonic time before which every frame that arrived has been queued or dropped."""
         self.due_ns = 0
         """Monotonic time of the next :meth:`fetch`. Used by the receiver."""
         self._capacity = capacity
@@ -124,7 +124,10 @@ class Intake:
         self._first_ns = min([times[0] if times else 0 for times in self._expected.values()])
 
     def asked(self, t_ns: int) -> None:
-        """Record that a request was sent at monotonic time ``t_ns`` and may be answered. Any thread."""
+        """Record that a request was sent at monotonic time ``t_ns``.
+
+        A response may follow. Any thread.
+        """
         self._asked_ns = t_ns
 
     # --- called by the receiver
@@ -132,7 +135,7 @@ class Intake:
     def gather(self, now_ns: int) -> None:
         """Set :attr:`due_ns` after a batch, so that frames accumulate until then."""
         known = now_ns > self._asked_ns + _ANSWER_NS
-        if now_ns < self._first_ns:  # fast path of the usual case: runs after every batch of every bus
+        if now_ns < self._first_ns:  # fast path for the usual case: runs after every batch of every bus
             awaited_ns = _before(self._first_ns, now_ns)
         else:
             awaited_ns, all_known = self._next_awaited(now_ns)
@@ -200,7 +203,7 @@ class _Shared:
 
 
 class Receiver:
-    """Receiver on the ports of ``intakes``, from construction until :meth:`close`.
+    """Receiver for the ports of ``intakes``, from construction until :meth:`close`.
 
     Threads: ports that read batches share one thread, which wakes once for several buses where possible. Any
     other port may block in python-can and has its own thread. A failing port stops only its own reception.

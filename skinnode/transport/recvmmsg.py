@@ -1,7 +1,7 @@
-"""Receives many messages from a socket in one system call: recvmmsg(2), which Python's socket module lacks.
+"""Receive many messages from a socket in one system call: recvmmsg(2), which Python's socket module lacks.
 
 The call holds Python's global interpreter lock. It does not wait and takes about 1 µs per message; releasing
-the lock for each of 8,000 messages/s would cost the other threads more.
+the lock 8,000 times a second, once per message, would cost the other threads more.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most``, and at most ``count``, messages, replacing the last batch; never waits.
+        """Receive up to ``most`` messages, but at most ``count``, replacing the last batch; never waits.
 
         Returns:
             Number of messages received.

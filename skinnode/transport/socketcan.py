@@ -45,13 +45,13 @@ _OLDEST_NS: Final = 10_000_000_000
 is used."""
 
 _NEWEST_NS: Final = 100_000_000
-"""Maximum time by which a frame may arrive after the reading of its batch began."""
+"""Maximum time from the start of reading a batch to the arrival of a frame in that batch."""
 
 _IP_S: Final = 5.0
 """Maximum duration of an ``ip link`` command, s."""
 
 BATCH_FRAMES: Final = 256
-"""Maximum number of frames per call: 30 ms of a fully loaded bus at 1 Mbit/s."""
+"""Maximum number of frames per call: 30 ms of traffic on a fully loaded bus at 1 Mbit/s."""
 
 
 class SocketReader:
@@ -179,7 +179,7 @@ class HardwareDelay:
     """Converter of times from a controller's own clock to the monotonic clock.
 
     A frame that the kernel timestamped late thus keeps its arrival time. The kernel's timestamp is never
-    early, so each frame gives an upper bound of the difference between the clocks. The lower envelope of
+    early, so each frame gives an upper bound on the difference between the clocks. The lower envelope of
     these bounds is tracked; it may rise as fast as two crystals drift apart. Owned by one thread.
     """
 

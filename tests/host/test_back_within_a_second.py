@@ -99,7 +99,7 @@ ATTACKS = (
     attack("open wire", open_upper=1, reason="wire open or shorted: upper wire open 1"),
     attack("all heartbeats lost", 2.0, heartbeat_lost=1.0, reason="no heartbeat from node"),
     attack("all SDO answers lost", 1.0, sdo_response_lost=1.0),
-    after_power_off("all SDO answers lost", 3.0, sdo_response_lost=1.0, reason="got no answer"),
+    after_power_off("all SDO answers lost", 3.0, sdo_response_lost=1.0, reason="no response"),
     after_power_off("all SDO requests lost", 2.0, sdo_request_lost=1.0, reason="no heartbeat from node"),
     after_power_off("a fifth of the SDO answers lost", 2.0, sdo_response_lost=0.2),
     after_power_off("NMT lost", 2.0, nmt_lost=1.0, reason="after the start command, expected 5"),

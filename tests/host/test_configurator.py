@@ -170,7 +170,7 @@ def test_no_node_at_all(hand: HandConfig) -> None:
     with pytest.raises(BusError) as caught, Host.from_config(hand, boot_deadline_s=0.5):
         pass
     assert str(caught.value) == (
-        f"can0: interface 'virtual', channel '{hand.buses[0].channel}': got no answer within "
+        f"can0: interface 'virtual', channel '{hand.buses[0].channel}': no response within "
         "0.5 s from any node: 5 (p0), 6 (p1)"
     )
     assert time.monotonic() - start_s < 10  # no hang
@@ -180,7 +180,7 @@ def test_one_node_missing(hand: HandConfig) -> None:
     failure = failure_of(hand, lambda port: node(port, 5), deadline_s=0.5)
     assert isinstance(failure, NodeTimeout)
     assert failure.node_id == 6
-    assert str(failure) == ("node 6: patch 'p1' on can0: got no answer within 0.5 s from 6 (p1)")
+    assert str(failure) == ("node 6: patch 'p1' on can0: no response within 0.5 s from 6 (p1)")
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,6 @@ def test_answer_for_another_object_names_who_may_have_caused_it() -> None:
     with pytest.raises(NodeError) as caught:
         RemoteOd(network, 5).read(0x1A00, 4, "u32")
     assert str(caught.value) == (
-        "node 5: read of object 0x1A00:4: got the answer for another object; "
+        "node 5: read of object 0x1A00:4: got the response for another object; "
         "two nodes answer with node-ID 5, or another SDO client is using it"
     )

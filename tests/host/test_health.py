@@ -154,10 +154,10 @@ def test_the_reason_names_what_holds_a_patch_back(monitor: NodeMonitor) -> None:
     assert reason(monitor, 0) == "node 11 has sent nothing"
     monitor.on_heartbeat(b"\x7f", 0)
     assert reason(monitor, 1) == "node 11 is pre-operational, not operational yet"
-    monitor.complaint = "read of object 0x1018:1: got no answer"
-    assert reason(monitor, 1).endswith("; read of object 0x1018:1: got no answer")
+    monitor.complaint = "read of object 0x1018:1: no response"
+    assert reason(monitor, 1).endswith("; read of object 0x1018:1: no response")
     assert (
-        reason(monitor, 2000) == "no heartbeat from node 11 for 2.0 s; read of object 0x1018:1: got no answer"
+        reason(monitor, 2000) == "no heartbeat from node 11 for 2.0 s; read of object 0x1018:1: no response"
     )
     monitor.complaint = None
     monitor.on_heartbeat(b"\x05", 2000 * MS)

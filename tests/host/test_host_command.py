@@ -239,7 +239,7 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 def test_no_node_answers(error_of: Callable[..., str], tmp_path: Path, hand: HandConfig) -> None:
     channel = hand.buses[0].channel
     assert error_of(str(write_hand(tmp_path, "virtual", channel))) == (
-        f"error: can0: interface 'virtual', channel '{channel}': got no answer within "
+        f"error: can0: interface 'virtual', channel '{channel}': no response within "
         "3 s from any node: 11 (thumb), 12 (index)"
     )
 

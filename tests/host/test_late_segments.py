@@ -61,5 +61,5 @@ def test_segments_that_do_not_come_are_asked_for_again(lost: Iterable[int]) -> N
 
 def test_a_node_that_falls_silent_in_a_block_is_silent() -> None:
     server = Server((), last=4)
-    with pytest.raises(NodeTimeout, match=r"block read of object 0x2301:0: got no answer"):
+    with pytest.raises(NodeTimeout, match=r"block read of object 0x2301:0: no response"):
         RemoteOd(server.network, 5).read_block(0x2301)

@@ -309,7 +309,7 @@ def test_the_load_of_each_bus_is_measured_though_in_turn(hand: HandConfig) -> No
 @pytest.mark.parametrize(
     ("response", "error", "line"),
     [
-        (None, NodeTimeout, "node 5: read of object 0x1017:0: got no answer within 0.9 s"),
+        (None, NodeTimeout, "node 5: read of object 0x1017:0: no response within 0.9 s"),
         (
             "4f 17 10 00 05 00 00 00",
             NodeError,
@@ -318,7 +318,8 @@ def test_the_load_of_each_bus_is_measured_though_in_turn(hand: HandConfig) -> No
         (
             "60 17 10 00 00 00 00 00",
             NodeError,
-            "node 5: read of object 0x1017:0: got Unexpected response 0x60, expected an answer as in CiA 301",
+            "node 5: read of object 0x1017:0: got Unexpected response 0x60, "
+            "expected a response as in CiA 301",
         ),
         (
             "80 17 10 00 00 00 02 06",

@@ -84,7 +84,7 @@ def test_a_late_node_id_is_not_taken_for_that_of_another(line_of: Callable[..., 
     line = line_of(slave(7, 5), slave(8, 6))
     line.late = {0x5E}
     assert line.master.select(address(7))
-    with pytest.raises(LssFailed, match="the node-ID inquiry: got no LSS answer"):
+    with pytest.raises(LssFailed, match="the node-ID inquiry: no LSS response"):
         line.master.node_id()
     assert line.master.select(address(8))
     line.late, line.late_s = {0x5E}, 0.8 * ANSWER_S

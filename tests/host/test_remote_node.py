@@ -93,7 +93,7 @@ def test_a_node_that_does_not_answer_when_it_comes_back_is_not_refused(
         assert eventually(lambda: host.stats().nodes["p1"].failures > 0)
         health = host.health("p1")
         assert (health.condition is Condition.REFUSED, health.refusal) == (False, None)
-        assert "got no answer" in health.reason
+        assert "no response" in health.reason
 
 
 def test_a_node_that_left_operational_is_not_tared(hand: HandConfig, rack: Rack) -> None:

@@ -74,7 +74,7 @@ def test_a_node_is_asked_for_its_device_type(server: Server) -> None:
 def test_a_silent_node_does_not_answer_and_is_no_defect_of_the_host(server: Server) -> None:
     server.silent = True
     assert not server.remote.answers()
-    with pytest.raises(NodeTimeout, match=r"^node 5: read of object 0x1017:0: got no answer"):
+    with pytest.raises(NodeTimeout, match=r"^node 5: read of object 0x1017:0: no response"):
         server.remote.read(0x1017, 0, "u16")
     assert server.defects == []
     server.silent = False

@@ -15,7 +15,8 @@ from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16
-"""Readings averaged for a baseline; its noise is 1/4 of a reading's and adds 3 % to the noise of R/R0."""
+"""Number of readings averaged for a baseline, whose noise is 1/4 of a reading's and adds 3 % to that of
+R/R0."""
 
 
 class Acquisition:
@@ -102,7 +103,7 @@ class Acquisition:
         self.forget_sent()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0, ohm. The node then stops taring by itself, so the client must also set all other R0."""
+        """Set one R0, ohm; the client must then set all others, as the node no longer tares by itself."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.forget_sent()
@@ -119,7 +120,7 @@ class Acquisition:
         return self.codes if self._sent is None else self._sent
 
     def forget_sent(self) -> None:
-        """Make the next scan a full scan, because the receiver may not hold the codes sent before."""
+        """Make the next scan a full scan, because the receiver might not hold the codes sent earlier."""
         self._sent = None
 
     def changed_chunks(self, threshold: int, full_every: int) -> list[int] | None:
@@ -130,7 +131,7 @@ class Acquisition:
 
         Args:
             threshold: threshold, codes.
-            full_every: scans from one full scan to the next; 0 for no full scans.
+            full_every: number of scans from one full scan to the next; 0 for no full scans.
 
         Returns:
             Indices in ascending order; None if a full scan is due.

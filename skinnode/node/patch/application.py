@@ -1,4 +1,4 @@
-"""Patch application, which takes scans at SYNC, by its own timer or on command, tares, and tests itself.
+"""Patch application, which takes scans at SYNC, on its own timer or on command, tares, and tests itself.
 
 :mod:`skinnode.node.patch.objects` binds the manufacturer objects (0x2000 to 0x2301). The CANopen
 communication around the application is in :mod:`skinnode.node.device`.
@@ -42,7 +42,7 @@ class PatchApplication:
         serial: serial number (0x2000:11), u32.
         acquisition: codes and baseline of the patch.
         services: the services of the device.
-        pacing: timer precision, which determines how closely chunks keep their pace.
+        pacing: timer precision, which determines how precisely chunks are paced.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class PatchApplication:
         self._plan()
 
     def on_sync(self, counter: int | None, turns: frozenset[int], t_ns: int) -> None:
-        """Take a scan at a SYNC in OPERATIONAL, unless the node scans by its own timer.
+        """Take a scan at a SYNC in OPERATIONAL, unless the node scans on its own timer.
 
         Args:
             counter: the SYNC counter; None if SYNC carries none.

@@ -98,7 +98,7 @@ class ScanStream:
     def is_held_up(self, t_ns: int) -> bool:
         """Return whether scans take longer than their inhibit times require.
 
-        If so, the node's thread gets too little processor time, or the bus refuses frames.
+        If so, the node's thread receives too little processor time, or the bus refuses frames.
         """
         busy_ns = t_ns - self._busy_ns
         lost_ns = busy_ns - self._paced_ns

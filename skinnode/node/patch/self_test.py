@@ -20,7 +20,8 @@ from skinnode.protocol.self_test import SelfTest, SelfTestFault
 READINGS: Final = 16
 """Number of readings, the same as for a tare.
 
-The standard deviation is then known to 18 % (1/√30) for one crossing and to 1 % for a patch of 300 crossings.
+The standard deviation is then known to within 18 % (1/√30) for one crossing and to within 1 % for a patch of
+300 crossings.
 """
 
 NOISE_LIMIT: Final = 1e-3
@@ -74,7 +75,7 @@ def self_test(read: Callable[[], Float], baseline_ohm: Float, scale: CodeScale) 
 
 
 def _noise(readings: Float) -> float:
-    """Return the RMS over the crossings of the readings' relative standard deviation; 0 without crossings."""
+    """Return the readings' relative standard deviation, RMS over the crossings; 0 without crossings."""
     if len(readings) < 2 or not readings.shape[1]:
         return 0.0
     relative = readings.std(axis=0, ddof=1) / readings.mean(axis=0)

@@ -12,7 +12,8 @@ type       sent
 =========  =======================================================================================
 
 If the application has *claimed* the first object of a TPDO, the application sends that TPDO, and SYNCs and
-events do not trigger it. The engine still counts its SYNCs and serves its remote frames and event timer.
+events do not trigger it. The engine still counts the TPDO's SYNCs and serves its remote frames and event
+timer.
 
 The time to handle a SYNC grows with the number of enabled TPDOs that respond to SYNC, and the time to handle
 a timer event with the number of TPDOs that are due. Other TPDOs take no time.

@@ -31,7 +31,8 @@ SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
 """Maximum mean time between two segments, ns; at this pace, segments take a quarter of a 125 kbit/s bus. If
 the bus refuses segments even at this pace, the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum segments sent per timer event, to compensate for a thread that wakes late (2 ms by default).
+"""Maximum number of segments sent per timer event, to compensate for a thread that wakes late (by 2 ms by
+default).
 
 The transmit queue of a Linux CAN interface holds 10 frames, and a delayed thread may handle two events in a
 row.
@@ -40,7 +41,7 @@ TWICE_NS: Final = 3_000_000
 """Maximum time between the two deliveries of one frame, ns: two maximum-length frames at 125 kbit/s and an
 error frame.
 
-A client that sends a genuine second acknowledgement has received more segments since the first one.
+A client that sends a genuine second acknowledgement has received more segments since the first.
 """
 
 _LAST: Final = 0x80

@@ -75,7 +75,7 @@ class SdoServer:
                 self._abort(transfer.target, refused.code)
 
     def on_request(self, request: bytes, t_ns: int) -> None:
-        """Handle a client request. An abort gets no response.
+        """Handle a client request. An abort receives no response.
 
         Args:
             request: eight bytes.

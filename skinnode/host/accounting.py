@@ -44,7 +44,7 @@ def discrepancies(stats: HostStats) -> list[str]:
 
 
 def losses_of_bus(bus: BusStats) -> dict[str, str]:
-    """Return a phrase for each counter of a bus's losses and errors that is not zero, by counter name."""
+    """Return a phrase for each nonzero counter of a bus's losses and errors, by counter name."""
     counts = (
         ("dropped", "frame dropped", "frames dropped"),
         ("kernel_dropped", "frame dropped by the kernel", "frames dropped by the kernel"),
@@ -56,7 +56,7 @@ def losses_of_bus(bus: BusStats) -> dict[str, str]:
 
 
 def losses_of_stream(stream: StreamStats) -> dict[str, str]:
-    """Return a phrase for each counter of a patch's losses that is not zero, by counter name."""
+    """Return a phrase for each nonzero counter of a patch's losses, by counter name."""
     assembler = stream.assembler
     counts = (
         ("scans_torn", "scan torn", "scans torn"),

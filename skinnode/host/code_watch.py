@@ -217,7 +217,7 @@ def _median(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
 
 
 def _median_of_known(values: NDArray[np.float64]) -> float:
-    """Return the median of the values that are not NaN; NaN if all are."""
+    """Return the median of the values that are not NaN; NaN if all are NaN."""
     known = values[~np.isnan(values)]
     return float(_median(known, 0)) if known.size else math.nan
 

@@ -2,8 +2,8 @@
 
 Nothing is written before identity and layout are known to match the hand file, because the node could be a
 drive. Every written value is read back. On a bus that another master runs, the host sends no NMT commands,
-leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If it must send
-nothing (``guest_sends = "nothing"``), all facts come from files.
+leaves the SYNC parameters alone, and writes patch-specific parameters only if they differ. If the host must
+send nothing (``guest_sends = "nothing"``), all facts come from files.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _POLL_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configuration of the nodes of one bus, one after the other or in parallel.
+    """Configuration of the nodes of one bus, one after another or in parallel.
 
     Threads: one thread per node at a time.
     """

@@ -31,8 +31,8 @@ _LONGEST_BRIEF_S: Final = 0.02
 other subjects."""
 
 _COMPLAINTS: Final = 64
-"""Maximum number of logged messages remembered per subject; when it is reached, messages may be logged
-again."""
+"""Maximum number of logged messages remembered per subject; when this number is reached, messages may be
+logged again."""
 
 
 def one_line(error: BaseException | None) -> str:

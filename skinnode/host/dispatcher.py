@@ -218,8 +218,8 @@ class Dispatcher:
     def measure(self, now_ns: int) -> None:
         """Compute the load if an interval has passed.
 
-        This takes as long as handling forty frames, so a mainline with several buses calls it for only one
-        bus per turn.
+        The computation takes as long as handling forty frames, so a mainline with several buses calls it for
+        only one bus per turn.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)

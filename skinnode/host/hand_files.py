@@ -72,7 +72,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
 
     Raises:
         ConfigError: if the file cannot be read.
-        ProfileError: if it is not an EDS, or an object differs or is missing.
+        ProfileError: if the file is not an EDS, or an object differs or is missing.
     """
     from canopen.objectdictionary.eds import import_eds  # accepts any file name
 

@@ -40,8 +40,8 @@ class Condition(enum.StrEnum):
     """Operational according to its heartbeat, but no scans arrive, or all are withheld."""
     RESTARTING = "restarting"
     """The node restarts by itself in a loop: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. A node
-    that restarted once, or that is operational again and has not restarted for 0.5 s, gets the condition that
-    fits its current state."""
+    that restarted once, or that is operational again and has not restarted for 0.5 s, is given the condition
+    that fits its current state."""
     FROZEN = "frozen"
     """Scans arrive, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"

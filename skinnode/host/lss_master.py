@@ -37,8 +37,8 @@ STORE_ANSWER_S: Final = 2.0
 it synchronises to disk. CANopenNode's LSS master waits 1 s for any response."""
 
 _SCAN_ANSWERS_S: Final = (0.03, 0.15)
-"""Timeouts of the requests in a fastscan, s; every negative answer costs one timeout, and the longer is used
-if the first attempt found no node."""
+"""Timeouts of the requests in a fastscan, s; every negative answer costs one timeout, and the longer timeout
+is used if the first attempt found no node."""
 
 _TRIES: Final = 2
 """Number of requests without a response after which a node is assumed not to exist; a busy computer may miss
@@ -210,7 +210,7 @@ class LssMaster:
         _require_done(answer, f"node-ID {node_id}")
 
     def set_bit_rate(self, bitrate_bps: int) -> None:
-        """Set the bit rate that the node uses after its next power-on, provided it is stored.
+        """Set the bit rate that the node uses after its next power-on, provided the bit rate is stored.
 
         Raises:
             LssFailed: if the node refuses or does not answer.
@@ -233,7 +233,7 @@ class LssMaster:
         _require_done(answer, "the store command")
 
     def release(self) -> None:
-        """Switch all nodes to waiting state; a node that has just got its first node-ID boots."""
+        """Switch all nodes to waiting state; a node that has just received its first node-ID boots."""
         self._request(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,)))
 
     # --- frames

@@ -245,7 +245,7 @@ def _read_back(node: Supervised) -> None:
 
 
 def _search(remote: RemoteNode) -> bool:
-    """Search for the patch by LSS. Returns whether it was found."""
+    """Search for the patch by LSS. Returns whether the patch was found."""
     try:
         return remote.search()
     except Exception as error:

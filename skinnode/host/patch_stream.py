@@ -1,8 +1,8 @@
 """From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
 
-The mainline assembles scans and puts the newest in a box that holds one scan; a worker takes it from there
-and solves it. A scan that is overtaken while the worker is busy is skipped and counted. The stream's token
-ensures that at most one worker processes the stream at a time.
+The mainline assembles scans and puts the newest in a box that holds one scan; a worker takes the scan from
+the box and solves it. A scan that is overtaken while the worker is busy is skipped and counted. The stream's
+token ensures that at most one worker processes the stream at a time.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class StreamStats:
     """Incomplete scans withheld because of ``stream.partial`` in the hand file."""
     solved: int
     skipped: int
-    """Scans replaced by a newer one before a worker was free."""
+    """Scans replaced by newer scans before a worker was free."""
     untrusted: int
     """Fields in which a wire did not converge."""
     invalid_codes: int

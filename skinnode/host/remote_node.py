@@ -263,7 +263,7 @@ class RemoteNode:
         return not self.has_other_master and self.patch.serial is not None
 
     def search(self) -> bool:
-        """Search for the patch by its serial number, if known. Returns whether it was found.
+        """Search for the patch by its serial number, if known. Returns whether the patch was found.
 
         If found, the patch will boot with its node-ID.
         """

@@ -26,8 +26,8 @@ _BRING_UPS: Final = 3
 do, or whose configuration raises an unexpected exception."""
 
 _START_AGAIN_NAPS: Final = 50
-"""Number of polling pauses, a quarter of a second in total, after which an unconfirmed start command is sent
-again, because it may have been lost."""
+"""Number of polling pauses, a quarter of a second in total, after which an unconfirmed start command, which
+may have been lost, is sent again."""
 
 _POLL_S: Final = 0.005
 

@@ -17,7 +17,7 @@ RUNNING    its scans are passed on                   it booted, or left operatio
 
 A defect is an exception raised while serving a patch that is STARTING or RUNNING, or while configuring it. It
 makes the patch faulty: its scans are withheld, and its node is AWAITED for a pause of 0.1 s to 1 s that grows
-with each defect. A node that could not be configured is AWAITED likewise. A boot-up ends the pause; after
+with each defect. A node that could not be configured is likewise AWAITED. A boot-up ends the pause; after
 silence or a refusal, so does any frame from the node.
 """
 

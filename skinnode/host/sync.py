@@ -104,7 +104,7 @@ class SyncProducer:
     Threads: a dedicated thread sends.
 
     Args:
-        buses: For each bus, the function that sends and the SYNC counters.
+        buses: For each bus, the function that sends frames, and the SYNC counters.
         period_s: SYNC period, s.
         stagger_s: Delay from one bus to the next, s.
         defects: For each bus, the collector of exceptions raised while sending on it.

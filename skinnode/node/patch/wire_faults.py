@@ -31,7 +31,7 @@ class WireFaults:
 
     @classmethod
     def none(cls, profile: PatchProfile) -> WireFaults:
-        """Return the wire faults of a patch that has none."""
+        """Return the result for a patch without wire faults."""
         rows, columns = np.zeros(profile.rows, dtype=np.bool_), np.zeros(profile.columns, dtype=np.bool_)
         return cls(rows, rows, columns, columns)
 

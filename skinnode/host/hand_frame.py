@@ -1,4 +1,4 @@
-"""Hand frames: the fields of all patches for one SYNC, gathered on the thread that reads them.
+"""Hand frames: the fields of all patches for one SYNC, assembled on the thread that reads them.
 
 This module starts no threads.
 """

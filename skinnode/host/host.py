@@ -195,7 +195,7 @@ class Host:
             capacity: Number of hand frames by which the loop may lag; the hand file's capacity by default.
 
         Raises:
-            ValueError: if the patches of the hand do not follow one SYNC with a counter.
+            ValueError: if the patches of the hand do not all follow the same SYNC with a counter.
         """
         self._require_one_sync()
         patches = [patch.name for patch in self.hand.patches]

@@ -18,7 +18,7 @@ _WAIT_S: Final = 0.02
 
 
 class Mainline:
-    """Thread that dispatches the frames received on ``links`` until :meth:`stop` or the end of a ``with``.
+    """Thread that dispatches the frames of ``links`` until :meth:`stop` or the end of a ``with`` block.
 
     A failure on one bus does not affect the others.
 

@@ -270,7 +270,7 @@ class PatchStream:
         same number.
 
         Args:
-            times_ns: Monotonic times at which their last frames arrived.
+            times_ns: Monotonic times at which the last frames of these scans arrived.
             within_ns: Tolerance of these times.
         """
         self._left_out, self._left_out_within_ns = sorted(times_ns), within_ns

@@ -94,7 +94,7 @@ class RemoteNode:
         """Configure the node, with its scans withheld.
 
         Args:
-            deadline_s: Maximum time to its first response, s.
+            deadline_s: Maximum time until the node's first response, s.
             abandoned: Called repeatedly; once it returns True, configuration raises Abandoned.
             on_answer: Called when the node has answered.
 

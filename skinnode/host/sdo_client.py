@@ -1,6 +1,6 @@
 """SDO client: read and write the object dictionary of a remote node.
 
-canopen's client blocks the requesting thread; the mainline feeds it the responses through
+canopen's client blocks the requesting thread; the mainline feeds the client the responses through
 :meth:`SkinNetwork.notify`. This module limits the length and duration of a transfer, because canopen's client
 reads as many bytes as a server sends, for as long as it sends: a faulty node could fill the memory or block a
 thread forever.
@@ -44,8 +44,8 @@ _OUT_OF_STEP: Final = (
     AbortCode.INVALID_SEQUENCE,
     AbortCode.CRC,
 )
-"""SDO abort codes of a node that missed a frame of the transfer, which is then retried: toggle bit, time-out,
-command specifier, block size, sequence number, CRC."""
+"""SDO abort codes by which a node reports a missed frame of the transfer, which is then retried: toggle bit,
+time-out, command specifier, block size, sequence number, CRC."""
 
 MAX_UPLOAD_BYTES: Final = 4 * 254 * 254
 """Maximum length of a value in bytes: the baseline of the largest patch."""

@@ -109,7 +109,7 @@ class BlockUpload(BlockUploadStream):
     """A block upload.
 
     canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than its
-    timeout ends in a wrong CRC. It requests an out-of-order segment only once, so this class makes a late
+    timeout results in a wrong CRC. It requests an out-of-order segment only once, so this class makes a late
     segment look out of order.
     """
 

@@ -48,7 +48,8 @@ class ServedBus:
     def sync_is_late(self, t_up_ns: int, period_ns: int) -> bool:
         """Return whether another master's SYNC has been absent for :data:`SYNCS_MISSED` periods.
 
-        The time of the newest dispatched frame counts as now, so that a delay in the host does not count.
+        The time of the newest dispatched frame counts as now, so that a delay in the host does not count as
+        missing SYNC.
 
         Args:
             t_up_ns: Monotonic time at which bring-up of the host was complete.

@@ -1,7 +1,7 @@
 """Values that a node keeps across a power cycle.
 
 A memory stores one :class:`Kept` as a unit. Reading returns either the last or the previous saved content,
-never a mixture. :mod:`skinnode.node.memory_file` stores it in a file.
+never a mixture. :mod:`skinnode.node.memory_file` stores the content in a file.
 """
 
 from __future__ import annotations

@@ -65,8 +65,8 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 def make_folder(path: Path) -> Path | None:
     """Create the folder ``path`` with its parents, and return it; None if it already existed.
 
-    A name with a suffix is treated as that of a misspelt recording file. Raises ConfigError for such a name,
-    or if the folder cannot be created.
+    A name with a suffix is treated as a misspelt name of a recording file. Raises ConfigError for such a
+    name, or if the folder cannot be created.
     """
     if path.is_dir():
         return None

@@ -1,8 +1,8 @@
 """Read frames from a candump log or a BLF file, even if the file is damaged.
 
 A truncated or partly overwritten file yields every complete frame; the damage is counted and located by line
-or offset (:class:`Damage`). No file content causes an exception. A changed byte that is still valid is
-detected in BLF, whose containers have checksums, but not in a candump log, which has no checksum.
+or offset (:class:`Damage`). No file content causes an exception. A corrupted byte that leaves a frame valid
+is detected in BLF, whose containers have checksums, but not in a candump log, which has no checksums.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ _OLDEST_STAMP_S: Final = 10.0
 the time of reading is used."""
 
 _LINK_GONE: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
-"""Errors by which the kernel reports, once per socket, that its interface went down; a send call may receive
+"""Errors by which the kernel reports, once per socket, that the interface went down; a send call may receive
 such an error instead of a receive call."""
 
 _SOCKETCAN: Final = "socketcan"

@@ -20,8 +20,8 @@ from skinnode.transport.frame import Frame
 from skinnode.transport.port import CanPort
 
 CAPACITY_FRAMES: Final = 16384
-"""Capacity of an intake: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s), which covers more
-than the longest pause that a host tolerates."""
+"""Capacity of an intake: 2 s of traffic on a fully loaded bus at 1 Mbit/s (8,000 frames/s); a host tolerates
+only shorter pauses."""
 
 _POLL_S: Final = 0.02
 """Maximum time that a thread waits for a frame before it checks whether to end, s."""

@@ -16,7 +16,7 @@ events do not trigger it. The engine still counts the TPDO's SYNCs and serves it
 timer.
 
 The time to handle a SYNC grows with the number of enabled TPDOs that respond to SYNC, and the time to handle
-a timer event with the number of TPDOs that are due. Other TPDOs take no time.
+a timer event with the number of TPDOs that are due. Other TPDOs add nothing to these times.
 """
 
 from __future__ import annotations

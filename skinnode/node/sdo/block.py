@@ -24,12 +24,12 @@ SEGMENT_NS: Final = 500_000
 
 PDOs may use 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this pace uses 2000, so the
 transmit queue, which is shared with PDOs, does not fill up. A block takes 64 ms, or 100 ms if the thread
-wakes late; clients wait at least 300 ms (canopen library) for a frame. Each time the bus refuses a segment,
-as slower buses do, the time is doubled for the rest of the transfer.
+wakes late; clients wait for a frame for at least 300 ms (canopen library). Each time the bus refuses a
+segment, as slower buses do, the time is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
-"""Maximum mean time between two segments, ns; at this pace, segments take a quarter of a 125 kbit/s bus. If
-the bus refuses segments even at this pace, the pace is not the cause."""
+"""Maximum mean time between two segments, ns; at this pace, segments take a quarter of the capacity of a 125
+kbit/s bus. If the bus refuses segments even at this pace, the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
 """Maximum number of segments sent per timer event, to compensate for a thread that wakes late (by 2 ms by
 default).
@@ -38,8 +38,8 @@ The transmit queue of a Linux CAN interface holds 10 frames, and a delayed threa
 row.
 """
 TWICE_NS: Final = 3_000_000
-"""Maximum time between the two deliveries of one frame, ns: two maximum-length frames at 125 kbit/s and an
-error frame.
+"""Maximum time between the two deliveries of one frame, ns: the duration of two maximum-length frames and an
+error frame at 125 kbit/s.
 
 A client that sends a genuine second acknowledgement has received more segments since the first.
 """

@@ -1,4 +1,4 @@
-"""Collect the messages that a node sends besides scans, and derive the health of its patch from them."""
+"""Collect the messages other than scans that a node sends, and derive the health of its patch from them."""
 
 from __future__ import annotations
 

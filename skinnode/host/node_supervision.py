@@ -30,7 +30,7 @@ _SEARCH_NS: Final = 1_000_000_000
 """Interval between LSS searches for an absent node."""
 
 _FORGET_NS: Final = 2_000_000_000
-"""Silence after which a node is no longer reported as refused or faulty."""
+"""Duration of silence after which a node is no longer reported as refused or faulty."""
 
 _MUTE_NS: Final = 1_000_000_000
 """Minimum interval between two readings of the configuration of a node that sends no scans."""

@@ -16,7 +16,7 @@ from skinnode.config import BusConfig
 _log = logging.getLogger(__name__)
 
 QUIET_NS: Final = 10_000_000_000
-"""Silence after which another master that sends again is logged again, ns."""
+"""Duration of silence after which new frames from another master are logged again, ns."""
 
 SYNC, NMT, SDO, HEARTBEAT = "SYNC", "NMT commands", "SDO requests to our nodes", "our own heartbeat"
 

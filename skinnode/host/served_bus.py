@@ -1,4 +1,4 @@
-"""A bus of the hand, with everything that the host does on it besides serving patches."""
+"""A bus of the hand, with everything that the host does on it other than serving patches."""
 
 from __future__ import annotations
 

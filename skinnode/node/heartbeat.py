@@ -15,7 +15,7 @@ from skinnode.node.emcy import EmcyProducer
 from skinnode.node.object_dictionary import ObjectStore
 
 _BOOTED: Final = 1
-"""Second detail byte of an emergency that reports a restart of the monitored node, not silence."""
+"""Second detail byte of an emergency that reports a restart of the monitored node rather than its silence."""
 
 
 class HeartbeatProducer:

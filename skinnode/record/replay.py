@@ -37,7 +37,7 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
-"""Maximum silence replayed; a longer silence may come from a damaged timestamp."""
+"""Maximum duration of a replayed silence; a longer silence may be due to a damaged timestamp."""
 
 _ROUNDING_NS: Final = 2_000
 """Maximum rounding error of a timestamp in a log."""

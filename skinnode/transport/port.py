@@ -399,7 +399,7 @@ def _is_garbage(error: Exception) -> bool:
 
 
 def _why(error: BaseException) -> str:
-    """Return the most informative error of a chain, in one line."""
+    """Return the most informative error in a chain of exceptions, as one line."""
     while error.__cause__ is not None:
         error = error.__cause__
     if error.__context__ is not None and isinstance(error.__context__, OSError):

@@ -29,8 +29,8 @@ _POLL_S: Final = 0.02
 
 GATHER_NS: Final = 1_500_000
 """Pause after a batch, like the interrupt moderation of a network card: waking 8,000 times a second, once per
-frame, would cost more than handling the frames. The first frame after a silence is not delayed, and each
-frame keeps its arrival time."""
+frame, would cost more than handling the frames. The first frame after a period of silence is not delayed, and
+each frame keeps its arrival time."""
 
 LONG_NS: Final = 5_000_000
 """Pause after a batch while the arrival of every awaited frame is predicted. An unpredicted frame may wait

@@ -143,7 +143,7 @@ class TpdoEngine:
         store = services.store
         self._store, self._send, self._now = store, services.send, services.now
         self.window = window
-        """Window for synchronous TPDOs; the engine sends TPDOs without an owner right after SYNC."""
+        """Window for synchronous TPDOs; the engine sends TPDOs without an owner immediately after SYNC."""
         self._claims: dict[int, Owner] = {}
         self._running = False
         self._timers = Timers()

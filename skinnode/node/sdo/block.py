@@ -25,7 +25,7 @@ SEGMENT_NS: Final = 500_000
 PDOs may use 70 % of a bus. At 1 Mbit/s at least 2200 frames/s remain, of which this pace uses 2000, so the
 transmit queue, which is shared with PDOs, does not fill up. A block takes 64 ms, or 100 ms if the thread
 wakes late; clients wait for a frame for at least 300 ms (canopen library). Each time the bus refuses a
-segment, as slower buses do, the time is doubled for the rest of the transfer.
+segment, as slower buses do, this time is doubled for the rest of the transfer.
 """
 SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
 """Maximum mean time between two segments, ns; at this pace, segments take a quarter of the capacity of a 125

@@ -69,8 +69,8 @@ class Configurator:
 
         Raises:
             NodeTimeout: if the node does not answer in time.
-            NodeError: if it is not the patch in the hand file, or does not keep its configuration.
-            SdoAbort: if it refuses a transfer.
+            NodeError: if the node is not the patch in the hand file, or does not keep its configuration.
+            SdoAbort: if the node refuses a transfer.
             ConfigError: if the baseline file does not fit the patch.
             Abandoned: if ``abandoned`` returned True.
         """

@@ -168,8 +168,8 @@ class NodeSupervision:
         monitor = node.remote.monitor
         monitor.complaint = complaint
         monitor.refusal = complaint if refused else None
-        monitor.running = monitor.running and not refused  # another host may be using the node
-        self._await_again(node, now_ns, was_silent=True)  # even if refused: another node may replace it
+        monitor.running = monitor.running and not refused  # Another host may be using the node.
+        self._await_again(node, now_ns, was_silent=True)  # Another node may replace a refused node.
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty after a defect.

@@ -1,5 +1,4 @@
-"""Journal of a recording: JSON lines next to the log with everything that a replay needs other than the
-frames.
+"""Journal of a recording: JSON lines, next to the log, with all that a replay needs other than the frames.
 
 The first line holds the hand and the offset of the host's clock (:class:`Header`). Each further line is an
 event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before

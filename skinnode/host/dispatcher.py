@@ -49,7 +49,7 @@ class BusStats:
     error_frames: int
     """Error frames, with which the interface reports bus errors and controller states."""
     bus_offs: int
-    """Number of times the interface reported that its controller went bus-off."""
+    """Number of times the interface reported that its controller had gone bus-off."""
     controller: BusState | None
     """Newest reported state of the controller; None if none was reported."""
     foreign_ids: Mapping[int, int]

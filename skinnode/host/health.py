@@ -37,7 +37,7 @@ class Condition(enum.StrEnum):
     """The node is sending frames, but is not operational yet."""
     OPERATIONAL = "operational"
     STALE = "stale"
-    """Operational according to its heartbeat, but no scans arrive, or all are withheld."""
+    """Operational according to the node's heartbeat, but no scans arrive, or all scans are withheld."""
     RESTARTING = "restarting"
     """The node restarts by itself in a loop: see :data:`~skinnode.host.node_monitor.LOOP_RESTARTS`. A node
     that restarted once, or that is operational again and has not restarted for 0.5 s, is given the condition

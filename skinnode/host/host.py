@@ -326,7 +326,7 @@ class Host:
 
         Raises:
             KeyError: if there is no such patch.
-            NodeError: if another master runs its bus, its baseline is kept in a file, or the node is not
+            NodeError: if another master runs the bus, the baseline is kept in a file, or the node is not
                 operational.
             NodeTimeout: if no new baseline arrived in time.
             BusError: if the command cannot be sent.

@@ -53,8 +53,8 @@ _UNDER_WAY_S: Final = 0.4
 _PARTS: Final = 4
 _REVISIONS: Final = od.REVISION_NUMBER, od.UNCHECKED_REVISION_NUMBER
 _LIKELY: Final = (od.VENDOR_ID,), (od.PRODUCT_CODE,), _REVISIONS
-"""Address parts of skinnode patches, which fastscan tries first; this takes three or four requests instead of
-96."""
+"""Address parts of skinnode patches, which fastscan tries first; the search then takes three or four requests
+instead of 96."""
 
 
 class LssFailed(BusError):

@@ -136,7 +136,7 @@ class PatchStream:
         self._left_out: list[int] = []
         self._left_out_within_ns = 0
         self.withholdings = 0
-        """Number of times that withholding began."""
+        """Number of times that withholding has begun."""
         self.doubtful = False
         """Whether a summary that may have announced a new baseline was lost or discarded with its scan."""
         self._frames = self._withheld = self._partial = 0

@@ -60,9 +60,9 @@ class RemoteNode:
         self.boot_ups = 0
         """Number of boot-up messages when bring-up began; if more arrive, bring-up must be repeated."""
         self.t_answer_ns = 0
-        """Monotonic time of its newest SDO response."""
+        """Monotonic time of the node's newest SDO response."""
         self._answers = 0
-        """Number of SDO responses with its node-ID."""
+        """Number of SDO responses with the node's node-ID."""
         self._hand, self._lss = hand, bus.lss
         self._profile = PatchProfile.from_config(patch, self.bus)
         self._remote = self.link.remote_od(patch.node_id, self._on_answer, defects)
@@ -99,10 +99,10 @@ class RemoteNode:
             on_answer: Called when the node has answered.
 
         Returns:
-            The solver for its scans.
+            The solver for the node's scans.
 
         Raises:
-            NodeError: if its electrode layout cannot be solved, or two nodes have the same node-ID.
+            NodeError: if the node's electrode layout cannot be solved, or two nodes have the same node-ID.
             SkinError: as raised by :meth:`Configurator.configure`.
         """
         self.boot_ups = self.monitor.boot_ups

@@ -87,7 +87,7 @@ class ScanSolver:
 def check_solvable(patch: PatchConfig, config: SolverConfig) -> None:
     """Check that a layout can be solved, and compile the kernels or load them from the cache.
 
-    Call this before a node waits for the host.
+    Call this function before a node waits for the host.
 
     Raises:
         ConfigError: if the layout can be sensed but not solved.

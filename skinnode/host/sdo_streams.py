@@ -62,8 +62,8 @@ class Client(SdoClient):
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return the response.
 
-        For a request that begins a transfer, this is the first response that names the same object, because a
-        slow node may still be sending frames of the previous transfer.
+        For a request that begins a transfer, the first response that names the same object is returned,
+        because a slow node may still be sending frames of the previous transfer.
 
         Raises:
             SdoError: if there is no response, or it is an abort.

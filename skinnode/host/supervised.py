@@ -61,7 +61,7 @@ class Supervised:
     phase: Phase
     since_ns: int
     read_ns: int
-    """Earliest time of the next reading of its baseline."""
+    """Earliest time of the next reading of the node's baseline."""
     job: Future[Joined | None] | None = None
     """Job that communicates with the node; its result is None if it only reads the error register."""
     searching: Future[bool] | None = None
@@ -87,7 +87,7 @@ class Supervised:
     rejoins: int = 0
     failures: int = 0
     baseline_ohm: Float | None = None
-    """Baseline with which its scans are solved; None before its first bring-up."""
+    """Baseline with which the node's scans are solved; None before the first bring-up."""
     announced: bool = False
     """Whether the node announced a new baseline that is not in use yet."""
     baselines: int = 0

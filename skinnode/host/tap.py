@@ -67,7 +67,7 @@ def tap_link(tap: HostTap, link: BusLink) -> Callable[[], None]:
     """Start passing every frame to ``tap``. Call on the mainline, or before it runs.
 
     Returns:
-        A function that ends this, to be called under the same condition.
+        A function that ends the recording, to be called under the same condition.
     """
     received = functools.partial(tap.received, link.config.name)
     sent = functools.partial(tap.sent, link.config.name)
@@ -85,7 +85,7 @@ def tap_bus(tap: HostTap, link: BusLink, streams: Sequence[PatchStream]) -> Call
     """Make the mainline pass the streams' state, then every frame and stream change, to ``tap``.
 
     Returns:
-        A function that ends this; any thread may call it.
+        A function that ends the recording; any thread may call it.
     """
     ends: list[Callable[[], None]] = []
 

@@ -187,7 +187,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
 
 
 def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
-    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it is not a valid event."""
+    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it holds no valid event."""
     event: dict[str, Any] = json.loads(line)
     _whole(event["at"])
     _whole(event["t_ns"])

@@ -82,8 +82,7 @@ def make_folder(path: Path) -> Path | None:
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether ``path`` is a folder. Raises ConfigError if ``path`` can be neither a folder nor a
-    file."""
+    """Return whether ``path`` is a folder. Raises ConfigError if it can be neither folder nor file."""
     try:
         return path.is_dir()
     except OSError as error:

@@ -80,7 +80,7 @@ class BusError(SkinError):
 
 
 class NodeError(BusError):
-    """Behaviour of a node that violates the specification."""
+    """Violation of the specification by a node."""
 
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id

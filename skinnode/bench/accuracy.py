@@ -15,11 +15,11 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum error of the posterior by layout, for a press of 0.1 heights at h = 0.5 and a relative noise of
+"""Maximum error of the posterior by layout, for a press 0.1 heights deep at h = 0.5 and a relative noise of
 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Divisor of the scenes for a cell of the tables of noise and codes; a cell has at least 3 scenes. The RMS of
-each scene already covers 300 coordinates."""
+"""Divisor of the number of scenes for a cell of the noise and code tables; a cell has at least 3 scenes. The
+RMS of each scene already covers 300 coordinates."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:

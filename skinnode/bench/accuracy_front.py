@@ -1,6 +1,6 @@
 """Error against time for a few wires: our solvers next to their peers on the same compiled F and J.
 
-The wires are the most deeply pressed wires of the patch; the samples of the press have no noise. Every solver
+The most deeply pressed wires of the patch are used; the samples of the press contain no noise. Every solver
 starts from rest. It solves either the last sample alone or all samples in turn, each from the solution of the
 previous sample, as in the paper. Each solver runs at several tolerances and gives one point per tolerance.
 The time of ``solve_path`` includes steps that the bare operators omit: setting up the patch, following the
@@ -76,7 +76,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the shortest time of a few calls, fewer if they are slow; other programs can only add time."""
+    """Return the shortest time of a few calls (fewer if calls are slow): other programs can only add time."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -127,7 +127,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Return the rows of one scatter plot per scene, with time, error, and whether they are on the front."""
+    """Return the rows of one scatter plot per scene, with time, error, and whether each is on the front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)

@@ -96,7 +96,7 @@ class Parts:
     _left: list[Float] = field(default_factory=list)
 
     def add(self, frame: FieldFrame, truth_m: Float) -> None:
-        """Add a scene and its truth (U, N, 3). Skips held frames, whose variance has additional parts."""
+        """Add a scene and its truth (U, N, 3). Skips held frames, whose variance has additional terms."""
         if frame.core_std_m is None or (frame.held is not None and frame.held.all()):
             return
         used = np.array([status is Status.CONVERGED for status in frame.status])
@@ -133,7 +133,7 @@ class Parts:
 
 @dataclass
 class Bound:
-    """Pools the Cramér-Rao bound of wires without a prior, computed at the truth with the NumPy model."""
+    """Pools the Cramér-Rao bounds of wires, without a prior, computed at the truth with the NumPy model."""
 
     _variance: float = 0.0
     _size: float = 0.0
@@ -294,7 +294,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return one sharp or blunt body or, in three of ten scenes, two bodies in different halves."""
+    """Return one sharp or blunt body or, in three scenes out of ten, two bodies in different halves."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -317,7 +317,7 @@ def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
 
     Returns:
         One row per layout, noise and method, with forces if there are any; and the posterior's errors in all
-        scenes, by the prior's fraction of the variance.
+        scenes, grouped by the prior's fraction of the variance.
     """
     rows, parts = [], Parts()
     for kind, height, sigma in COVERAGE:

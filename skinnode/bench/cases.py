@@ -88,7 +88,7 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
         converter: Converter that reads the resistances.
         shares: Fractions (T,) of the depth, one per frame.
         spoil: Returns a modified stream.
-        gain: Returns factors of the resistances, (T, U, K) or broadcastable to it.
+        gain: Returns factors that scale the resistances, (T, U, K) or broadcastable to that shape.
         presses: Returns the presses that replace the single random press.
     """
 
@@ -117,7 +117,7 @@ def all_cases() -> list[Case]:
 
 
 def _exact(number: int, name: str, layout: PatchLayout, depth: float, samples: int) -> Case:
-    """Return a case with a press without noise, for all path methods and the exact tracker."""
+    """Return a case with a noise-free press, for all path methods and the exact tracker."""
     skin = Skin(narrowed(layout))
     shares = np.linspace(0.0, 1.0, samples + 1)
     make = pressing(skin, depth, Converter(), shares)
@@ -310,7 +310,7 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Rotate two neighbours on a wire by 180° about their midpoint, so that F ends as it began."""
+    """Rotate two neighbours on a wire by 180° about their midpoint, which restores the initial F."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share
@@ -323,7 +323,7 @@ def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
 
 
 def _mirror(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Move one electrode through the lower layer to its mirror image, so that F ends as it began."""
+    """Move one electrode through the lower layer to its mirror image, which restores the initial F."""
     moved = np.zeros(layout.upper_m.shape)
     wire, electrode = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1])
     moved[wire, electrode, 2] = -2 * share * layout.height_m
@@ -335,7 +335,7 @@ def _after_detour(
     detour: Callable[[np.random.Generator, PatchLayout, float], Float],
     converter: Converter,
 ) -> Callable[[np.random.Generator], Stream]:
-    """Return a stream of a motion impossible for skin, which ends at the rest resistances, and a real press.
+    """Return a stream with an impossible motion that ends at the rest resistances, then a real press.
 
     The impossible motion has no truth, because F does not distinguish a wire from the same wire with two
     electrodes swapped or one mirrored.
@@ -448,7 +448,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # one electrode per wire has no pitch along the wire, so the patch is a narrow line
+        # with one electrode per wire there is no pitch along the wire, so the patch is a narrow line
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

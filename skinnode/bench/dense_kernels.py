@@ -1,4 +1,4 @@
-"""Dense kernels compared with LAPACK, in a process in which LAPACK has one thread, like our kernels.
+"""Dense kernels compared with LAPACK, in a process in which LAPACK, like our kernels, uses one thread.
 
 LAPACK's worker threads keep spinning for a while after each call. If they share a core with the next
 candidate, that candidate takes up to three times as long, and the threads wait for each other while the

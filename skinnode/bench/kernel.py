@@ -27,7 +27,7 @@ SHORT: Final = 1e-3
 
 
 class NumpyWire:
-    """Computes F and Jᵀ of one wire as fast as NumPy can: a structure of arrays, with preallocated buffers.
+    """Computes F and Jᵀ of one wire as fast as NumPy allows: a structure of arrays, preallocated buffers.
 
     This is the fastest of the axis orders and summation methods that were tried; it takes 85 % of the time of
     the obvious method.
@@ -90,7 +90,7 @@ def numpy_step(operator: str, wire: NumpyWire, x: Float, a: Float) -> Float:
                 )
         else:
             n = x.size
-            augmented = np.zeros((r.size + n, n + 1))  # gives R and Qᵀr without Q, in 0.7 of the time
+            augmented = np.zeros((r.size + n, n + 1))  # gives R and Qᵀr without Q, in 70 % of the time
             augmented[: r.size, :n] = j
             augmented[: r.size, n] = r
             np.fill_diagonal(augmented[r.size :], 0.1 * scale)

@@ -36,7 +36,7 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Time between turns of the sender: on a full bus it sends two frames at a time, like a USB adapter."""
+"""Interval between turns of the sender; on a full bus, it sends two frames per turn, like a USB adapter."""
 LEAD_S: Final = 0.5
 """Time from :meth:`Generator.begin` to the first frame."""
 _BEAT_S: Final = 0.1
@@ -53,7 +53,7 @@ class Sent:
     frames: dict[str, int]
     """Number of frames sent per bus, excluding the heartbeats before the start."""
     bus_load: dict[str, float]
-    """Fraction of time that the simulated bus was occupied by the frames."""
+    """Fraction of the time for which frames occupied the simulated bus."""
     late_p99_ms: float
     """Delay of the frames relative to their times on the simulated bus, caused by the generator itself."""
     late_max_ms: float
@@ -232,8 +232,8 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
     """Arbitrate the frames, which are sent one after the other.
 
-    Frames of a node keep their order, as in the queue of its controller; of the first frames of all nodes,
-    the frame with the lowest identifier is sent.
+    Frames of a node keep their order, as in the queue of its controller; of the frames at the heads of these
+    queues, the frame with the lowest identifier is sent.
     """
     order = sorted(range(len(frames)), key=lambda i: frames[i][0])
     waiting: dict[int, list[int]] = {}  # by node, in reverse order

@@ -154,7 +154,7 @@ def _heartbeat(config: BusConfig, seconds: float, load_hz: int) -> Row:
 
 
 def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
-    """Send foreign frames in bursts, at a constant mean rate."""
+    """Send unrelated frames in bursts, at a constant mean rate."""
     start_s, sent = time.monotonic(), 0
     while not stop.is_set():
         due = int((time.monotonic() - start_s) * rate_hz)

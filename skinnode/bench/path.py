@@ -10,13 +10,13 @@ than F alone. Here F and J together cost about as much as two evaluations of F; 
 differences. Calls per step are means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖
 / ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order optimality is that of r =
 a F − 1, dimensionless with lengths in pitches; MATLAB would give that of F, which is larger by a factor of F²
-and depends on the unit of length; the paper does not state its unit.
+and depends on the unit of length, which the paper does not state.
 
-Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves 10 of
-10 with any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1. At h = 0.7 and
-30 %, Gauss-Newton fails as it did for the authors: at 5 and 10 steps, in 6 and 2 of 10 experiments, but not
-from 20 steps on. This setting was found by searching h = 0.3 … 1 and presses of 15 … 30 %; at h = 1 and 25 %,
-5 and 3 fail, but there levenberg_marquardt also fails at more steps.
+Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves all
+10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1. At
+h = 0.7 and 30 %, Gauss-Newton fails as it did for the authors: in 6 of 10 experiments with 5 steps and in 2
+with 10 steps, but in none with 20 or more. This setting was found by searching h = 0.3 … 1 and presses of 15
+… 30 %; at h = 1 and 25 %, 5 and 3 experiments fail, but there levenberg_marquardt also fails with more steps.
 """
 
 from __future__ import annotations

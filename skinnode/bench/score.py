@@ -70,7 +70,7 @@ class Score:
 
     @property
     def within_uncertainty(self) -> bool:
-        """Whether the RMS error and each single error agree with the reported standard deviations."""
+        """Whether the RMS error and every single error are consistent with the reported uncertainty."""
         return (
             self.scans > 0
             and self.untrusted == 0

@@ -1,6 +1,6 @@
 """Soak of a hand under random faults: does the host survive, do all patches recover, do all counts agree?
 
-Simulated nodes with faults and the host share this process and two virtual buses. A round injects one to
+Simulated nodes, with faults, and the host share this process and two virtual buses. A round injects one to
 three faults, including drops of frames of every kind, into one patch or into all. It then clears the faults
 and waits until every patch is operational and streaming again; meanwhile, subscribers come and go. In some
 rounds other processes occupy the processor. Memory is compared between two idle instants, one after a warm-up
@@ -199,7 +199,7 @@ def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, A
 def summary_lines(figures: dict[str, Any]) -> list[str]:
     """Return the figures as readable lines."""
     lines = [
-        f"{figures['rounds']} rounds, {figures['starved_rounds']} of them with a starved processor; "
+        f"{figures['rounds']} rounds, {figures['starved_rounds']} of them starved of CPU time; "
         f"{figures['frames']} frames received, {figures['scans']} scans, {figures['fields']} fields, "
         f"{figures['rejoins']} bring-ups",
         f"all patches back after {figures['slowest_back_s']:.2f} s at most, "
@@ -211,7 +211,7 @@ def summary_lines(figures: dict[str, Any]) -> list[str]:
         for row in figures[key]:
             numbers = (row["wanted"], row["dropped"], row["held_back"], row["arrived"])
             lines.append(f"  {row['kind']:<30} " + " ".join(f"{number:>9}" for number in numbers))
-    lines.append("dropped: lost on the way by a fault")
+    lines.append("dropped: lost in transit because of a fault")
     lines.append("held back: the node was silent, unplugged, deaf or off the bus, or the chunk was late")
     for key in ("not_back", "not_operational", "defects", "discrepancies"):
         lines += [f"  {line}" for line in figures[key]]

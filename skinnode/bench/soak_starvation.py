@@ -1,4 +1,4 @@
-"""Starvation of a soak: spinning child processes take its processor time for a while."""
+"""Starvation of a soak: busy-looping child processes deprive it of CPU time for a while."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Comparison, kind by kind, of the frames that a soak's nodes sent and dropped with the host's counts."""
+"""Comparison, by kind, of a soak's counts of frames sent and dropped with the counts of the host."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Return one line per sum of frames from nodes to host that does not agree.
+    """Return one line per count of frames from nodes to host that does not match.
 
     Call while the nodes are silent.
 
@@ -123,7 +123,7 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Return one line per sum of frames from host to nodes that does not agree, in total and by node.
+    """Return one line per count of frames from host to nodes that does not match, in total and by node.
 
     Call after the host has closed and the nodes have stopped.
     """
@@ -147,7 +147,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
 
 
 def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
-    """Return one line per host counter that differs from the injected faults."""
+    """Return one line per host counter that does not match the number of faults injected."""
     found = [
         f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
         for name, each in injected.items()
@@ -161,7 +161,7 @@ def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> li
         ("short chunks", short, "short"),
         ("long heartbeats", sum(bus.malformed for bus in buses) - short - unchecked, "long"),
         ("frames of foreign COB-IDs", sum(bus.foreign for bus in buses), "babbled"),
-        ("frames lost to the host's own queue", sum(bus.dropped for bus in buses), None),
+        ("frames lost in the host's own queue", sum(bus.dropped for bus in buses), None),
     ):
         must = sum(getattr(each, name) for each in injected.values()) if name else 0
         if got != must:

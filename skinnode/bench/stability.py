@@ -80,7 +80,7 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of a case given by number, because its closures cannot be sent to a process."""
+    """Return the rows of the case with this number; the closures of a case cannot be sent to a process."""
     return _rows(all_cases()[number], only, seeds)
 
 

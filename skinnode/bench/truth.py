@@ -3,7 +3,7 @@
 Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
 they have no grid and do not depend on a prior. Resistances come from :class:`Skin`, which can differ from the
 solver's model: electrodes of finite size, rubber whose resistivity depends on strain, a different thickness,
-a contact resistance in series. Converters add noise and codes as real converters do.
+a contact resistance in series. Converters add noise and quantise to codes, as real converters do.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class Converter:
 
     @property
     def exact(self) -> bool:
-        """Whether a reading equals the true resistance."""
+        """Whether every reading equals the true resistance."""
         return self.sigma == 0.0 and self.bits == 0
 
     @property
@@ -254,7 +254,7 @@ def stream(  # noqa: PLR0913 - the parts of a stream
         shares: Fractions (T,) of the depth, one per frame.
         converter: Converter that reads the resistances.
         rng: Random generator of the noise.
-        gain: Factors of the resistances, (T, U, K) or broadcastable to it.
+        gain: Factors that scale the resistances, (T, U, K) or broadcastable to that shape.
     """
     truth = np.stack([skin.displacement_m(presses, share) for share in shares])
     resistance = np.stack([skin.resistance_ohm(moved) for moved in truth])

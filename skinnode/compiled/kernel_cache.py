@@ -83,7 +83,7 @@ class KernelCache:
                 if kept_signature == signature
                 else None
             )
-        except Exception as error:  # the file is intact, but from another installation
+        except Exception as error:  # the file is intact, but was written by another installation
             if _remove(path):
                 _report(self._folder, f"a file could not be loaded ({error!r:.200}); removed, recompiling")
             return None

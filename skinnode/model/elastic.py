@@ -9,7 +9,7 @@ Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
     ⎢ u_y ⎥  =  ───  ⎢ ν x y/r³             (1−ν)/r + ν y²/r³     (½−ν) y/r² ⎥ ⎢ f_y ⎥
     ⎣ u_z ⎦     2πG  ⎣ −(½−ν) x/r²          −(½−ν) y/r²           (1−ν)/r    ⎦ ⎣ f_z ⎦
 
-This module evaluates that matrix at a point (:func:`point_compliance`), integrated over a rectangle of
+This module evaluates this matrix at a point (:func:`point_compliance`), integrated over a rectangle of
 uniform traction (:func:`rectangle_compliance`) or over the pressure under a sphere (:class:`HertzContact`).
 
 The model neglects the finite thickness of the rubber (a bonded layer is stiffer and its displacement decays

@@ -27,9 +27,9 @@ class ScanStamp:
     """Scan number in the CAN frames, u8: the SYNC counter if the SYNC has one."""
     device_time_us: int
     """Time on the node's own clock at the SYNC of the scan, µs, 0 to 2³² − 1 with wrap-around; 0 if the
-    summary was lost. The resolution is 64 µs; the host derives the upper 10 bits, for the first scan from its
-    own clock. The node's full 32-bit time with a resolution of 1 µs can be read from 0x2011:4; patches of
-    revision 1.0 send it with each scan."""
+    summary was lost. The resolution is 64 µs; the host derives the upper 10 bits (for the first scan, from
+    its own clock). The node's full 32-bit time with a resolution of 1 µs can be read from 0x2011:4; patches
+    of revision 1.0 send it with each scan."""
     t_sync_ns: int
     """Time at which the SYNC of this scan was sent or received; 0 if unknown."""
     t_receive_ns: int
@@ -105,8 +105,8 @@ class FieldFrame:
     """(U,) RMS of the relative residual F/b − 1 over the valid resistances of a wire."""
     stats: SolveStats
     force_n: Float | None = None
-    """(U, N, 3) loads on the skin, N: estimated by the posterior, or computed from the paper's law k Δs if a
-    stiffness was given."""
+    """(U, N, 3) loads on the skin, N: estimated from the posterior, or computed from the paper's law F = k Δs
+    if a stiffness was given."""
     stamp: ScanStamp | None = None
     """Scan from which the field was computed; None outside a host."""
     method: str = "exact"

@@ -41,7 +41,7 @@ def broadcast_noise(relative_noise: ArrayLike, layout: PatchLayout) -> Float:
         ValueError: If the noise is neither a number nor of that shape.
     """
     if isinstance(relative_noise, np.ndarray) and relative_noise.shape == layout.shape:
-        return np.asarray(relative_noise, np.float64)  # fast path: a host passes this with every frame
+        return np.asarray(relative_noise, np.float64)  # fast path: a host passes an array with every frame
     try:
         return np.asarray(np.broadcast_to(np.asarray(relative_noise, np.float64), layout.shape))
     except (TypeError, ValueError) as error:

@@ -51,8 +51,8 @@ Mask = NDArray[np.bool_]
 # -- the layout ---------------------------------------------------------------------------------------------
 
 FOLDED: Final = 250.0
-"""RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. It is 70 for the
-staggered layout at h = 0.5, where none of 6000 wires ran into one, and at least 1200 for staggered layouts
+"""RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. The value is 70 for the
+staggered layout at h = 0.5, where none of 6000 wires ran into a fold, and at least 1200 for staggered layouts
 from h = 1 and for aligned and symmetric layouts, where one wire in 30 ends at a wrong root."""
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
@@ -74,10 +74,10 @@ movements of 0.24 and more were observed to cross folds."""
 LARGE: Final = 0.03
 """Displacement, in clearances, above which the roughness is checked; folds lie at larger displacements."""
 ROUGH_IN_STREAM: Final = 1.2
-"""Ratio of roughness to size of a displacement above which a live stream checks it with the posterior.
+"""Roughness-to-size ratio above which a live stream checks a displacement against the posterior.
 The ratio is 0.5 to 1 for presses, up to 1.7 if they move a single electrode, and 1 to 2 for wrong roots."""
 ROUGH_AT_PATH_END: Final = 0.8
-"""Ratio of roughness to size of a displacement above which the end of a path is solved again from the
+"""Roughness-to-size ratio of a displacement above which the end of a path is solved again from the
 smoothest displacement. The ratio is 0.67 on average for presses, below 0.9 for nine presses in ten, up to 1.9
 if they move a single electrode, and 0.7 to 2 for wrong roots."""
 STILL_CONFIRMED: Final = 0.2
@@ -91,11 +91,11 @@ TWIN_REACH: Final = 2.0
 """Largest distance to a twin root that is worth solving for, relative to the largest displacement of the
 wire. Twins farther away were at least 1.3 times as rough on the staggered layout, h = 0.3 to 1."""
 TWIN_ROUGHNESS: Final = 1.05
-"""Ratio of roughness above which the smoother of two roots at a fold is accepted. Over 82 random presses of
-50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as rough. Of 100
-correct roots, 4 have a twin within the ratio and lose the status CONVERGED. In 60 further presses of each
-depth and height (6710 wires, h = 0.3 to 1) no wrong root was reported as CONVERGED; in 40 others (4510 wires)
-one was."""
+"""Ratio between the roughnesses of two roots at a fold above which the smoother root is accepted. Over 82
+random presses of 50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as
+rough. Of 100 correct roots, 4 have a twin within the ratio and lose the status CONVERGED. In 60 further
+presses of each depth and height (6710 wires, h = 0.3 to 1) no wrong root was reported as CONVERGED; in 40
+others (4510 wires) one was."""
 UNLIKELY: Final = 4.0
 """Energy margin by which other roots must be less likely. In 1530 pairs of roots from presses of 30 to 70 %
 on the staggered layout, h = 1, and the aligned layout, h = 0.5, the wrong root was likelier in 19 pairs, by

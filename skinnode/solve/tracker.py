@@ -23,8 +23,8 @@ from skinnode.solve.root_gate import RootGate
 
 EXACT_STD: Final = 0.0025
 """Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses it: 2.5 % of a
-press that indents the layer by a tenth. With 16-bit codes it is 0.0005 on the staggered layout, h = 0.5, and
-0.05 on the aligned layout."""
+press that indents the layer by a tenth. With 16-bit codes, the standard deviation is 0.0005 on the staggered
+layout, h = 0.5, and 0.05 on the aligned layout."""
 
 
 class Tracker:

@@ -1,4 +1,4 @@
-"""One picture of the accuracy: Pareto fronts, error against noise and codes, coverage, time per frame."""
+"""Figure of the accuracy benchmark: Pareto fronts, error by noise and codes, coverage, time per frame."""
 
 from __future__ import annotations
 

@@ -91,5 +91,5 @@ def draw_solve(file: Path, figures: dict[str, Any]) -> None:
     error.set_axisbelow(True)
     error.tick_params(axis="y", length=0)
     error.set_xlabel("largest error / displacement")
-    figure.suptitle("One wire of the reference patch from a near start (skinnode in blue)")
+    figure.suptitle("One wire of the reference patch, starting close to the solution (skinnode in blue)")
     _save(figure, file, figures)

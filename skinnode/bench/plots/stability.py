@@ -1,4 +1,4 @@
-"""One picture of the hard cases: verdicts by case and method, error against reported uncertainty."""
+"""Figure of the hard cases: verdicts by case and method, error against reported uncertainty."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Draw a bar per case and method with the fraction of each verdict; wrong fractions are enlarged."""
+    """Draw a bar per case and method with the fraction of each verdict; the ``wrong`` part is enlarged."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:
@@ -81,7 +81,7 @@ def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
 
 
 def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Draw each row's median error against its median reported standard deviation, both / displacement."""
+    """Draw each row's median error against its median standard deviation, relative to the displacement."""
     for kind, colour in COLOURS.items():
         points = [
             (max(row["reported"], LEAST), max(row["median_error"], LEAST), row["wrong"] > 0)

@@ -4,15 +4,16 @@ With ``normal_only``, x and y of every electrode stay at rest. With ``active_onl
 contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the electrode
 that explains most of the residual joins the unknowns together with its neighbours; once more than half have
 joined, all of them join. All electrodes return to rest when the rest position explains the frame. The
-standard deviation of an omitted coordinate is the smallest move that χ² would detect if no other electrode
-moved, to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J outside the
-range of the unknowns and of the electrode's other columns‖.
+standard deviation of an omitted coordinate is the smallest movement that χ² would detect if no other
+electrode moved, to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J
+outside the range of the unknowns and of the electrode's other columns‖.
 
 Both options are assumptions about the skin, and the standard deviations of the unknowns are valid only if the
-assumption is. χ² tests the assumption of active_only well. It tests that of normal_only less well, because a
-smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong Hertzian press
-with a shear of 0.3 of its depth is rejected; a weaker press is accepted with errors in z of up to 16 of its
-small standard deviations, or 0.2 % of h. Allowing for this would cost more than solving for the shear.
+assumption is. χ² is a good test of the assumption behind active_only, but a weaker test of the one behind
+normal_only, because a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a
+strong Hertzian press with a shear of 30 % of its depth is rejected; a weaker press is accepted with errors in
+z of up to 16 times its small standard deviation, or 0.2 % of h. Allowing for this would cost more than
+solving for the shear.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ TINY: Final = 1e-200
 
 
 class LeftOut:
-    """Electrodes omitted from the unknowns of a stream, and the size of moves that would go unnoticed."""
+    """Electrodes omitted from the unknowns of a stream, and the size of movements that would go unnoticed."""
 
     def __init__(self, stream: StreamState, active_only: bool) -> None:
         problem = stream.problem
@@ -52,7 +53,7 @@ class LeftOut:
         # ∂r/∂x at rest of every coordinate, (U, 3N, K)
         slopes = jacobian(layout, layout.upper_m).reshape(*layout.shape, -1) * layout.pitch_m**2
         self._slopes = np.ascontiguousarray((slopes * problem.a_rest[:, :, None]).transpose(0, 2, 1))
-        # (U, 3N) unnoticed move of each coordinate, pitches per unit of σ, and its weights (U, K)
+        # (U, 3N) undetectable movement of each coordinate, pitches per unit of σ, and its weights (U, K)
         self._unnoticed = np.zeros((layout.shape[0], layout.unknowns))
         self._unnoticed_weight = np.zeros(layout.shape)
         # limits of χ² by degrees of freedom
@@ -113,7 +114,7 @@ class LeftOut:
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 
     def _measure_unnoticed(self, u: int, weight: Float) -> None:
-        """Write the unnoticed move of each omitted coordinate, pitches per unit of σ."""
+        """Write the undetectable movement of each omitted coordinate, pitches per unit of σ."""
         solver, (_, lower) = self._stream.solver, self._layout.shape
         self._unnoticed_weight[u] = weight
         unnoticed = self._unnoticed[u].reshape(-1, 3)

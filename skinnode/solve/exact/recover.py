@@ -41,7 +41,7 @@ def recover_lost(
 ) -> None:
     """Recover the wires that are not at a root; write ``good`` and ``status`` of the stream's arrays.
 
-    Gives up wires that fail, and ``exhausted`` wires (U,), for which all attempts have been made. Sets
+    Gives up on wires that fail, and on ``exhausted`` wires (U,), for which all attempts have been made. Sets
     ``turns`` (U,) to False for wires reached after the deadline.
     """
     solver, arrays = stream.solver, stream.arrays

@@ -1,11 +1,11 @@
-"""Exact tracker: solves each frame of a live stream starting from the last, as the paper follows a path.
+"""Exact tracker: solves each frame of a live stream from the previous one, as the paper follows a path.
 
 hold       keep the position of a wire whose resistances changed no more than their noise (see ``hold``)
 predict    move by (∂x/∂R) ΔR with the J⁻¹ of an earlier frame, computed for its covariance anyway
 follow     take simplified Newton steps with the same J⁻¹ while it is still accurate enough
 correct    otherwise iterate the operator, to a tolerance far below any noise
 widen      add an omitted electrode to the unknowns if it seems to move (see ``leave_out``)
-recover    bridge a wire that fails, or give it up (see ``recover``)
+recover    bridge a wire that fails, or give up on it (see ``recover``)
 
 The rules for acceptable roots are in :mod:`skinnode.solve.roots`.
 """
@@ -36,7 +36,8 @@ from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
 """Maximum time of one evaluation of F and J with its step, s. Each call solves as many wires as are certain
-to fit into the remaining time, because ten calls cost as much more than one call as solving ten wires."""
+to fit into the remaining time, because splitting one call into ten takes as much extra time as solving ten
+wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 """Maximum cost of a wire per frame, in evaluations."""
 

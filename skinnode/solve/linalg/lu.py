@@ -1,6 +1,6 @@
 """LU factorisation of a small square matrix, for the Jacobian of one wire.
 
-LAPACK is not used because at 30 unknowns a call costs more than the arithmetic, and ``numpy.linalg`` inside
+LAPACK is not used because with 30 unknowns a call costs more than the arithmetic, and ``numpy.linalg`` inside
 compiled code costs seconds of compile time. Kernels store Jᵀ and factor it, so that every inner loop runs
 along a contiguous row and vectorisation reorders no sum (Golub & Van
 Loan, Matrix Computations, 4th ed., 3.4).

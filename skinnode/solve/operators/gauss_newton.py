@@ -93,7 +93,7 @@ def correction(w: Work, r: Float, out: Float) -> float:
 
 @njit_part
 def rounding(w: Work, x: Float) -> float:
-    """Write the effect of rounding of x on r, eps Σ_j |J_kj x_j|, into ``e``; return max |x|."""
+    """Write the effect on r of rounding x, eps Σ_j |J_kj x_j|, into ``e``; return max |x|."""
     top = 0.0
     for k in range(w.e.size):
         w.e[k] = 0.0

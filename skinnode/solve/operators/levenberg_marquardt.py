@@ -19,7 +19,7 @@ from skinnode.solve.operators.work import LAM, NEWTON_LENGTH, RADIUS, REDUCED, S
 
 @njit_part
 def marquardt_step(w: Work) -> None:  # noqa: C901 - Moré's iteration in one piece
-    """Set the step with ‖D s‖ within a tenth of the radius, by Newton's method for lam (Moré, section 5).
+    """Set the step so that ‖D s‖ is within 10 % of the radius; find lam by Newton's method (Moré, § 5).
 
     In the bidiagonal form of J D⁻¹, computed once per Jacobian, s = D⁻¹ P t and ‖D s‖ = ‖t‖, so each lam
     costs O(n) operations.

@@ -10,8 +10,8 @@ Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a
 
 For a square system, CONVERGED means a root: max|r| ≤ tol_f *and* a simplified Newton correction
 ‖J⁻¹ r₊‖∞ ≤ tol_x · max(1, ‖x‖∞) with the current factors. If rounding keeps r above tol_f, an r within the
-rounding of J·x counts as zero. For a tall system, it means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P the
-projection onto the range of J, and the same condition on the correction. A stationary point of a square
+rounding error of J·x counts as zero. For a tall system, CONVERGED means a minimum: ‖P r‖ ≤ tol_f ‖r‖, with P
+the projection onto the range of J, and the same condition on the correction. A stationary point of a square
 system with r ≠ 0 is ILL_CONDITIONED, because J is singular there.
 """
 
@@ -134,7 +134,7 @@ def shorten(operator: int, w: Work) -> int:
 
 @njit_part
 def _within_rounding(w: Work, norm: float) -> bool:
-    """Return whether rounding of x explains ``r_trial``, whose norm is ``norm``."""
+    """Return whether the rounding of x explains ``r_trial``, whose norm is ``norm``."""
     if not (norm < math.inf and norm > 0.25 * w.s[NORM] and w.flag[SINGULAR] == 0):
         return False
     rounding(w, w.trial)

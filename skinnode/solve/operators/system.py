@@ -63,7 +63,7 @@ def solve_system(  # noqa: PLR0913 - keyword arguments of the public interface
 
     Raises:
         ValueError: If an argument is out of range, or an argument or returned array has the wrong shape. A
-            residual or Jacobian that is not finite never raises.
+            residual or Jacobian that is not finite never raises an exception.
     """
     code = operator_code(operator)
     require_tolerances(tol_f, tol_x, max_steps)

@@ -69,7 +69,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error of the relative decrease of ‖r‖² for a step predicted to change it little."""
+    """Return the rounding error in the relative decrease of ‖r‖² for a step with a small predicted change."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -112,7 +112,8 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the actual and predicted decrease of ‖r‖, which is ``norm`` at the trial; update the radius.
+    """Compare the decrease of ‖r‖ to ``norm``, its value at the trial, with the prediction; update the
+    radius.
 
     Returns ACCEPTED, REJECTED or a Status.
     """

@@ -23,7 +23,8 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum steps from a guided start: a start near a root takes 1 to 20 steps, others never converge."""
+"""Maximum steps from a guided start: a solve that starts near a root takes 1 to 20 steps; others never
+converge."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
 """Accuracy of a root that is only compared with another root: distinct roots differ by far more."""
 
@@ -84,7 +85,7 @@ def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
 
 
 def doubt_rough(tracker: PathTracker, accuracy: Accuracy) -> None:
-    """Reject each rough root for which :func:`guide` finds a smoother one; moves no wire."""
+    """Reject each rough root for which :func:`guide` finds a smoother root, without moving any wire."""
     end = tracker.end
     todo = _rough(tracker) & end.converged
     x, kept = tracker.solver.x.copy(), end.copy()
@@ -172,7 +173,7 @@ def keep_likeliest(
 def doubt_twins(tracker: PathTracker, estimate: PatchEstimate | None) -> None:
     """Reject roots that have an equally smooth twin on the other side of a fold.
 
-    Given an ``estimate`` of the patch, a twin that the estimate does not confirm is ignored.
+    If an ``estimate`` of the patch is given, a twin that the estimate does not confirm is ignored.
     """
     layout = tracker.problem.layout
     if layout.shape[1] != layout.unknowns:

@@ -53,8 +53,8 @@ class Uniform:
             each wire at the outcome of the last sample. Otherwise each sample starts on the secant through
             the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
             displacement that explains the last sample. On the staggered layout, h = 1, with 10 samples of
-            each of 21 presses of 50 %, starting on the secant alone loses none of 197 wires instead of 7, and
-            takes 2.9 evaluations per sample instead of 4.
+            each of 21 presses of 50 %, starting on the secant by itself reduces the lost wires from 7 of 197
+            to none, and the evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -95,12 +95,12 @@ class Periodic:
     Between two solves the tracked point stays within the relaxed tolerance, so the skipped samples add no
     information.
 
-    The cycle is determined from the samples themselves. The samples are followed from the rest position at
-    1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If the solves
-    have a period, T is the median number of samples from one solve to the next, on the wire that needs the
-    most solves. The path then starts again and solves every T-th sample at that tolerance, and always the
-    last sample. If no tolerance shows a cycle of at least two samples that occurs at least twice, every
-    sample is solved at 1e-6.
+    The cycle is determined from the samples themselves. The samples are followed from the rest position with
+    a tolerance of 1e-6, 1e-5, …, skipping each sample whose first-order optimality is below the tolerance. If
+    the solves have a period, T is the median number of samples from one solve to the next, on the wire that
+    needs the most solves. The path then starts again and solves every T-th sample at that tolerance, and
+    always the last sample. If no tolerance shows a cycle of at least two samples that occurs at least twice,
+    every sample is solved at 1e-6.
 
     The paper's tolerance applies to MATLAB's unscaled problem, in which ‖Jᵀr‖∞ is F² times its value here,
     where r = a F − 1 in pitches. F depends on the unit of length, which the paper does not state.

@@ -19,7 +19,7 @@ QUIET_CHANCE: Final = 0.005
 """Probability per frame that the χ² test reports an unmoved wire as moved."""
 QUIET_DEVIATIONS: Final = 3.7
 """Apparent movement of a single coordinate, in standard deviations, at which its wire counts as moved. With
-300 coordinates at rest, noise alone reaches it in one frame in 15."""
+300 coordinates at rest, noise alone reaches this limit in one frame in 15."""
 KEPT: Final = 50
 """Number of frames for which a wire's equations stay in use after a movement that the other wires' equations
 did not show."""
@@ -33,7 +33,7 @@ class Fit(NamedTuple):
     sharpest: Float
     """(U,) largest apparent error of a single coordinate, in standard deviations."""
     move: Float
-    """(U, f) size of the move that fits the wire best if only this coordinate moves, pitches."""
+    """(U, f) size of the movement that fits the wire best if only this coordinate moves, pitches."""
 
 
 class Gate:

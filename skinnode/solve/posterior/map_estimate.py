@@ -5,8 +5,9 @@ chord     starts at the last field with the factors of an older frame; typically
 newton    refactorises at the current field, then takes chord steps
 anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
           its true value. At high noise the posterior has a single maximum, near that of the prior, and
-          following it leads to the correct maximum. This solves presses of 70 % of the layer between two
-          frames, on layouts where the exact inverse fails even if it follows the samples of the press.
+          following it as the noise decreases leads to the correct maximum. Annealing solves presses of 70 %
+          of the layer between two frames, on layouts where the exact inverse fails even if it follows the
+          samples of the press.
 """
 
 from __future__ import annotations
@@ -48,18 +49,19 @@ HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
 """Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
-expected load at a location is known only to within a factor. At 1, the hidden part of a first touch is 5 to 7
-standard deviations off on one wire in 20 000, and so are dents that a half-space cannot have. At 2, one
+expected load at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7
+standard deviations off on one wire in 20 000, and so are dents that a half-space cannot form. At 2, one
 coordinate in 12 000 of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds
 5."""
 SMOOTH_SHARE: Final = 0.25
 """Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than real
 bodies: the measured errors contain 0.0 to 0.13 of that variance for spheres and 0.02 to 0.5 for Gaussian
-dents. The tail of the error distribution determines the standard deviation, and its centre the interval."""
+dents. The tail of the error distribution determines the standard deviation, and its centre determines the
+interval."""
 
 
 class MapEstimator:
-    """Displacement, nuisances and last factors of one patch's MAP estimate. Do not share between owners.
+    """Displacement, nuisances and last factors of one patch's MAP estimate; not to be shared.
 
     Args:
         problem: The patch.
@@ -310,7 +312,7 @@ class MapEstimator:
         return kernels.assemble(members, self._free, covariance, scale2, o.h, o.d, moved, self._b)
 
     def _newton(self, observation: Observation, members: Index) -> float:
-        """Take a Gauss-Newton step with new factors; return the largest move in pitches, inf on failure."""
+        """Take a Gauss-Newton step with new factors; return max |step|, pitches, or inf on failure."""
         b, prior = self._b, self.load_prior
         self._factored = None
         self._linearise(observation, self.moved, members)

@@ -177,7 +177,7 @@ class Posterior:
         return self._field(observation, status, held, start)
 
     def stop_at(self, until: float) -> None:
-        """Set the :func:`time.perf_counter` value at which the next updates stop; inf for no limit."""
+        """Set the deadline for subsequent updates, as a :func:`time.perf_counter` value; inf for no limit."""
         self._until = until
 
     def covariance_m2(self) -> Float:
@@ -232,7 +232,7 @@ class Posterior:
     def _is_quiet(self, observation: Observation) -> bool:
         """Return whether the last field explains the frame within noise.
 
-        The residual of a wire in use contains two noises: that of this frame and that of the last field.
+        The residual of a wire in use contains noise from two sources: this frame and the last field.
         """
         seen_before = self._known and np.array_equal(observation.weight > 0, self._seen)
         if not (self.options.hold and seen_before):

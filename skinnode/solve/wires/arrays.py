@@ -89,9 +89,9 @@ class SolverArrays(ArrayTable):
     inverse: Annotated[Float, "U 3N K"]
     """∂x/∂r of the last converged solve of each wire."""
     a_solved: Annotated[Float, "U K"]
-    """1/F at that solution; 1 if the equation was missing."""
+    """1/F at the last converged solution; 1 if the equation was missing."""
     noise: Annotated[Float, "U K"]
-    """Variance of a at that solution; inf if the equation was missing."""
+    """Variance of a at the last converged solution; inf if the equation was missing."""
     std: Annotated[Float, "U 3N"]
     """Standard deviation of x; inf if unknown."""
     report: Annotated[Index, "U report"]
@@ -134,7 +134,7 @@ class FrameArrays(ArrayTable):
     a: Annotated[Float, "U K"]
     """Resistance in the units of the problem."""
     weight: Annotated[Float, "U K"]
-    """σ divided by the standard deviation; 0 if that is unknown or the resistance is invalid."""
+    """σ divided by the standard deviation; 0 if the latter is unknown or the resistance is invalid."""
     used: Annotated[Float, "U K"]
     """As ``weight``, but also 0 if a is out of range."""
     todo: Annotated[Bytes, "U"]
@@ -147,7 +147,7 @@ class FrameArrays(ArrayTable):
     x: Annotated[Float, "U 3N"]
     """Last trusted position."""
     a_solved: Annotated[Float, "U K"]
-    """Value of a at that position."""
+    """Value of a at the last trusted position."""
     weight_solved: Annotated[Float, "U K"]
     """Weights for which the inverse of each wire was computed."""
     predictable: Annotated[Mask, "U"]

@@ -69,7 +69,7 @@ def _hold(u: int, solver: SolverArrays, a: Float, weight: Float, sigma: float, t
 
 @njit_part
 def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
-    """Move ``x`` in the workspace by (∂x/∂a) (a − a of the last solve); return the largest move."""
+    """Move ``x`` in the workspace by (∂x/∂a) (a − a of the last solve); return the largest movement."""
     w: Any = solver.work
     a_solved = solver.a_solved[u]
     for k in range(a.size):
@@ -84,7 +84,7 @@ def _predict(u: int, solver: SolverArrays, a: Float, weight: Float) -> float:
 def _follow(  # noqa: PLR0913 - one wire of a call
     u: int, solver: SolverArrays, options: SolveOptions, a: Float, weight: Float, moved: float
 ) -> tuple[int, int, bool]:
-    """Follow wire ``u`` after a prediction by ``moved``.
+    """Follow wire ``u`` after a prediction of size ``moved``.
 
     Returns the number of evaluations of F, the number of steps, and whether the wire keeps its inverse.
     """

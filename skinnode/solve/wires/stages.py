@@ -17,8 +17,8 @@ from skinnode.solve.wires import arrays as wires
 from skinnode.solve.wires.arrays import FrameArrays, SolverArrays
 
 STALE: Final = 2.0
-"""Maximum factor between the weight of an equation and its weight in the J⁺ of a tall system for which that
-J⁺ is reused."""
+"""Maximum factor by which the weight of an equation may have changed since the J⁺ of a tall system was
+computed, for that J⁺ to be reused."""
 DEADLINE: Final = int(Status.DEADLINE)
 
 

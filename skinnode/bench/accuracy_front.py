@@ -35,7 +35,7 @@ SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
 """Maximum error, relative to the displacement, at which a result counts as solved and is drawn."""
 ROUNDING: Final = 1e-11
-"""Error below which results count as equal: rounding error of F, amplified by the condition number of J."""
+"""Error below which results count as equal: rounding error in F, amplified by the condition number of J."""
 LOOSE: Final = 1e-6
 """Tolerance at all samples before the last, as in the paper."""
 REPEATS: Final = 7

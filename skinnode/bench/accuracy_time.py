@@ -24,7 +24,7 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 class Cycle:
     """A press down and up again, solved frame by frame.
 
-    Every call solves all frames of the cycle, so that no turn gets only the cheap frames.
+    Every call solves all frames of the cycle, so that no turn covers only cheap frames.
 
     Args:
         solver: Solver to measure.

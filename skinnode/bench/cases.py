@@ -1,9 +1,9 @@
 """Hard cases: streams that make solvers fail. New cases are added as they are found.
 
- 1 symmetric layout, J rank-deficient         8 drift of the baseline, gain, contact resistance
+ 1 symmetric layout, J rank-deficient         8 baseline drift, gain error, contact resistance
  2 thick layers                               9 wrong roots with zero residual
  3 presses of 30, 50 and 70 %                10 two indenters, shear only, edge, half off the patch
- 4 a press between two frames                11 press and release many times
+ 4 a press between two frames                11 repeated presses and releases
  5 an electrode almost touching              12 curved layouts, N = 1, K < 3N, K > 3N
  6 noise and code widths                     13 the wrong model
  7 open, shorted, missing, saturated
@@ -32,7 +32,7 @@ STRIDE: Final = 4
 """Number of path samples per tracker frame."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error in the change of R predicted by the wrong models of case 13. Measured on a 30 % press,
+"""Relative error in the change in R predicted by the wrong models of case 13. Measured on a 30 % press,
 staggered, h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in
 the median and by 7 % at worst."""
 
@@ -50,9 +50,9 @@ class Case:
     """Converter of the streams; the user knows its noise."""
     drift: str = "none"
     stride: int = 1
-    """Number of stream frames per tracker frame; a path gets all frames."""
+    """Number of stream frames per tracker frame; a path uses all frames."""
     model_error: float = 0.0
-    """Relative error in the change of R that the user expects from the model."""
+    """Relative error in the change in R that the user expects from the model."""
 
 
 def preset(name: str, height: float) -> PatchLayout:

@@ -2,8 +2,8 @@
 
 A frame's time is the time at which the node passes it to its interface, on the monotonic clock that also
 stamps SYNC. SYNC and load come from another endpoint in another thread of the same process, so the
-interpreter lock affects the result. Other work on the machine affects it even more; ``chrt -f 20 skinnode
-bench node`` gives the figures of an idle machine.
+interpreter lock affects the result. Other work on the machine affects the result even more; ``chrt -f 20
+skinnode bench node`` gives the figures of an idle machine.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame, which makes a node without a bus handle such a frame.
+    """Return one function per kind of frame, each of which makes a node without a bus handle a frame.
 
     Each also queries the next deadline, as the thread that drives a node does.
     """

@@ -208,7 +208,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _path_rows(path: PathResult) -> slice:
-    """Return the rows of the path itself, without the cycle search, second tries and checks."""
+    """Return the rows of the path itself, without the cycle search, second attempts and checks."""
     at = path.position[path.searched :, 0]
     return slice(path.searched, path.searched + int(np.argmax(at == np.nanmax(at))) + 1)
 
@@ -373,7 +373,7 @@ def print_all(figures: dict[str, Any], say: Say) -> None:
     """Print the tables and the figure data, with the paper's value next to each number."""
     paper, count = figures["paper"], figures["experiments"]
     say(f"Means of {count} experiments; one wire, {UNKNOWNS} unknowns; tolerances 1e-6 and 1e-12.")
-    say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second try.")
+    say("As in the paper: Uniform(plain=True). Ours: Uniform(), with extrapolation and a second attempt.")
     say("Tol_X: the largest remaining correction, pitches. Times: medians per call for the single wire.")
     say("Ten-step path of one wire (paper: 2.03 s)")
     for row in figures["ten_steps"]:

@@ -85,7 +85,7 @@ def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[
 
 
 def _rows(case: Case, only: Sequence[str] | None, seeds: int) -> list[dict[str, Any]]:
-    """Return one row per method; all methods get the same streams."""
+    """Return one row per method; all methods solve the same streams."""
     chosen = [name for name in case.methods if only is None or name in only]
     solvers = {name: methods.set_up(case, name) for name in chosen}
     tallies = {name: Tally(case.converter.exact) for name in chosen}

@@ -8,14 +8,15 @@ wrong      if it is CONVERGED and an error is too large, or if it is not finite,
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
 beyond that. A long run must not fail by chance, nor a fault pass as chance, so two conditions must hold in
-each row. For errors that are Gaussian with the reported standard deviation, each fails with a probability of
-1e-4:
+each row. For errors that are Gaussian with the reported standard deviation, each condition fails with a
+probability of 1e-4:
 
 - no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)
   standard deviations with probability 1e-4. z is 5.7 for 9,000 coordinates and 6.4 for 1e6 (Bonferroni's
   bound: correlation only makes it safer)
-- the number of seeds with a coordinate beyond 5 is within a binomial limit whose probability is the expected
-  number of such coordinates per seed (again a bound); seeds are independent even though coordinates are not
+- the number of seeds with a coordinate beyond 5 is within the limit of a binomial distribution whose
+  probability is the expected number of such coordinates per seed (again a bound); seeds are independent even
+  though coordinates are not
 
 If the second condition fails, every wire beyond 5 is wrong. With exact data chance plays no part: the limit
 is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is larger.

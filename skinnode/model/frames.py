@@ -96,7 +96,7 @@ class FieldFrame:
     displacement_m: Float
     """(U, N, 3) displacement from the rest position, metres."""
     displacement_std_m: Float
-    """(U, N, 3) standard deviation due to the noise of the resistances, metres; inf if nothing is known. The
+    """(U, N, 3) standard deviation due to noise in the resistances, metres; inf if nothing is known. The
     part due to a prior includes an allowance for the tail of the prior's errors, so an error above five
     standard deviations indicates a fault."""
     status: tuple[Status, ...]

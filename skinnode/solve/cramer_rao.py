@@ -1,6 +1,6 @@
 """Cramér-Rao bound J⁺ diag(σ²) J⁺ᵀ of a wire: how precisely its resistances determine its rest position.
 
-J is the Jacobian of the relative residual a F − 1 at rest and σ the relative noise of each resistance.
+J is the Jacobian of the relative residual a F − 1 at rest and σ the relative noise in each resistance.
 Standard deviations are in clearances; the clearance is the smallest distance at rest between an upper and a
 lower electrode.
 """

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from skinnode.model.layout import Float, PatchLayout
 
 NOISE_MAX: Final = 1e12
-"""Largest relative noise of a usable resistance; its square must not overflow."""
+"""Largest relative noise in a usable resistance; its square must not overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class CodeMap:
     lo: float
     """R / R0 of code 0."""
     step: float
-    """Change of R / R0 per code."""
+    """Change in R / R0 per code."""
     steps: int
     """Largest valid code."""
     rounding_ohm: Float

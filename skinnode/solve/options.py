@@ -33,7 +33,7 @@ class EstimateOptions:
         drift: Gain errors to estimate: ``patch`` for one common gain of all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.
-        model_error: Standard error of the forward model, as a fraction of the change of each resistance
+        model_error: Standard error of the forward model, as a fraction of the change in each resistance
             (from thickness, electrode size and conductivity under strain): the full value for an error common
             to all resistances, and 0.7 of it for an independent error of each resistance.
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.

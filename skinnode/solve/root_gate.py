@@ -152,7 +152,7 @@ class RootGate:
         )
 
     def _give_up(self, field: FieldFrame, doubtful: Mask) -> FieldFrame:
-        """Leave the doubtful wires without a root, for lack of time for a posterior solve."""
+        """Leave the doubtful wires without a root, because there is no time for a posterior solve."""
         std = field.displacement_std_m.copy()
         std[doubtful] = np.inf
         self._apart[doubtful] = 0.0

@@ -81,7 +81,7 @@ ROUGH_AT_PATH_END: Final = 0.8
 smoothest displacement. The ratio is 0.67 on average for presses, below 0.9 for nine presses in ten, up to 1.9
 if they move a single electrode, and 0.7 to 2 for wrong roots."""
 STILL_CONFIRMED: Final = 0.2
-"""Relative change of a displacement since its confirmation up to which a rough wire is not checked again."""
+"""Relative change in a displacement since its confirmation up to which a rough wire is not checked again."""
 
 # -- two roots of one wire ----------------------------------------------------------------------------------
 

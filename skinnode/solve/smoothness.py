@@ -21,7 +21,7 @@ CORRELATION_PITCHES: Final = 1.0
 of the rest position in four sets of 82 random presses on the staggered layout: 70 % at h = 0.5, and 10, 30
 and 50 % at h = 1. Values of 0.7 and 1.5 find fewer."""
 ROUGH_SHARE: Final = 1e-3
-"""Relative increase of the diagonal of C, so that C⁻¹ exists in floating point."""
+"""Relative increase in the diagonal of C, so that C⁻¹ exists in floating point."""
 
 
 class Smoothness:

@@ -86,7 +86,7 @@ def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> No
     adaptive = setting["adaptive"]["runtime_ms"] / 1e3
     axes.loglog([1], [adaptive], "*", ms=11, color=COLOURS[2], label="Adaptive, last sample alone")
     axes.set_xlabel("steps")
-    axes.set_ylabel("time of one path of one wire (s)")
+    axes.set_ylabel("time per path of one wire (s)")
     axes.set_title("Time per path (table 4)")
     axes.legend(frameon=False, loc="upper left")
     axes.set_ylim(top=1e5)

@@ -107,7 +107,7 @@ class ExactTracker:
         if codes is not None:
             self.arrays.set_codes(codes)
         self.invalid_codes = 0
-        """Number of invalid codes in the last scan."""
+        """Number of invalid codes in the latest scan."""
         self.reset()
         self.update(problem.a_rest / problem.gain)  # compiles the kernels before a stream starts
         self.reset()

@@ -110,7 +110,7 @@ def rounding(w: Work, x: Float) -> float:
 def estimate_error(w: Work, inverse: Float) -> float:
     """Write J⁺ of the last factors into ``inverse`` (n, m); return the error estimate of a converged solve.
 
-    The estimate is the remaining correction plus the effect of rounding of x, amplified by the condition
+    The estimate is the remaining correction plus the effect of rounding x, amplified by the condition
     number of J, relative to max(1, ‖x‖∞); inf if J is singular.
     """
     n, m = w.jt.shape

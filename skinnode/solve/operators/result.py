@@ -23,6 +23,6 @@ class Solution:
     optimality: float
     """First-order optimality ‖Jᵀr‖∞ at ``x``."""
     error_estimate: float
-    """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding of F, amplified
+    """Estimate of max |x − x*|: the remaining Newton correction plus the effect of rounding F, amplified
     by the condition number of J; inf if no root or minimum was found."""
     stats: SolveStats

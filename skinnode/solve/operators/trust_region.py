@@ -69,7 +69,7 @@ def measure_newton(w: Work) -> None:
 
 @njit_part
 def _gain_noise(w: Work) -> float:
-    """Return the rounding error in the relative decrease of ‖r‖² for a step with a small predicted change."""
+    """Return the rounding error in the relative decrease in ‖r‖² for a step with a small predicted change."""
     noise, before = 4.0 * EPS, w.s[NORM]
     rounding(w, w.x)
     for k in range(w.r.size):
@@ -112,8 +112,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the decrease of ‖r‖ to ``norm``, its value at the trial, with the prediction; update the
-    radius.
+    """Compare the decrease in ‖r‖, to ``norm`` at the trial, with the prediction; update the radius.
 
     Returns ACCEPTED, REJECTED or a Status.
     """

@@ -36,8 +36,8 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
 ) -> None:
     """Predict positions along the secant through the last two solved points.
 
-    The last move is scaled by the projection of the next relative change of ``a`` onto the last one. A wire
-    whose prediction is not finite stays at ``x``.
+    The previous move is scaled by the projection of the next relative change in ``a`` onto the previous
+    change. A wire whose prediction is not finite stays at ``x``.
 
     Args:
         x_before: (U, n) position at the second-to-last point, pitches.

@@ -26,8 +26,9 @@ SCALE_MOST: Final = 1.0
 SCALE_STEP: Final = math.log(1.25)
 """Logarithm of the scale change that triggers an update; the standard deviations change by less."""
 SCALE_LEAST: Final = 1.0
-"""Smallest scale, relative to that of a field that on average changes the resistances by their noise. A
-smaller field would go unnoticed, so the standard deviations of an untouched patch must allow for it."""
+"""Smallest scale, relative to the scale of a field that on average changes the resistances by as much as
+their noise. A smaller field would go unnoticed, so the standard deviations of an untouched patch must allow
+for it."""
 ADAPTIONS: Final = 5
 """Maximum number of updates of the prior or the noise per frame."""
 REFINEMENTS: Final = 3

@@ -68,7 +68,7 @@ class LoadPosterior:
         """Return the load variances (Q,), pitch², implied by the loads found; at least ``least``.
 
         Without its own prior, a load has the estimate q / s² k and the variance 1/k − s², where k is the
-        increase of χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for
+        increase in χ² per unit of the load (Tipping and Faul, Fast marginal likelihood maximisation for
         sparse Bayesian models, 2003).
         """
         prior = self._prior

@@ -36,7 +36,7 @@ LOCAL_CHANGE: Final = 0.35
 slow press reach 6 standard deviations; at 0.25, twice as many frames need a rebuild."""
 LOCAL_SURPRISE: Final = 16.0
 """Ratio of the squared load of a cell to its expected square above which the prior is rebuilt even if little
-of the expected load moved elsewhere. Without this limit, a press twice as deep as in the last frame was 7
+of the expected load moved elsewhere. Without this limit, a press twice as deep as in the previous frame was 7
 standard deviations off after an unusual motion that left small expected loads. A value of 16 costs nothing:
 slow presses need a factorisation in as many frames as without the limit."""
 

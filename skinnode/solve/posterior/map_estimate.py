@@ -241,7 +241,7 @@ class MapEstimator:
     # -- evidence --------------------------------------------------------------------------------------
 
     def signal(self) -> Float:
-        """Return the variance (U, K), pitch⁻², of each relative change of R at rest if s = 1."""
+        """Return the variance (U, K), pitch⁻², of each relative change in R at rest if s = 1."""
         wires, f, a = len(self.moved), self._free.size, self._problem.a_rest
         plain = Observation(a, np.ones_like(a), np.zeros((*a.shape, 0)), np.zeros(0))
         self._linearise_at_rest(plain)

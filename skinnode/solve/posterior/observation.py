@@ -2,7 +2,7 @@
 
 A wire's residual is r = w (a F(x) − 1) with w = 1/σ. The model is r(x) − H g = noise of variance 1, with a
 few nuisances g ~ N(0, diag(d)): a gain error of the patch or of each wire (drift), and an error of the
-forward model that is proportional to the change of each resistance.
+forward model that is proportional to the change in each resistance.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Observation:
     weight: Float
     """(U, K) 1/σ, 0 if a resistance is missing."""
     h: Float
-    """(U, K, p) H, change of the residual per unit of each nuisance."""
+    """(U, K, p) H, change in the residual per unit of each nuisance."""
     d: Float
     """(p,) prior variances of the nuisances."""
 
@@ -63,7 +63,7 @@ class ObservationModel:
         problem: The patch.
         drift: ``none``, ``patch`` (one gain error) or ``wire`` (one gain error per upper wire).
         drift_std: Prior standard deviation of a gain error.
-        model_error: Standard error of the forward model, as a fraction of the change of each resistance.
+        model_error: Standard error of the forward model, as a fraction of the change in each resistance.
 
     Attributes:
         gains: Number of gain errors; they come first among the nuisances.

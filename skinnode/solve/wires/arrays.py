@@ -35,7 +35,7 @@ SOLVE: Final = 1
 PREDICT: Final = 2
 """Solve the wire, starting at x + (∂x/∂a) (a − a of the last solve)."""
 HOLD: Final = 3
-"""As PREDICT, but keep x if its residual is within noise."""
+"""Like PREDICT, but keep x if its residual is within noise."""
 
 # Additional tasks of a solve, combined with bitwise or
 COVARIANCE: Final = 1
@@ -124,7 +124,7 @@ class FrameArrays(ArrayTable):
     code_gain: Annotated[Float, "U K"]
     rounding_ohm: Annotated[Float, "U K"]
     code_map: Annotated[Float, "4"]
-    """R/R0 of code 0, change of R/R0 per code, largest valid code, relative noise before the converter."""
+    """R/R0 of code 0, change in R/R0 per code, largest valid code, relative noise before the converter."""
     ohm: Annotated[Float, "U K"]
     noise: Annotated[Float, "U K"]
     """Relative standard deviation of the resistance."""
@@ -136,7 +136,7 @@ class FrameArrays(ArrayTable):
     weight: Annotated[Float, "U K"]
     """σ divided by the standard deviation; 0 if the latter is unknown or the resistance is invalid."""
     used: Annotated[Float, "U K"]
-    """As ``weight``, but also 0 if a is out of range."""
+    """Like ``weight``, but also 0 if a is out of range."""
     todo: Annotated[Bytes, "U"]
     """LEAVE, SOLVE, PREDICT or HOLD."""
     order: Annotated[Index, "U"]

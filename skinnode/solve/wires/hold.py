@@ -7,8 +7,8 @@ variance s², and lies in the n directions of the range of J. With t = s²/σ²,
 half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, t = 0). The quantile is that
 of the c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
-A slow movement may go unnoticed in this sum, especially along the one direction of K that a wire determines
-worst. The variance of a held coordinate allows for such a movement: its correction c = Σ_k (∂x_j/∂r_k) ρ_k
+A slow movement may go unnoticed in this sum, especially along the worst-determined of the K directions of a
+wire. The variance of a held coordinate allows for such a movement: its correction c = Σ_k (∂x_j/∂r_k) ρ_k
 contains the movement and the noise of both frames, and the excess of c² over that noise is a lower limit of
 the variance. Measured coverage of the 95 % intervals (staggered layout, h = 0.5, noise 1e-5): 98 % for
 unmoved wires (99 % of the frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96

@@ -55,7 +55,7 @@ def choose(frame: FrameArrays) -> None:
     """Write the action for each wire into ``todo``: ``first`` if the wire can be predicted, else SOLVE.
 
     The action is also SOLVE if the J⁺ of a tall system was computed for different weights, because
-    resistances that it relies on may be noisy by now.
+    resistances on which that J⁺ relies may have become noisy.
     """
     predictable, unknowns, todo = frame.predictable, frame.unknowns, frame.todo
     used, weight, first = frame.used, frame.weight_solved, frame.first

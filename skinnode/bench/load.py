@@ -1,4 +1,4 @@
-"""Load of ``skinnode bench pipeline``: frames of real nodes, replayed in real time by another process.
+"""Load for ``skinnode bench pipeline``: frames from real nodes, replayed in real time by another process.
 
 The nodes are those of ``skinnode node``, measuring the simulator's patches. In simulated time their frames
 cross a bus with CAN arbitration: whenever the bus is free, the waiting frame with the lowest identifier is

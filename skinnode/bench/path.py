@@ -483,7 +483,7 @@ def _print_figures(setting: dict[str, Any], paper: dict[str, Any], say: Say) -> 
     section = paper["section5"]
     say(
         f"  the paper's T at 1e-4 and 50 samples: {section['cycle_at_50_steps_tol_1e-4']}. Its optimality is "
-        f"of F, which would be {setting['unscaled']:.0f} times ours if its unit of length were the pitch."
+        f"that of F and would be {setting['unscaled']:.0f} times ours if its unit of length were the pitch."
     )
     totals, printed_totals = setting["figure11"], paper["figure11_iterations"]
     say("figure 11, iterations per path")

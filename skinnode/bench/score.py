@@ -49,7 +49,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Figures of a patch's run; lengths in metres, NaN without a scored scan."""
+    """Figures of a patch's run; lengths in metres, NaN if no scan was scored."""
 
     scans: int
     untrusted: int

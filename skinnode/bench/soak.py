@@ -202,8 +202,8 @@ def summary_lines(figures: dict[str, Any]) -> list[str]:
         f"{figures['rounds']} rounds, {figures['starved_rounds']} of them starved of CPU time; "
         f"{figures['frames']} frames received, {figures['scans']} scans, {figures['fields']} fields, "
         f"{figures['rejoins']} bring-ups",
-        f"all patches back after {figures['slowest_back_s']:.2f} s at most, "
-        f"after more than {SLOW_S:g} s in {counted(figures['slow_rounds'], 'round')}",
+        f"all patches back within {figures['slowest_back_s']:.2f} s; "
+        f"{counted(figures['slow_rounds'], 'round')} took more than {SLOW_S:g} s",
     ]
     columns = f"{'sent':>9} {'dropped':>9} {'held back':>9} {'arrived':>9}"
     for key, direction in (("from_nodes", "nodes to the host"), ("from_host", "host to the nodes")):

@@ -18,7 +18,7 @@ probability of 1e-4:
   probability is the expected number of such coordinates per seed (again a bound); seeds are independent even
   though coordinates are not
 
-If the second condition fails, every wire beyond 5 is wrong. With exact data chance plays no part: the limit
+If the second condition fails, every wire beyond 5 is wrong. With exact data, chance plays no part: the limit
 is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is larger.
 """
 

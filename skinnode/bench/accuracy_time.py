@@ -57,7 +57,7 @@ def _frames(skin: Skin, press: Press, sigma: float) -> Float:
 def run(rounds: int) -> list[dict[str, Any]]:
     """Return one row per solver: time in µs per frame, limit, and number of wires solved.
 
-    The time is the mean over the frames, and the median over turns. A press moves the whole half-space, so no
+    The time is a mean over the frames and a median over the turns. A press moves the whole half-space, so no
     real scene moves only three wires; here the resistances of the other wires are masked. No wire is held, so
     every frame is solved.
     """

@@ -70,10 +70,10 @@ def run(  # noqa: PLR0913 - the options of the command
 
     Args:
         seconds: Duration of each measurement.
-        short: Run only the rows that have a requirement.
+        short: Whether to run only the rows that have a requirement.
         interface: ``udp`` or ``socketcan``.
         channel: Channel for socketcan.
-        all_cores: Do not bind host and load to one core each.
+        all_cores: Whether host and load may use all cores; otherwise each is bound to one core.
         report: Called with each row when it is ready.
 
     Returns:
@@ -253,7 +253,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return ms from last frame to field and to field delivery, for scans that ended after ``begin_ns``."""
+        """Return ms from last frame to field and to field delivery, for scans ended after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]

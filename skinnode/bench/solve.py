@@ -1,7 +1,8 @@
 """One wire of the reference patch solved to 1e-9 from a nearby start, by us and by peers on the same F and J.
 
 The start is the second-to-last sample of a ten-step path to a 10 % press. Every peer runs at the loosest
-tolerance that reduces the displacement error to 1e-9; a peer that never reaches it is listed without a time.
+tolerance that reduces the displacement error to 1e-9; a peer that never reaches this error is listed without
+a time.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
 
 
 def ceres() -> Solve:
-    """Return Ceres with its dense QR and traditional dogleg, without output."""
+    """Return Ceres as a solver with dense QR and traditional dogleg, without output."""
     pyceres = importlib.import_module("pyceres")
     options = pyceres.SolverOptions()
     options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG

@@ -7,8 +7,8 @@ accurate   if it is CONVERGED and every coordinate is within the reported uncert
 wrong      if it is CONVERGED and an error is too large, or if it is not finite, whatever its status
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
-beyond that. A long run must not fail by chance, nor a fault pass as chance, so two conditions must hold in
-each row. For errors that are Gaussian with the reported standard deviation, each condition fails with a
+beyond this limit. A long run must not fail by chance, nor a fault pass as chance, so two conditions must hold
+in each row. For errors that are Gaussian with the reported standard deviation, each condition fails with a
 probability of 1e-4:
 
 - no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)

@@ -185,7 +185,7 @@ class Adaptive:
     root on the branch of the rest position is undone and halved.
 
     A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
-    meet. If a wire gets stuck there, or its root is too rough to be a press, it is solved again by
+    meet. If a wire gets stuck at such a fold, or its root is too rough to be a press, it is solved again by
     Levenberg-Marquardt, whatever the operator. That solve starts from the smoothest displacement that
     explains the last sample (:func:`skinnode.solve.starts.guided_start`). If there are then two roots, the
     smoother one is kept.

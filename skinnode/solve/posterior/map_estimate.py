@@ -49,10 +49,9 @@ HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0
 """Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
-expected load at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7
-standard deviations off on one wire in 20 000, and so are dents that a half-space cannot form. At 2, one
-coordinate in 12 000 of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds
-5."""
+load to expect at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7 standard
+deviations off on one wire in 20 000, and so are dents that a half-space cannot form. At 2, one coordinate in
+12 000 of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
 SMOOTH_SHARE: Final = 0.25
 """Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than real
 bodies: the measured errors contain 0.0 to 0.13 of that variance for spheres and 0.02 to 0.5 for Gaussian

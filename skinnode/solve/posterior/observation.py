@@ -97,7 +97,7 @@ class ObservationModel:
 
 
 def eased(observation: Observation, level: float) -> Observation:
-    """Return the observation with added noise of standard deviation ``level``, for annealing."""
+    """Return the observation with noise of standard deviation ``level`` added, for annealing."""
     weight = observation.weight
     loose = 1.0 / np.hypot(
         level, np.divide(1.0, weight, out=np.full_like(weight, math.inf), where=weight > 0)

@@ -1,4 +1,4 @@
-"""Finds the bus and node for a command from its options: an interface, or a bus of a hand file."""
+"""Finds a command's bus and node from its options, which name an interface or a bus in a hand file."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def find_node(
     hand: Path | None,
     bus: str | None,
 ) -> tuple[Place, int]:
-    """Return the bus and node-ID for NODE, which is a node-ID or the name of a patch on any bus of the hand.
+    """Return the bus and node-ID of NODE, a node-ID or the name of a patch on any bus of the hand.
 
     The other arguments are as for :func:`find_buses`.
 

@@ -43,7 +43,7 @@ def run(app: typer.Typer, argv: Sequence[str] | None = None) -> int:
 
 
 def _printable(stream: Any) -> Any:
-    """Return a wrapper of ``stream`` that escapes control characters and those missing from its encoding."""
+    """Return ``stream``, wrapped to escape control characters and characters missing from its encoding."""
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream if stream is None or isinstance(stream, PrintableStream) else PrintableStream(stream)
@@ -73,8 +73,8 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    Typer's own text is kept, except for missing and invalid values, where it omits the argument's meaning,
-    the value given or the allowed range.
+    Typer's own text is kept, except for missing and invalid values: there, Typer omits the argument's
+    meaning, the value given or the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")
     param, kind = getattr(error, "param", None), type(error).__name__

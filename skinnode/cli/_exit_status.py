@@ -42,7 +42,7 @@ class Stopped(SystemExit):
 
 
 def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
-    """Run a typer application and exit with its status. From then on, signals end the process.
+    """Run a typer application and exit with its status. From this call on, signals end the process.
 
     Args:
         module: Name of the module that defines the application as ``app``.
@@ -74,7 +74,7 @@ def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers
 
 
 def _ignore_signals() -> None:
-    """Keep the exit status once all threads have ended: Python is about to restore the default handlers."""
+    """Ignore signals once all threads have ended: Python's default handlers would change the exit status."""
     _handle(signal.SIG_IGN)
 
 

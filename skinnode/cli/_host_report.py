@@ -32,7 +32,7 @@ _EXPLAINED_BY_SLOWNESS: Final = (
     "chunks_lost",
     "summaries_lost",
 )
-"""Counters of missing and late frames that a slow computer explains; wrong frames remain faults."""
+"""Counters of the missing and late frames that a slow computer can cause; wrong frames remain faults."""
 
 
 def operational_text(running: Host) -> str:
@@ -76,7 +76,8 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
         notes += [f"{name}: {text}" for text in patch_notes]
     for name, defects in stats.defects.items():
         if defects.count:
-            faults.append(f"{name}: {counted(defects.count, 'defect')} of the host, newest: {defects.newest}")
+            defect = f"{counted(defects.count, 'defect')} of the host, most recent: {defects.newest}"
+            faults.append(f"{name}: {defect}")
     return faults, notes
 
 
@@ -123,7 +124,7 @@ def _patch_faults_and_notes(
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return why a patch is faulty or refused, after the prefix ``before``; empty for other conditions."""
+    """Return ``before`` and the reason why a patch is faulty or refused; empty for other conditions."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -203,7 +204,7 @@ def _patch(running: Host, name: str, before: HostStats, now: HostStats) -> dict[
 
 
 def _deepest(field: FieldFrame | None) -> dict[str, float | None]:
-    """Return the deepest electrode's depth and its standard deviation; a press moves it towards −z."""
+    """Return the depth of the deepest electrode, positive towards −z, and the depth's standard deviation."""
     if field is None:
         return {"deepest_m": None, "deepest_std_m": None}
     z = field.displacement_m[..., 2]

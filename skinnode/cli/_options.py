@@ -51,7 +51,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value < math.inf:
-        raise typer.BadParameter(f"{text!r} is not a number of seconds of at least 0")
+        raise typer.BadParameter(f"{text!r} is not a number of seconds, 0 or more")
     return value
 
 
@@ -60,10 +60,10 @@ Interface = Annotated[
 ]
 Channel = Annotated[str | None, typer.Option(help="Channel of the interface; default can0.", metavar="NAME")]
 OtherInterface = Annotated[
-    str | None, typer.Option(help="python-can interface instead of the file's.", metavar="NAME")
+    str | None, typer.Option(help="python-can interface to use instead of the file's.", metavar="NAME")
 ]
 OtherChannel = Annotated[
-    str | None, typer.Option(help="Channel of the interface instead of the file's.", metavar="NAME")
+    str | None, typer.Option(help="Channel to use instead of the file's.", metavar="NAME")
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
 Fd = Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")]

@@ -57,9 +57,7 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
     for row in figures["rows"]:
         spent = "not reached".rjust(18) if row["us"] is None else f"{row['us']:10.1f}{row['ratio']:8.2f}"
         typer.echo(f"{row['who']:42}{spent}{row['error']:10.0e}{row['tolerance']:11.0e}")
-    typer.echo(
-        "ratio: relative to skinnode dogleg; tolerance: the solver's loosest setting that reaches 1e-9."
-    )
+    typer.echo("ratio: relative to skinnode dogleg; tolerance: the loosest setting that reaches 1e-9.")
     if not any("pyceres" in row["who"] for row in figures["rows"]):
         typer.echo("Ceres is not installed; to measure it too, run sh install.sh bench.")
     _write(json, figures)
@@ -113,7 +111,7 @@ def accuracy(
 ) -> None:
     """Measure error versus time, noise and code width; the coverage of intervals; and the time per frame.
 
-    Exit status 1 if a requirement is not met, except for times, which depend on the machine.
+    Exit status 1 if a requirement is not met; times, which depend on the machine, do not count.
     """
     from skinnode.bench import accuracy as bench
 
@@ -196,15 +194,17 @@ def pipeline(
     plot: PlotFile = None,
     seconds: Annotated[float, typer.Option(min=1, help="Duration of each measurement, s.")] = 10.0,
     short: Annotated[bool, typer.Option("--short", help="Run only rows that have a requirement.")] = False,
-    interface: Annotated[str, typer.Option(help="udp, or socketcan for one bus, set by --channel.")] = "udp",
+    interface: Annotated[
+        str, typer.Option(help="udp, or socketcan for the one bus given by --channel.")
+    ] = "udp",
     channel: Annotated[str, typer.Option(help="Channel for socketcan.")] = "vcan0",
     all_cores: Annotated[
-        bool, typer.Option("--all-cores", help="Let host and load use all cores, instead of one core each.")
+        bool, typer.Option("--all-cores", help="Let host and load generator use all cores.")
     ] = False,
 ) -> None:
-    """Run four full buses with sixteen patches through a host and measure losses, latency and CPU load.
+    """Feed a host from four full buses with sixteen patches; measure losses, latency and CPU load.
 
-    Exit status 1 if a frame was lost or the frame counts do not add up. Times do not affect it.
+    Exit status 1 if a frame was lost or the frame counts do not add up. Times do not affect the exit status.
     """
     from skinnode.bench import pipeline as bench
 
@@ -244,9 +244,9 @@ def soak(
 ) -> None:
     """Run a simulated hand under random faults for minutes or hours.
 
-    Frames of every kind are dropped, the processor is starved, and the kernel cache is damaged at the start.
-    The host must survive, every patch must recover, all frame counts must add up, and memory, threads and
-    file descriptors must not grow. Exit status 1 if any of this fails.
+    Frames of every kind are dropped, other processes occupy the processors, and the kernel cache is damaged
+    at the start. The host must survive, every patch must recover, all frame counts must add up, and memory,
+    threads and file descriptors must not grow. Exit status 1 if any of these requirements is not met.
     """
     from skinnode.bench import soak as bench
 
@@ -264,7 +264,7 @@ def soak(
 
 
 def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
-    """Run the soak in a child process on a damaged copy of the kernel cache, and return its exit status."""
+    """Run the soak in a child process with a damaged copy of the kernel cache, and return its exit status."""
     import subprocess
     import sys
     import tempfile
@@ -291,7 +291,7 @@ def _print_must(must: list[dict[str, Any]]) -> None:
 
 
 def _prepare(json: Path | None, plot: Path | None = None) -> None:
-    """Check that the files can be written, and announce if kernels must first be compiled."""
+    """Check that the files can be written, and report whether the kernels must be compiled first."""
     from skinnode.compiled.jit import is_cold
     from skinnode.files.output_file import require_writable
     from skinnode.files.plot_file import require_matplotlib
@@ -303,7 +303,7 @@ def _prepare(json: Path | None, plot: Path | None = None) -> None:
         require_writable("--plot", plot)
 
     if is_cold():
-        typer.echo("Compiling the kernels; the next start will not need to.", err=True)
+        typer.echo("Compiling the kernels; later starts use the compiled code.", err=True)
 
 
 def _print_machine(figures: dict[str, Any]) -> None:

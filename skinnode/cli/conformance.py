@@ -40,14 +40,14 @@ def conformance(
         bool, typer.Option("--list", help="Print the IDs, titles and clauses of the cases, and exit.")
     ] = False,
 ) -> None:
-    """Test a node against CiA 301: 127 cases in raw frames, one line each.
+    """Test a node against CiA 301 with raw frames: 127 cases, one line each.
 
     It RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
     parameters. It reads the configuration first and restores every change at the end. It sends commands to
     all nodes and frames that appear to come from other nodes: use a bus without another master, preferably
     without any other node, on a machine that may safely stop.
 
-    Exit status 0 if no case failed, 1 if one did, 2 if it could not run.
+    Exit status 0 if no case failed, 1 if one did, 2 if the tests could not run.
     """
     from skinnode.cli._bus import find_bus
     from skinnode.conformance import connect, run_cases, select

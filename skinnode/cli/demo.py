@@ -22,7 +22,9 @@ def demo(
         int,
         typer.Option(min=1, max=MAX_PATCHES, help="Number of patches of 10 × 10 electrodes.", metavar="N"),
     ] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of scene and converter noise.", metavar="N")] = 1,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the scene and the converter noise.", metavar="N")
+    ] = 1,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write all figures to this file.", metavar="FILE")
     ] = None,

@@ -36,9 +36,9 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    It only listens and reads, so it does not disturb a running hand. It judges the skin from scans; a hand
-    that is not running sends scans only with --active. Do not touch the skin while the command runs.
-    Exit status 0 if no fault was found, 1 if one was found, 2 if it could not run.
+    The doctor only listens and reads, so a running hand is not disturbed. The skin is judged from scans,
+    which a hand that is not running sends only with --active. Do not touch the skin during the examination.
+    Exit status 0 if no fault was found, 1 if one was found, 2 if the examination could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -28,10 +28,10 @@ def check(
 ) -> None:
     """Validate a hand file and the files it names, and compute the load of its buses.
 
-    For each bus the command prints the planned load, with every frame at its maximum length and with random
-    data; the worst-case time from SYNC to the end of each patch's summary, also as a fraction of the SYNC
-    period; and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if a bus needs
-    more than its max_load, 2 if the file cannot be used.
+    For each bus the command prints the planned load, once with every frame at its maximum length and once
+    with random data; the worst-case time from SYNC to the end of each patch's summary, also as a fraction of
+    the SYNC period; and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if a bus
+    needs more than its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand

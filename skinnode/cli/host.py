@@ -55,7 +55,7 @@ def host(
 
 
 def _run(plan: HandConfig, seconds: float | None, report: Report, stop: threading.Event) -> int:
-    """Run the hand until stopped or time is up, and return the exit status.
+    """Run the hand until the host is stopped or time is up, and return the exit status.
 
     The host logs each frame whose content does not match its identifier; Python prints the log on stderr.
     """

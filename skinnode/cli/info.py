@@ -29,7 +29,7 @@ def info(
     """Print identity, layout, baseline, errors, PDOs, wires and configuration of one node.
 
     The command only reads. Exit status 0 if the node reports no fault, 1 if it has an error, faulty wires or
-    no baseline; 2 if it does not answer.
+    no baseline; 2 if the node does not answer.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress

@@ -58,9 +58,9 @@ def monitor(
     """Show a hand on the terminal: height and shear, touches, health, rates, load, events.
 
     The command runs the hand as `skinnode host` does, but waits for missing patches. Keys: 1-9 select a
-    patch, z shows it alone, t tares it, r records, space freezes the picture, ? shows help, q quits. It needs
-    the extra `tui`. Exit status 0 if there was no fault, 1 if there was one (printed at the end), 2 if it
-    could not run.
+    patch, z shows it alone, t tares it, r records, space freezes the picture, ? shows help, q quits. The
+    screen needs the extra `tui`. Exit status 0 if there was no fault, 1 if there was one (printed at the
+    end), 2 if the monitor could not run.
     """
     from skinnode.errors import NOTHING, ConfigError, Shown
 

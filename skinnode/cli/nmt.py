@@ -43,7 +43,7 @@ def nmt(
 
     `all` means every node on the bus, or on every bus of --hand.
 
-    Exit status 0 if every node obeyed, 1 if one did not, 2 if it could not run.
+    Exit status 0 if every node obeyed, 1 if one did not, 2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses, find_node
     from skinnode.cli._console import console, print_json, progress, table

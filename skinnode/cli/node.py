@@ -57,7 +57,8 @@ def node(
         ),
     ] = None,
     strict_timing: Annotated[
-        bool, typer.Option("--strict-timing", help="Keep time to within 0.2 ms, not 2 ms; needs more CPU.")
+        bool,
+        typer.Option("--strict-timing", help="Keep time to within 0.2 ms, not 2 ms; uses more CPU time."),
     ] = False,
     seconds: Seconds = None,
     as_json: JsonLines = False,
@@ -67,7 +68,7 @@ def node(
     A source is a class or function that takes the layout and returns an object whose read(t_ns) returns (U,
     K) ohms. `--source simulated` needs no hardware. The command reports every second until Ctrl-C. Exit
     status 1 if the source failed, scans were skipped, frames were not sent, another node used its node-ID or
-    the --store file could not be used; 2 if it could not run.
+    the --store file could not be used; 2 if the node could not run.
     """
     from skinnode.canopen.lss import NOT_CONFIGURED
     from skinnode.cli._layout_option import find_layout, import_from_here
@@ -161,7 +162,7 @@ def _node_text(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Progress of the node; all counts are since its start."""
+    """Progress of the node; its counts start at 0 when it starts."""
 
     elapsed_s: float
     node_id: int | None
@@ -218,7 +219,7 @@ def _faults(end: _Progress) -> list[str]:
 def _watch(
     runner: NodeRunner, port: CanPort, stop: threading.Event, seconds: float | None, as_json: bool
 ) -> None:
-    """Print a line every second until stopped, time is up, or the node's thread has ended."""
+    """Print a line every second until the command is stopped, time is up, or the node's thread has ended."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     before, due_s = replace(_progress(runner, port, 0.0), scans=0, frames=0), start_s + 1.0

@@ -55,8 +55,8 @@ def od(
 ) -> None:
     """Read or write objects of a node. Indices are hexadecimal, with or without 0x.
 
-    Without INDEX it dumps the whole dictionary. Exit status 0 on success, 1 if --diff found differences,
-    2 if the node did not answer or refused the request.
+    Without INDEX the command dumps the whole dictionary. Exit status 0 if done, 1 if --diff found
+    differences, 2 if the node did not answer or refused.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress
@@ -158,7 +158,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
     """Return the data sheet of the node.
 
     The sheet has no entries for a third-party device without an EDS, or for a node that refuses to identify
-    itself; its objects are then named by CiA 301.
+    itself; the objects then have only their CiA 301 names.
     """
     from skinnode.conformance.eds_reader import Eds
     from skinnode.diagnose.data_sheet import DataSheet, data_sheet_of
@@ -176,7 +176,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. If there is only one, a refusal raises SdoAbort; otherwise it is listed."""
+    """Read the objects. A refusal raises SdoAbort for a single object, and is listed otherwise."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

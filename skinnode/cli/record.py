@@ -35,7 +35,9 @@ def record(
     kind: Annotated[
         Literal["log", "blf"],
         typer.Option(
-            "--format", help="File format in a folder: candump's text or Vector's BLF.", metavar="log|blf"
+            "--format",
+            help="Format of a file in a folder: candump's text or Vector's BLF.",
+            metavar="log|blf",
         ),
     ] = "log",
     listen: Annotated[
@@ -52,7 +54,7 @@ def record(
     Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command
     is killed, the recording can be read up to the last second. A recording made with --listen has no
     baselines and thus no fields; it is for use with can-utils. Exit status 1 if frames could not be written,
-    or for any fault that `skinnode host` reports; 2 if it could not run.
+    or for any fault that `skinnode host` reports; 2 if the hand could not be run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
@@ -121,7 +123,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line every second until stopped or time is up; ``check`` raises to end it early."""
+    """Print a line every second until stopped or until time is up; ``check`` may raise to end this early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 def replay(
     recording: Annotated[
         Path,
-        typer.Argument(help="The .log or .blf file; its .jsonl is in the same folder.", metavar="RECORDING"),
+        typer.Argument(
+            help="The .log or .blf file; its .jsonl must be in the same folder.", metavar="RECORDING"
+        ),
     ],
     speed: Annotated[float, typer.Option(help="1: as recorded; 2: twice as fast.", metavar="X")] = 1.0,
     fast: Annotated[bool, typer.Option("--fast", help="Play as fast as scans can be solved.")] = False,
@@ -27,7 +29,7 @@ def replay(
         ),
     ] = False,
 ) -> None:
-    """Decode and solve a recording made by `skinnode record`, with bit-identical results to the live run.
+    """Decode and solve a recording made by `skinnode record`; results are bit-identical to the live run's.
 
     With --json each field has `contacts` (null unless solver.method is "posterior"): centroid, area, normal
     and shear force with standard deviations, in m, m² and N.

@@ -1,4 +1,4 @@
-"""``skinnode tare [PATCH…]``: makes the present resistances of patches their baseline."""
+"""``skinnode tare [PATCH…]``: makes the current resistances of patches their baseline."""
 
 from __future__ import annotations
 
@@ -33,14 +33,12 @@ def tare(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Make the present resistances the baseline R0 of patches.
-
-    Do not touch the skin while the command runs.
+    """Make the current resistances of patches their baseline R0. Do not touch the skin during the tare.
 
     Taring works by SDO, with or without a host on the bus: a running host reads the new baselines and
     continues. A patch loses its baseline at power-off unless it is stored (0x1010). A patch whose baseline
     comes from a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if one was not,
-    2 if it could not run.
+    2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses, node_among
     from skinnode.cli._console import print_json, progress
@@ -75,7 +73,7 @@ def tare(
 
 
 def _tare_on(place: Place, node_ids: list[int], tell: Callable[[str], None]) -> list[Tared]:
-    """Tare nodes on one bus. Opens the bus only if at least one node may be tared."""
+    """Tare nodes on one bus. The bus is opened only if at least one node may be tared."""
     from skinnode.diagnose.bus_connection import BusConnection
     from skinnode.diagnose.tare import Tared, refusal, tare
 

@@ -22,7 +22,7 @@ LONGEST_HEARTBEAT_S: Final = 2.5
 """Maximum wait for a heartbeat; nodes with a longer period are not detected by their heartbeats."""
 
 GUARD_ANSWERS_S: Final = (0.15, 0.5)
-"""Maximum waits for the answer to a first and a second remote frame; a node may be busy the first time."""
+"""Maximum waits for the responses to a first and a second remote frame; a node may be busy the first time."""
 
 _POLL_S: Final = 0.002
 
@@ -40,7 +40,7 @@ class State(NamedTuple):
 
 
 def no_answer(wrong: str) -> str:
-    """Describe a node without a valid SDO answer; ``wrong`` is its newest invalid answer, or empty."""
+    """Describe a node without a valid SDO response; ``wrong`` is its newest invalid response, or empty."""
     if not wrong:
         return "does not answer SDO requests"
     return f"answers SDO requests with data that is not a CiA 301 answer (newest: {wrong})"
@@ -105,7 +105,7 @@ class BusConnection:
         return True
 
     def ask_all(self, node_id: int, request: bytes, within_s: float) -> list[bytes]:
-        """Send one SDO request and return all answers: two if two nodes have the node-ID."""
+        """Send one SDO request and return all responses: two if two nodes share the node-ID."""
         since_ns = time.monotonic_ns()
         self.link.send(od.sdo_request_cob_id(node_id), request.ljust(8, b"\0"))
         self.wait_until(lambda: False, within_s)
@@ -120,17 +120,17 @@ class BusConnection:
             more: Returns text to append to the error message.
 
         Raises:
-            NodeError: There is no valid answer.
+            NodeError: The node sends no valid response.
         """
         remote, since_ns = self.od(node_id), time.monotonic_ns()
         if not remote.answers() and not remote.answers():
             raise NodeError(node_id, no_answer(self.wrong_answer(node_id, since_ns)) + more())
 
     def wrong_answer(self, node_id: int, since_ns: int) -> str:
-        """Return the newest frame received instead of a valid SDO answer.
+        """Return the newest frame received instead of a valid SDO response.
 
         Args:
-            node_id: A node without a valid answer.
+            node_id: A node that sent no valid response.
             since_ns: Earliest reception time of the frame.
 
         Returns:

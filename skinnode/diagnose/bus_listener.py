@@ -1,6 +1,6 @@
-"""Records the messages received on a bus: heartbeats, emergencies, SDO answers, COB-IDs in use.
+"""Records the messages received on a bus: heartbeats, emergencies, SDO responses, COB-IDs in use.
 
-One thread writes the record; other threads read copies of it, because there are no locks.
+One thread writes the record; other threads read copies, because the record has no lock.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from skinnode.canopen.nmt import STATE_MASK, NmtState
 from skinnode.transport import Frame
 
 _KEPT: Final = 256
-"""Number of messages kept per kind and node: over half a minute of heartbeats at 4 Hz."""
+"""Number of messages kept per kind and node: at 4 Hz, more than half a minute of heartbeats."""
 
 
 class Beat(NamedTuple):
-    """A boot-up message, a heartbeat or an answer to node guarding (CiA 301, 7.2.8.3)."""
+    """A boot-up message, a heartbeat or a node-guarding response (CiA 301, 7.2.8.3)."""
 
     t_ns: int
     state: int
@@ -43,9 +43,9 @@ class NodeTraffic:
     boot_ups: int = 0
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=_KEPT))
     sdo_answers: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """Time and the eight data bytes of each answer."""
+    """Time and the eight data bytes of each SDO response."""
     newest_sdo: tuple[int, bytes] | None = None
-    """Time and data of the newest frame on the COB-ID of SDO answers, whatever its length."""
+    """Time and data of the newest frame on the COB-ID for SDO responses, whatever its length."""
 
 
 class BusListener:
@@ -71,7 +71,7 @@ class BusListener:
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
-        """Return the newest heartbeat or guarding answer after ``since_ns``; None if there is none."""
+        """Return the newest heartbeat or guarding response after ``since_ns``; None if there is none."""
         beats = self.node(node_id).beats
         newest = beats[-1] if beats else None
         return newest if newest is not None and newest.t_ns > since_ns else None

@@ -41,7 +41,8 @@ DEFAULT_NOISE: Final = 3e-6
 """Relative noise assumed for the converter if there is no hand file."""
 
 _PAUSES_S: Final = (0.0, 0.1, 0.3, 0.6)
-"""Pauses before attempts to read a node; a host reading a baseline keeps the node busy for 0.1 to 0.3 s."""
+"""Pauses before successive attempts to read a node; a host reading a baseline keeps the node busy for 0.1 to
+0.3 s."""
 
 _FIRST_SYNC_S: Final = 0.5
 _KNOWN_TO_ALL: Final = frozenset(
@@ -55,7 +56,7 @@ Answer = TypeVar("Answer")
 def collect_facts(
     bus: BusConfig, hand: HandConfig | None, *, active: bool = False, progress: Progress = lambda _: None
 ) -> BusFacts:
-    """Collect all facts about one bus; a bus failure is recorded as a fact and raises nothing.
+    """Collect all facts about one bus; a bus failure is recorded as a fact, not raised.
 
     Args:
         bus: The bus.
@@ -167,7 +168,7 @@ def _examine(
 
 
 def _asked(question: Callable[[], Answer]) -> tuple[Answer | None, str]:
-    """Try a read several times if necessary; return its result, or why it failed.
+    """Try to read, several times if necessary; return the result, or the reason for the failure.
 
     A running host may access the node at the same time, and a server handles one transfer at a time.
     """
@@ -233,7 +234,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
     """Return the shortest SYNC period, s, for a node that no host has configured; 0 for any other node.
 
-    At its default inhibit time, a node needs at least this period to finish each scan before the next.
+    With its default inhibit time, a node needs at least this period to finish each scan before the next SYNC.
     Bring-up sets an inhibit time that fits the hand's period.
     """
     profile = profiles.get(patch.node_id)
@@ -284,10 +285,11 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 
 
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
-    """Count frames, by COB-ID, that neither a service, a node nor ``others`` in the hand file explains.
+    """Count, by COB-ID, the frames that no service, node or entry of ``others`` in the hand file explains.
 
     COB-IDs in the pre-defined connection set of a node that was found are attributed to that node,
-    whatever the device. Those of a patch that does not answer are attributed to a host that polls the patch.
+    whatever the device. Frames with the COB-IDs of a patch that does not answer are attributed to a host that
+    polls the patch.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}

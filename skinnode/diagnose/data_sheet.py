@@ -1,7 +1,7 @@
 """The electronic data sheet of a node: generated for a patch, read from a file for another device.
 
-It uses the reader of the conformance suite, which preserves defaults as written; the canopen library does
-not. The host checks a patch's EDS with that library, as an independent reader.
+This module uses the conformance suite's EDS reader, which preserves defaults as written; the canopen library
+does not. The host checks a patch's EDS with that library, as an independent reader.
 """
 
 from __future__ import annotations

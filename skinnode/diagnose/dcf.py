@@ -93,7 +93,7 @@ def as_dcf(sheet: DataSheet, readings: Sequence[Reading], node_id: int, bitrate_
 
 
 def expected(sheet: DataSheet) -> Eds:
-    """Return the EDS with its defaults replaced by its DCF values; unchanged if the sheet has none."""
+    """Return the EDS with its defaults replaced by DCF values; unchanged if the sheet has no DCF values."""
     parser = _parser(_BYTES_LINE.sub(r"\1", sheet.text))
     entries = dict(sheet.eds.entries)
     for section in parser.sections():
@@ -125,7 +125,7 @@ def _is_configuration(reading: Reading) -> bool:
 
 
 def _standard_form(reading: Reading, data: bytes) -> str | None:
-    """Return the value in the notation of CiA 306; None if no notation preserves its bytes.
+    """Return the value in CiA 306 notation; None if no such notation preserves its bytes.
 
     Numbers are hexadecimal and reals are bit patterns, as conforming tools expect.
     """

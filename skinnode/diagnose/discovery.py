@@ -21,10 +21,11 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests; it limits their load to a sixth of a 1 Mbit/s bus, so PDOs are not delayed."""
+"""Interval between requests, which limits their load to a sixth of a 1 Mbit/s bus, so PDOs are not
+delayed."""
 
 ANSWER_S: Final = 0.12
-"""Wait time for answers after the last request of a sweep."""
+"""Time to wait for responses after the last request of a sweep."""
 
 SWEEPS: Final = 2
 """Number of sweeps; a busy node gets a second request."""
@@ -33,7 +34,7 @@ LISTEN_S: Final = 1.2
 """Minimum listening time; stopped nodes send nothing but heartbeats."""
 
 LSS_S: Final = 1.5
-"""Maximum time to search for nodes without a node-ID; any others are reported as "more"."""
+"""Maximum time to search for nodes without a node-ID; nodes not found in this time are reported as "more"."""
 
 OTHERS_S: Final = 1.0
 """Maximum wait for other SDO clients to finish."""
@@ -68,9 +69,9 @@ class FoundNode:
     boot_ups: int
     """Boot-up messages received during the search."""
     duplicate: str
-    """Evidence for two nodes with this node-ID; empty if there is none."""
+    """Evidence that two nodes have this node-ID; empty if there is none."""
     wrong_answer: str = ""
-    """Newest frame on the COB-ID of SDO answers, as hexadecimal text, if no answer was valid."""
+    """Newest frame on the COB-ID for SDO responses, as hexadecimal text, if no response was valid."""
 
     @property
     def profile(self) -> str:
@@ -143,7 +144,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 def _let_others_finish(connection: BusConnection) -> None:
     """Wait until other clients' SDO transfers have ended, because a request would abort them.
 
-    A host transfers data during bring-up, but not while it runs.
+    A host makes SDO transfers during bring-up, but normally not afterwards.
     """
     end_s = time.monotonic() + OTHERS_S
     while time.monotonic() < end_s:
@@ -159,7 +160,7 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Return the nodes without a node-ID, and whether there are more that were not found in time.
+    """Return the nodes without a node-ID, and whether more exist that were not found in time.
 
     The nodes return to LSS waiting mode.
     """
@@ -179,7 +180,7 @@ def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...]
 
 
 def _sweep(connection: BusConnection) -> dict[int, int]:
-    """Return the node-IDs that answer, each with its number of answers to one request."""
+    """Return the node-IDs that respond, each with its number of responses to one request."""
     answers: dict[int, int] = {}
     for _ in range(SWEEPS):
         asked_ns = time.monotonic_ns()
@@ -226,7 +227,7 @@ def _examine(connection: BusConnection, node_id: int, answers: int) -> FoundNode
 
 
 def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> FoundNode | None:
-    """Return a node that sends heartbeats but no valid SDO answer; None if it sends no heartbeats."""
+    """Return a node that sends heartbeats but no valid SDO response; None if it sends no heartbeats."""
     beat = connection.listener.newest_beat(node_id)
     if beat is None:
         return None
@@ -248,7 +249,7 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 
 
 def _two_serials(connection: BusConnection, node_id: int) -> str:
-    """Return evidence for two nodes; empty if the second answer belonged to an earlier request."""
+    """Return evidence of two nodes; empty if the second response belonged to an earlier request."""
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
     if len(answers) < 2:

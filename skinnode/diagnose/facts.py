@@ -26,7 +26,7 @@ class Sure(StrEnum):
     CERTAIN = "certain"
     """A node or a counter reports the fault."""
     LIKELY = "likely"
-    """The figures can hardly have another cause."""
+    """The figures can hardly have any other cause."""
     POSSIBLE = "possible"
     """The condition may be intended; a person must decide."""
 
@@ -114,7 +114,7 @@ class BusFacts:
     """Listening time."""
     frames: int = 0
     load: float = 0.0
-    """Bus load as a fraction, in the busiest second of scans or, without scans, in the last second."""
+    """Bus load as a fraction: in the busiest second of the capture or, without scans, in the last second."""
     error_frames: int = 0
     dropped: int = 0
     outages: int = 0

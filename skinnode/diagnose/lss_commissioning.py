@@ -76,7 +76,7 @@ def commission(
         connection: The bus.
         address: The node.
         wanted: Values to set.
-        agreed: Called with the present node-ID before anything is written; if it returns False, nothing is
+        agreed: Called with the current node-ID before anything is written; if it returns False, nothing is
             written.
 
     Returns:

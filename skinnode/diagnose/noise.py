@@ -1,11 +1,12 @@
-"""Estimates the noise of each crossing and wire, even while the skin is touched. Pure functions.
+"""Estimates the noise at each crossing and on each wire, even while the skin is touched. Pure functions.
 
 There are two estimates. Second differences of successive scans (variance 6 σ²) are insensitive to slow
-touches. The residual of a crossing after projection on the other wires is insensitive to quick touches: a
-touch moves the crossings of many wires by a few functions of time, whereas the noise of each crossing is
-independent. Both are upper bounds of the noise, so the smaller value counts. A quick, deep and small touch
-affects both. On touched skin a wire is therefore judged by comparing its smallest singular values, which a
-touch hardly affects, with those of its neighbours; the patch is judged by its own.
+touches. The part of a crossing's signal that the other wires do not explain is insensitive to quick touches:
+the effects of a touch on the crossings of many wires are combinations of a few functions of time, whereas the
+noise of each crossing is independent. Both are upper bounds on the noise, so the smaller value is used. A
+quick, deep and small touch affects both estimates. On touched skin a wire is therefore judged by comparing
+its smallest singular values, which a touch hardly affects, with those of its neighbours; the patch is judged
+by its own.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from skinnode.diagnose.facts import Counts, ScanFacts
 from skinnode.model.layout import Float
 
 LEAST_SCANS: Final = 20
-"""Minimum number of scans; with fewer, the standard deviation is in error by more than a quarter."""
+"""Minimum number of scans; with fewer, the estimated standard deviation is off by more than 25 %."""
 
 _MOST_SCANS: Final = 64
-"""Maximum number of scans used, the newest; computing time grows with its square."""
+"""Maximum number of scans used (the newest); computing time grows with the square of this number."""
 
 _FLOOR: Final = 8
-"""Number of singular values that form the floor of a patch; they give the noise level to within a fifth."""
+"""Number of singular values that form the floor of a patch; they give the noise level to within 20 %."""
 
 _MOVED: Final = 6.0
 """Minimum motion of a touched crossing, in units of the stated noise."""
@@ -73,7 +74,7 @@ class NoiseAnalysis:
     floor: float
     """Noise of all crossings together, as for ``upper``."""
     supply: float
-    """Noise common to all crossings divided by the stated noise; 0 if the crossings differ."""
+    """Noise common to all crossings divided by the stated noise; 0 if the rest of the noise is not small."""
 
     @property
     def is_touched(self) -> bool:
@@ -122,7 +123,7 @@ def _unexplained(moved: Float) -> Float:
     """Return the (U, K) standard deviations of the motion that the other wires do not explain.
 
     The leading half of the temporal components of all other upper wires is projected out, then likewise for
-    all other lower wires; the larger residual counts. ``moved`` has mean 0.
+    all other lower wires; the larger residual is used. ``moved`` has mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -140,7 +141,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Return, for each wire of the first axis, the smaller of floor and median crossing; 0 if unknown."""
+    """Return the smaller of floor and median noise for each wire of the first axis; 0 if unknown."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():
@@ -150,7 +151,7 @@ def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
 
 
 def _floor(moved: Float, values: int) -> float:
-    """Return the norm of the smallest singular values of (T, n) data, divided by that of unit noise."""
+    """Return the norm of the smallest singular values of (T, n) data, relative to that of unit noise."""
     return _smallest(moved, values) / _of_noise(moved.shape, values) if moved.shape[1] else 0.0
 
 

@@ -1,6 +1,6 @@
-"""Reads, writes, dumps and compares a node's object dictionary, using names and types of its EDS (CiA 306).
+"""Reads, writes, dumps and compares a node's object dictionary, with names and types from its EDS (CiA 306).
 
-Objects without an EDS are named by CiA 301 (``standard_objects``).
+Without an EDS, objects have their CiA 301 names (``standard_objects``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _BOOLEAN, _TEXT = 0x01, 0x09
 _REALS: Final = {0x08: "<f", 0x11: "<d"}
 _STRINGS: Final = ("VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN")
 NOT_CONFIGURATION: Final = (od.ERROR_REGISTER, od.ERROR_FIELD, od.STORE, od.RESTORE)
-"""Objects that hold the state of a node, even if its EDS gives a default."""
+"""Objects that hold the state of a node rather than its configuration, even if its EDS gives a default."""
 _LONGEST_SHOWN: Final = 16
 _ADDRESS: Final = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})(?::(0[xX][0-9A-Fa-f]{1,2}|[0-9]{1,3}))?")
 
@@ -160,7 +160,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """Read a value; an abort also returns a reading. Raises NodeError if the node does not answer."""
+    """Read a value; an abort is returned as a reading too. Raises NodeError if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -291,7 +291,7 @@ def _same(entry: EdsEntry, data: bytes, wanted: bytes) -> bool:
 def _distinct(got: Reading, expected: Reading) -> tuple[str, str]:
     """Return two different values as texts that differ.
 
-    If the plain texts are equal, the bytes from the first difference follow.
+    If the plain texts are equal, the bytes from the first difference onwards are appended.
     """
     if got.data is None or expected.data is None or got.text != expected.text:
         return got.text, expected.text

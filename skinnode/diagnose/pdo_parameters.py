@@ -92,7 +92,7 @@ def _optional(remote: RemoteOd, index: int, subindex: int, kind: str) -> int | N
 
 
 def kind_text(pdo: Pdo) -> str:
-    """Return in words when a TPDO is sent, or when the data of an RPDO is used."""
+    """Describe in words when a TPDO is sent, or when the data of an RPDO is used."""
     if 1 <= pdo.kind <= 240:
         every = "every SYNC" if pdo.kind == 1 else f"every {pdo.kind} SYNCs"
         return every if pdo.direction == "TPDO" or pdo.kind == 1 else "at the next SYNC"

@@ -1,7 +1,7 @@
 """Groups findings by root cause: a finding that follows from another is listed below it.
 
-One overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All these findings
-are true, but none of them is the fault that must be repaired. A rule names a cause and its possible
+For example, an overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All
+these findings are true, but none of them is the fault to be repaired. A rule names a cause and its possible
 consequences, at the same patch or at every patch of a bus. If the text of a finding is ambiguous, its
 evidence decides: emergencies follow from an overload only if each of their texts reports an overrun.
 """
@@ -149,7 +149,7 @@ RULES: Final = (
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
     """Return all findings of these buses, grouped by root cause.
 
-    Groups are sorted by their most certain finding, then by their number of consequences.
+    Groups are sorted by the certainty of their most certain finding, then by their number of consequences.
     """
     groups = [group for facts in buses for group in _of_bus(facts.name, run_checks(facts))]
     return sorted(groups, key=lambda group: (group.rank, -len(group.consequences)))

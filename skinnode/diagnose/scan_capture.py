@@ -20,7 +20,7 @@ from skinnode.transport import Frame
 _MOST_SCANS: Final = 1000
 _MOST_SYNCS: Final = 100_000
 _LONGEST_NS: Final = 10_000_000_000
-"""Maximum time, ns, from a SYNC to the scan that it triggered."""
+"""Maximum time, ns, from a SYNC to the first frame of its scan."""
 
 
 class ScanCapture:
@@ -36,7 +36,7 @@ class ScanCapture:
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 
     def add(self, node_id: int, profile: PatchProfile, overflow: int, period_s: float) -> None:
-        """Assemble the scans of a patch from now on.
+        """Start to assemble the scans of a patch.
 
         Args:
             node_id: The node.
@@ -109,7 +109,7 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of a scan's SYNC: the latest with its counter or none, before its first frame."""
+        """Return the time of the latest SYNC before the scan with the scan's counter or without a counter."""
         for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None

@@ -92,7 +92,7 @@ SERIES: Final = tuple(indices for indices, _ in _MANY)
 
 
 def standard_entry(index: int, subindex: int) -> EdsEntry | None:
-    """Return the entry as CiA 301 defines it; None if it defines no such object or sub-index."""
+    """Return the entry as CiA 301 defines it; None if CiA 301 has no such object or sub-index."""
     item = _find(index)
     if item is None:
         return None

@@ -1,7 +1,7 @@
 """Tares patches by SDO, even while a host runs on the bus.
 
-The node responds to the write to 0x2021:4 after it has measured, so the response is the confirmation. The
-summary of its next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
+The node responds to the write to 0x2021:4 only after the measurement, so the response confirms the tare. The
+summary of the next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
 server handles one transfer at a time, so a request from here would abort the host's upload. The baseline is
 therefore read back only when the node's SDO channel is quiet.
 """
@@ -27,7 +27,7 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Silence on a node's SDO channel that shows that no other client has a transfer under way."""
+"""Duration of silence on a node's SDO channel after which no other client has a transfer under way."""
 
 HOST_BEGINS_S: Final = 1.0
 """Maximum time, in addition to a SYNC period, from the tare to the host's first SDO request; an idle host

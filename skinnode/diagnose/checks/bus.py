@@ -20,7 +20,7 @@ half of the counters; lost SYNCs break it at a few."""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
-"""Minimum heartbeat period as a fraction of the configured period; two senders halve it."""
+"""Minimum heartbeat period as a fraction of the configured period; a second sender halves the period."""
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Checks of the skin from captured scans: wires, noise, frozen values, jumps, baseline.
+"""Checks of the skin, made on captured scans: wires, noise, frozen values, jumps, baseline.
 
 Touched skin is not a defect: a finding that a touch can explain is not reported.
 """
@@ -17,11 +17,11 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum noise of a noisy crossing, in units of the stated noise; not reached by chance in 20 scans."""
+"""Minimum ratio of a noisy crossing's noise to the stated noise; 20 scans do not reach it by chance."""
 
 _DRIFT: Final = 0.003
-"""Minimum |R/R0 − 1| at rest that justifies a tare: 100 times the noise of a good converter, 1 % of a
-press."""
+"""Minimum |R/R0 − 1| at rest that justifies a tare: 100 times the noise of a good converter, or
+1 % of the effect of a press."""
 
 _MANY: Final = 0.8
 _FEW: Final = 0.1
@@ -106,7 +106,7 @@ def _check_crossings(
 
 
 def check_noise(bus: BusFacts) -> Iterator[Finding]:
-    """Check for more noise than the hand file states, for jumps, and for values that do not change."""
+    """Check for noise above the stated level, for jumps, and for values that do not change."""
     for patch, scans, analysis in _judged(bus):
         yield from _check_frozen(patch, scans)
         yield from _check_noise(patch, scans, analysis)
@@ -198,7 +198,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether all codes are constant, but the stated noise is too small for that to prove a defect."""
+    """Return whether all codes are constant, which proves no defect because the stated noise is too small."""
     known, still = _still(scans)
     return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
 
@@ -209,13 +209,13 @@ def _shows(scans: ScanFacts) -> bool:
 
 
 def _still(scans: ScanFacts) -> tuple[Mask, Mask]:
-    """Return masks of the crossings measured in every scan, and of those among them that never changed."""
+    """Return two masks: crossings measured in every scan, and those among them that never changed."""
     known = np.asarray(np.isfinite(scans.ratio).all(axis=0))
     return known, known & (np.ptp(np.where(known, scans.ratio, 0.0), axis=0) == 0.0)
 
 
 def check_baseline(bus: BusFacts) -> Iterator[Finding]:
-    """Check for a baseline that is missing or no longer matches the skin at rest."""
+    """Check whether the baseline is missing or no longer matches the skin at rest."""
     for patch in bus.patches:
         own = patch.info.patch if patch.info is not None else None
         if own is not None and own.baseline_missing:

@@ -91,7 +91,7 @@ def _check_sync(bus: BusFacts) -> Iterator[Finding]:
 
 
 def check_losses(bus: BusFacts) -> Iterator[Finding]:
-    """Check for lost frames, and where they were lost: in this machine, on the bus or at the node."""
+    """Check for lost frames, and locate the loss: in this machine, on the bus or at the node."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("losses", where, what, sure, evidence, advice)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vcan_sim.fleet import Fleet, NodeReport
 
 _WARN_AGAIN_S = 10.0
-"""Seconds before the warning about a busy machine is repeated."""
+"""Minimum time between warnings about a busy machine, s."""
 
 app = typer.Typer(
     pretty_exceptions_enable=False,
@@ -42,7 +42,7 @@ def simulate(
         ),
     ] = None,
 ) -> None:
-    """Simulate the patches of a hand as CANopen nodes on a bus, with a sphere pressing and sliding over each.
+    """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
 
     Bring them up by running `skinnode host` with the same file in another terminal.
     """

@@ -60,7 +60,7 @@ class Faults:
     """
 
     seed: int = 1
-    """Seed of the draws; the same seed and the same frames give the same faults."""
+    """Seed of the random draws; the same seed and the same frames give the same faults."""
 
     # --- fractions of the chunks
     lost: float = 0.0
@@ -71,7 +71,7 @@ class Faults:
     late: float = 0.0
     """The chunk arrives after the first frame of the next scan."""
     short: float = 0.0
-    """The chunk lacks one byte."""
+    """The chunk is one byte too short."""
     remote: float = 0.0
     """A remote frame is sent instead of the chunk."""
     miscounted: float = 0.0
@@ -91,8 +91,8 @@ class Faults:
     """A chunk has the counter of the next scan, whose own chunk with that index is lost."""
     understated: float = 0.0
     """A chunk is lost; the summary claims that only changed chunks were sent, and counts one chunk fewer. Its
-    check, if any, is correct for that summary. A scan that really sends only changed chunks just loses the
-    chunk."""
+    check, if any, is correct for that summary. A scan in which the node really sends only changed chunks just
+    loses the chunk."""
     unchecked: float = 0.0
     """The summary carries no check, as in revision 1.0."""
     struck: int | None = None
@@ -122,7 +122,7 @@ class Faults:
     command_lost: float = 0.0
     """The node does not receive a command PDO, such as a tare."""
 
-    # --- active as long as they are set
+    # --- active while they are set
     silent: bool = False
     """No frame from the node arrives."""
     deaf: bool = False
@@ -130,7 +130,7 @@ class Faults:
     frozen: bool = False
     """The converter keeps returning the same values."""
     unplugged: bool = False
-    """The node is disconnected from bus and supply; it boots when the fault ends."""
+    """The node is disconnected from the bus and its supply; it boots when the fault ends."""
     wrong_identity: bool = False
     """The node reports a different product code."""
     wrong_layout: bool = False
@@ -215,7 +215,7 @@ class Injected:
     restarts: int = 0
     """Resets caused by ``restart_every_s``."""
     impostures: int = 0
-    """Falsified answers about identity or layout."""
+    """Falsified responses about identity or layout."""
     emergencies: int = 0
     babbled: int = 0
     scans_spoilt: int = 0

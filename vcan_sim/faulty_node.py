@@ -1,7 +1,7 @@
 """A real node with faults. Every frame between the node and its bus passes through this module.
 
 Reading faults are in :mod:`vcan_sim.sensor`, scan faults in :mod:`vcan_sim.faulty_scans`. Faults depend on a
-seed and the order of the frames, not on the clock, except for events at a rate.
+seed and the order of the frames, not on the clock, except for periodic events.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from vcan_sim.tally import Kind, Tally, kind_of
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
 """Pacing of a simulated node. The node may stall for half a SYNC period of the reference hand and still
-finish its scan in time, because the load of the host machine is not simulated. Four nodes then send bursts of
-up to 270 frames, which fit the default receive buffer of a socket."""
+finish its scan in time, so that load on the machine that runs the simulation does not appear as a fault of
+the node. Four nodes then send bursts of up to 270 frames, which fit the default receive buffer of a
+socket."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
@@ -39,7 +40,7 @@ class Emit(Protocol):
     """Puts a frame on the bus, like :meth:`skinnode.transport.CanPort.send`."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Put a frame on the bus. Raises BusError if the bus refuses it."""
+        """Put a frame on the bus. Raises BusError if the bus refuses the frame."""
 
 
 class FaultyNode(PatchNode):
@@ -135,13 +136,13 @@ class FaultyNode(PatchNode):
         self._reset_if_due(t_ns)
 
     def _concerns(self, kind: Kind, can_id: int) -> bool:
-        """Return whether the frame is meant for the node; a request to a neighbour does not count as lost."""
+        """Return whether the frame is addressed to the node; requests to other nodes do not count as lost."""
         if kind is Kind.SDO_REQUEST:
             return can_id == od.sdo_request_cob_id(self.node_id)
         return kind is not Kind.COMMAND or can_id == od.command_cob_id(self.node_id)
 
     def on_timer(self, t_ns: int) -> None:
-        """Do everything due at ``t_ns``: the node's own work and the events at a rate."""
+        """Do everything due at ``t_ns``: the node's own work and the periodic events."""
         if self.faults.unplugged != self._unplugged:
             self._plug(t_ns)
         if self._unplugged:
@@ -182,7 +183,7 @@ class FaultyNode(PatchNode):
     def _reset_node(self, t_ns: int) -> None:
         super().on_frame(od.NMT_COB_ID, bytes([NmtCommand.RESET_NODE, self.node_id]), t_ns)
 
-    # --- events at a rate
+    # --- periodic events
 
     def _do_due_events(self, t_ns: int) -> None:
         for name, period_ns in _periods_ns(self.faults).items():
@@ -240,7 +241,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the answer to an upload, falsified if a fault requires a wrong identity or layout."""
+        """Return the response to an upload, falsified if a fault requires a wrong identity or layout."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -279,7 +280,7 @@ class FaultyNode(PatchNode):
 
 
 def _periods_ns(faults: Faults) -> dict[str, int]:
-    """Return the period of each event at a rate, in ns; 0 for never."""
+    """Return the period of each kind of periodic event, ns; 0 for never."""
     rates = {"emcy": faults.emcy_per_s, "babble": faults.babble_per_s}
     periods = {name: round(1e9 / rate) if rate else 0 for name, rate in rates.items()}
     return {"restart": round(faults.restart_every_s * 1e9), **periods}

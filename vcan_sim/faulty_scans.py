@@ -22,7 +22,7 @@ class Put(Protocol):
     """Puts a frame on the bus unless the node is cut off from it, and returns whether it was sent."""
 
     def __call__(self, can_id: int, data: bytes, *, remote: bool = False) -> bool:
-        """Put a frame on the bus. Raises BusError if the bus refuses it."""
+        """Put a frame on the bus. Raises BusError if the bus refuses the frame."""
 
 
 class FaultyScans:
@@ -67,7 +67,7 @@ class FaultyScans:
 
     @property
     def needs_next_scan(self) -> bool:
-        """Whether this scan's fault needs the next scan to follow in time."""
+        """Whether this scan's fault also involves the next scan, so that the next SYNC must not be lost."""
         return self._fate in ("torn", "displaced")
 
     def power_off(self) -> None:
@@ -234,8 +234,8 @@ class FaultyScans:
     def _send(self, can_id: int, data: bytes, *, spoilt: bool = False) -> bool:
         """Send a chunk or summary, and then the late chunks of earlier scans.
 
-        A receiver does not assign a ``spoilt`` frame to its scan, so late chunks stay queued after it.
-        Returns whether the frame was sent.
+        A receiver does not assign a ``spoilt`` frame to its scan, so late chunks stay queued after such a
+        frame. Returns whether the frame was sent.
         """
         if not self._put(can_id, data):
             return False

@@ -37,7 +37,7 @@ class NodeReport:
     scans_sent: int
     """Scans sent completely."""
     overruns: int
-    """Scans skipped because two earlier scans were still to be sent."""
+    """Scans skipped because two earlier scans were still waiting to be sent."""
     slow_overruns: int
     """Scans skipped because this machine was too busy."""
 
@@ -51,8 +51,8 @@ class Fleet:
 
     Args:
         hand: Buses, patches and scene.
-        interface: python-can interface that overrides the file's.
-        channel: Channel that overrides the file's.
+        interface: python-can interface that overrides the hand file's.
+        channel: Channel that overrides the hand file's.
         faults: Initial faults of every node; see also :meth:`inject`.
         wire_up: Returns the source that a patch's converter reads; default: the simulated patch itself.
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
@@ -207,7 +207,7 @@ class FaultyPort(CanPort):
         self.passed = Passed()
 
     def send(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """Send a frame. Raises BusError if the bus refuses it or the controller is bus-off."""
+        """Send a frame. Raises BusError if the bus refuses the frame or the controller is bus-off."""
         if self.off:
             raise BusError(f"{self.config.name}: bus-off, 0x{can_id:03X} not sent")
         super().send(can_id, data, remote=remote)

@@ -1,6 +1,6 @@
 """Deformation of the skin: a sphere presses, slides and lifts repeatedly, and the rubber follows.
 
-The displacement of the electrodes is the closed form of a sliding Hertz contact on a half-space
+The displacement of the electrodes is the closed-form solution for a sliding Hertz contact on a half-space
 (:class:`skinnode.model.elastic.HertzContact`), so the truth has no grid and does not depend on a solver's
 discretisation. A scene is a pure function of scene time: it can be evaluated at any time, in any order, and
 the same seed gives the same scene.
@@ -26,7 +26,7 @@ LEAD_S: Final = 0.8
 """Duration of rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Fractions of a cycle; the remainder is rest. In a 4 s cycle a press takes 1.4 s."""
+"""Fractions of a cycle; the skin is at rest for the remainder. In a 4 s cycle a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
 """Fraction of a slide in which the sphere accelerates; it decelerates in an equal fraction at the end."""
@@ -36,7 +36,7 @@ _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times are s since contact."""
+    """One press, slide and lift of a sphere. ``heading`` is a unit vector; times run from contact, s."""
 
     radius_m: float
     depth_m: float
@@ -138,8 +138,8 @@ class Scene:
     def _field_m(self) -> tuple[Float, Float]:
         """Corners of the rectangle to which the centre of the sphere is confined.
 
-        The rectangle lies one pitch inside the outermost electrodes, or shrinks to their middle on a smaller
-        patch.
+        The rectangle lies one pitch inside the outermost electrodes, or shrinks to their midpoint on a
+        smaller patch.
         """
         low, high = self._surface_m.min(axis=0), self._surface_m.max(axis=0)
         inset = np.minimum(self.layout.pitch_m, 0.5 * (high - low))

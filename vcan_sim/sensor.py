@@ -1,4 +1,4 @@
-"""Simulated resistances at a node's analogue port, with faults in the wires and the converter."""
+"""Simulated resistances at a node's analogue inputs, with faults in the wires and the converter."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ WIRE_NOISE: Final = 3e-3
 """Relative standard deviation of a resistance measured through a bad contact."""
 
 Fault = Callable[[Float, int], Float]
-"""Function from resistances (U, K) in ohm and the time in ns to the resistances that the converter sees
-instead; inf means an open pair of wires, 0 a shorted pair."""
+"""Function that takes the resistances (U, K) in ohm and the time in ns, and returns the resistances that the
+converter sees instead; inf means an open pair of wires, 0 a shorted pair."""
 
 
 class SimulatedPatch:

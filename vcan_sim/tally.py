@@ -1,4 +1,4 @@
-"""Counts of frames by kind, to compare what simulated nodes sent with what a host received."""
+"""Counts of frames by kind, for comparing the frames that simulated nodes sent with those a host received."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Tally:
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line per sum that does not agree. Call when the node is idle."""
+        """Return one line for each of these sums that does not hold. Call when the node is idle."""
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [

@@ -34,7 +34,7 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time without a new field, s, which shows that all scans of a SYNC are solved and no others have arrived."""
+"""Time without a new field, s, that counts as the gap between the scans of two SYNCs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ def play(hand: HandConfig, seconds: float, console: Console) -> Run:
                         _take(unscored.popleft(), watches, fleet, t_start_ns)
                     progress.update(host, elapsed_s, bits_before)
             bits, elapsed_s = _bits(host) - bits_before, (time.monotonic_ns() - t_start_ns) * 1e-9
-        while (frame := subscription.get(0.0)) is not None:  # fields still being solved when the host closed
+        while (frame := subscription.get(0.0)) is not None:  # solved while the host was closing
             unscored.append(frame)
         for frame in unscored:
             _take(frame, watches, fleet, t_start_ns)
@@ -279,7 +279,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the number of losses that the host counted: frames dropped by its queue, and missing chunks."""
+    """Return the number of losses counted by the host: frames dropped by its queue, and missing chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())

@@ -1,6 +1,6 @@
 """Simulated patches for commands that show a host at work.
 
-The patches run in a separate process. As with a real hand, they share no interpreter with the host, so the
+The patches run in a separate process. Like a real hand, they share no interpreter with the host, so the
 host's figures cover the host alone.
 """
 
@@ -53,7 +53,7 @@ def simulated(hand: HandConfig) -> Iterator[None]:
         try:
             complaint = ours.recv()
         except EOFError:
-            complaint = "the process that runs them ended at once"
+            complaint = "the process that runs them ended immediately"
         if complaint:
             raise SkinError(f"simulated patches: {complaint}")
         yield

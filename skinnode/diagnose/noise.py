@@ -6,7 +6,7 @@ the effects of a touch on the crossings of many wires are combinations of a few 
 noise of each crossing is independent. Both are upper bounds on the noise, so the smaller value is used. A
 quick, deep and small touch affects both estimates. On touched skin a wire is therefore judged by comparing
 its smallest singular values, which a touch hardly affects, with those of its neighbours; the patch is judged
-by its own.
+by its own singular values.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ class NoiseAnalysis:
     floor: float
     """Noise of all crossings together, as for ``upper``."""
     supply: float
-    """Noise common to all crossings divided by the stated noise; 0 if the rest of the noise is not small."""
+    """Noise common to all crossings divided by the stated noise; 0 unless each
+    crossing's own noise is much smaller."""
 
     @property
     def is_touched(self) -> bool:

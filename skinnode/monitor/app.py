@@ -1,4 +1,4 @@
-"""Full-screen application that shows the newest view several times per second and handles keys."""
+"""Full-screen application that shows the newest view several times a second and handles keys."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between pictures."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor to spend on drawing; slow pictures are drawn less often."""
+"""Maximum fraction of one processor's time spent on drawing; pictures that take longer are drawn less
+often."""
 SLOWEST_S: Final = 0.5
 
 _LOG_LINES: Final = 500
@@ -266,7 +267,7 @@ class MonitorApp(App[None]):
         )
 
     def _tare(self, names: list[str]) -> None:
-        """Tare on daemon threads, which do not delay the exit of the monitor."""
+        """Tare on daemon threads, which do not delay the monitor's exit."""
         self._say(f"{', '.join(names)}: tare requested")
 
         def tare(name: str) -> None:

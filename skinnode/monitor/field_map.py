@@ -1,8 +1,8 @@
 """Draws a displacement field as characters: depth as brightness, shear as arrows. Pure functions.
 
-The x axis, along the upper wires, points right; the y axis, across them, points up. Two pixels, one above the
-other, form a character, so a pixel is roughly square. Without colours, each character represents the mean of
-its two pixels; a denser character means deeper.
+The x axis, along the upper wires, points right; the y axis, across them, points up. Each character shows two
+pixels, one above the other, so a pixel is roughly square. Without colours, each character represents the mean
+of its two pixels; denser characters mean deeper skin.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _STEPS_M: Final = tuple(
 _LEAST_M: Final = 5e-5
 """Minimum full scale, m, so that noise does not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Time for which a deep press determines the scale, ns."""
+"""Duration for which a deep press continues to determine the scale, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,7 +255,7 @@ def _depth_line(above: Sequence[int], below: Sequence[int], arrows: dict[int, st
 
 
 def _grouped(cells: Sequence[tuple[str, Style]]) -> Line:
-    """Merge neighbours with the same style, because drawing time grows with the number of segments."""
+    """Merge neighbouring segments of the same style; drawing time grows with the number of segments."""
     return [
         Segment("".join(sign for sign, _ in run), style)
         for style, run in itertools.groupby(cells, key=lambda cell: cell[1])

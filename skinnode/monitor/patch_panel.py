@@ -17,13 +17,13 @@ from skinnode.monitor.theme import Paint, Theme, beside, centred, pad, spread
 from skinnode.monitor.view_model import PatchView
 
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
-"""Patch conditions in which the newest field is out of date."""
+"""Conditions of a patch whose newest field is out of date."""
 _AROUND: Final = 3
 """Lines of a tile besides its map."""
 _LEAST_OUTLINED: Final = (8, 5)
 """Minimum size of a box for a map with an outline, in characters and lines."""
 _LABEL: Final = 10
-"""Width of the names of figures, characters."""
+"""Width of the column of figure names, characters."""
 
 
 def tiles(patches: Sequence[PatchView], paint: Paint, width: int, height: int) -> list[Line]:

@@ -1,4 +1,4 @@
-"""Reports the faults of a session at its end, and the view as JSON for programs."""
+"""Reports the faults of a session when it ends, and the view as JSON for programs."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Missing or unreadable parts of a recording, as far as it has been replayed."""
+        """Missing or unreadable parts of a recording, in the part replayed so far."""
 
     def tare(self, patch: str) -> None:
         """Tare a patch, as :meth:`Host.tare` does."""

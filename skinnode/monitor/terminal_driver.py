@@ -1,4 +1,4 @@
-"""Terminal output that never blocks, even if the terminal stalls, as on a slow line, or disappears."""
+"""Terminal output that never blocks, even if the terminal disappears, or stalls as on a slow line."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _END_S: Final = 1.0
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    It does not use Python's own standard output, which would hold a lock while the terminal stalls; the
-    interpreter would wait for that lock at exit.
+    This thread does not use Python's own standard output, which would hold a lock while the terminal stalls;
+    the interpreter would wait for that lock at exit.
     """
 
     def __init__(self, descriptor: int, gone: threading.Event) -> None:

@@ -23,7 +23,8 @@ LEAST_TOUCH_M: Final = 1e-5
 class Touch:
     """One contact on a patch; unknown values are None.
 
-    The posterior estimates forces. An exact field without a known stiffness gives only place, area and depth.
+    The posterior estimates forces. An exact field without a known stiffness gives only position, area and
+    depth.
     """
 
     x_m: float
@@ -66,7 +67,7 @@ def touches_of(field: FieldFrame, rest_m: Float) -> tuple[Touch, ...]:
 
 
 def _depth_at(field: FieldFrame, rest_m: Float, place_m: Float) -> float:
-    """Return the depth, m, at the electrode nearest to a place."""
+    """Return the depth, m, at the electrode closest to a position."""
     away = np.hypot(rest_m[..., 0] - place_m[0], rest_m[..., 1] - place_m[1])
     return float(-field.displacement_m[..., 2].flat[int(away.argmin())])
 

@@ -39,7 +39,7 @@ class PatchView:
     condition: str
     level: Level
     words: tuple[str, ...]
-    """Faults other than the condition, the worst first."""
+    """Faults other than the condition, worst first."""
     health: PatchHealth
     stream: StreamStats
     rate_hz: float
@@ -85,7 +85,7 @@ class View:
     scans_hz: float
     """Fields per second of the fastest patch; equals the SYNC rate if all is well."""
     fields_hz: float
-    """Fields per second of all patches together."""
+    """Fields per second, summed over all patches."""
     latency_s: float | None
     latency_max_s: float | None
 
@@ -110,7 +110,7 @@ class LogLine:
 
 
 class History:
-    """Snapshots of the last seconds, condensed into views."""
+    """Snapshots of the last few seconds, condensed into views."""
 
     def __init__(self, hand: HandConfig, *, live: bool = True) -> None:
         self._hand, self._live = hand, live

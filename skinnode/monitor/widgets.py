@@ -17,7 +17,7 @@ from textual.widgets import Static
 from skinnode.monitor.field_map import Line
 
 Painter = Callable[[int, int], list[Line]]
-"""Function that returns the lines of a picture of given width and height."""
+"""Function that returns the lines of a picture of the given width and height."""
 
 
 class Canvas(Widget):

@@ -256,8 +256,8 @@ def stability(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['seeds']} seeds per row, {len(figures['rows'])} rows, "
         f"**{figures['wrong']} wires CONVERGED and wrong**. A wire is wrong if it is CONVERGED "
-        "with an error above 5 standard deviations and beyond chance, or above 1e-6 with exact data. The "
-        "table lists the rows with noise, solved by the method that `auto` chose; errors and standard "
+        "with an error above 5 standard deviations, not explained by chance, or above 1e-6 with exact data. "
+        "The table lists the rows with noise, solved by the method that `auto` chose; errors and standard "
         "deviations are medians over the seeds, in the deepest frame."
     ]
     rows = [

@@ -171,5 +171,5 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
         raise ConfigError(key, node_id, f"a node-ID in the hand, or any node-ID with {buses}")
     which = " and ".join(f"{patch.name} on {place.bus.name}" for place, patch in found)
     raise ConfigError(
-        key, node_id, f"a node-ID on only one bus; it is {which}; name the patch, or add {buses}"
+        key, node_id, f"a node-ID found on only one bus; this one is {which}; name the patch, or add {buses}"
     )

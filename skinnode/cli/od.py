@@ -171,7 +171,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
             raise
         why = ""
     except NodeError as error:
-        why = f"{error}: objects are named only by CiA 301"
+        why = f"{error}: objects have only their CiA 301 names"
     return DataSheet(Eds("", {}, frozenset(), {}, ()), "", note=why)
 
 

@@ -232,11 +232,11 @@ class ReplaySource:
 
     def record(self, folder: Path) -> Path:
         """Start a recording."""
-        raise SkinError("this is a recording already")
+        raise SkinError("this is already a recording")
 
     def stop_recording(self) -> Recording:
         """End the recording."""
-        raise SkinError("this is a recording already")
+        raise SkinError("this is already a recording")
 
     def close(self) -> None:
         """Release the source's resources."""

@@ -9,7 +9,7 @@ from vcan_sim.tally import Tally
 
 
 class Injector:
-    """Draws faults from a seed and the order of calls, and counts them.
+    """Draws faults, determined by a seed and the order of calls, and counts them.
 
     :attr:`faults` can be replaced at any time from any thread.
 

@@ -131,7 +131,7 @@ def find_node(
     The other arguments are as for :func:`find_buses`.
 
     Raises:
-        ConfigError: No patch has the name, or the bus of the node-ID is ambiguous.
+        ConfigError: No patch has this name, or the bus of the node-ID is ambiguous.
     """
     places = find_buses(interface, channel, bitrate, fd, hand, bus)
     return node_among(node, places, "NODE")
@@ -146,7 +146,7 @@ def node_among(node: str, places: list[Place], key: str) -> tuple[Place, int]:
         key: Name of the command-line argument that ``node`` comes from, for error messages.
 
     Raises:
-        ConfigError: No patch has the name, or the bus of the node-ID is ambiguous.
+        ConfigError: No patch has this name, or the bus of the node-ID is ambiguous.
     """
     from skinnode.errors import ConfigError
 

@@ -76,7 +76,7 @@ def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
         notes += [f"{name}: {text}" for text in patch_notes]
     for name, defects in stats.defects.items():
         if defects.count:
-            defect = f"{counted(defects.count, 'defect')} of the host, most recent: {defects.newest}"
+            defect = f"{counted(defects.count, 'defect')} in the host, most recent: {defects.newest}"
             faults.append(f"{name}: {defect}")
     return faults, notes
 
@@ -264,7 +264,7 @@ def _patch_text(name: str, facts: Mapping[str, object]) -> str:
 
 
 class JsonReport:
-    """Prints one JSON object per line: {"note": …} or the figures of one second."""
+    """Prints one JSON object per line: {"note": …} or the figures for one second."""
 
     def note(self, text: str) -> None:
         """Print ``text`` as a note."""

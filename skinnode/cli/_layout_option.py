@@ -16,7 +16,7 @@ HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as for layout.file i
 
 
 def import_from_here() -> None:
-    """Allow MODULE:NAME to refer to a file in the working directory, like ``python -m``."""
+    """Allow MODULE:NAME to refer to a file in the working directory, as ``python -m`` does."""
     sys.path.insert(0, os.getcwd())
 
 

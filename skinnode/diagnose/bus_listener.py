@@ -63,7 +63,7 @@ class BusListener:
 
     @property
     def nodes(self) -> dict[int, NodeTraffic]:
-        """Messages by node-ID; a copy."""
+        """Copy of the messages, by node-ID."""
         return dict(self._nodes)
 
     def node(self, node_id: int) -> NodeTraffic:

@@ -84,8 +84,8 @@ class SimulatedPatch:
         """Return the time of a reading, ns.
 
         Args:
-            device_time_us: Lower 32 bits of the node's clock at the reading, µs; the lowest 6 bits are
-                ignored, because a checked summary does not carry them.
+            device_time_us: Lower 32 bits of the time of the reading on the node's clock, µs; the lowest 6
+                bits are ignored, because a checked summary does not carry them.
 
         Raises:
             LookupError: There was no such reading, or it is too old.

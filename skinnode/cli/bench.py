@@ -47,7 +47,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 from a nearby start with skinnode, SciPy and Ceres on the same F and J."""
+    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres: same F and J, start close to the solution."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)

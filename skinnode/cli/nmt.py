@@ -1,4 +1,4 @@
-"""``skinnode nmt NODE|all COMMAND``: commands the NMT state of nodes and checks that they obey."""
+"""``skinnode nmt NODE|all COMMAND``: sends NMT commands to nodes and checks that they obey."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def collect_facts(
         hand: The hand; None without a hand file.
         active: Whether to start nodes that are not running, and to send SYNC if no other node does. The
             started nodes are returned to PRE-OPERATIONAL at the end.
-        progress: Receives a text for each step.
+        progress: Called with a description of each step.
     """
     facts = BusFacts(
         bus.name,

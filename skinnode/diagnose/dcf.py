@@ -27,7 +27,7 @@ _BYTES_KEY: Final = ";ParameterBytes"
 _BYTES_LINE: Final = re.compile(r"^;(ParameterBytes=)", re.MULTILINE)
 _SECTION: Final = re.compile(r"([0-9A-Fa-f]{4})(?:sub([0-9A-Fa-f]{1,2}))?", re.IGNORECASE)
 _VALUES: Final = ("parametervalue", "parameterbytes", _BYTES_KEY.lower())
-_COMMISSIONING: Final = "DeviceComissioning"  # this spelling is in CiA 306
+_COMMISSIONING: Final = "DeviceComissioning"  # the spelling of CiA 306
 _STRINGS: Final = {"VISIBLE_STRING": "ascii", "UNICODE_STRING": "utf-16-le"}
 _OCTETS: Final = ("OCTET_STRING", "DOMAIN")
 _VISIBLE_STRING: Final = 0x09

@@ -114,7 +114,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
     Args:
         connection: The bus.
-        progress: Receives a text for each step.
+        progress: Called with a description of each step.
 
     Raises:
         BusError: The bus failed.

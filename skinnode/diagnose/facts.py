@@ -65,7 +65,7 @@ class ScanFacts:
     step: float
     """Width of one code relative to R0."""
     stated_noise: float
-    """Relative noise of the converter in the hand file."""
+    """Relative noise of the converter, from the hand file."""
     stats: AssemblerStats
 
     @property
@@ -124,7 +124,7 @@ class BusFacts:
     strangers: tuple[FoundNode, ...] = ()
     """Nodes that are not in the hand file."""
     period_s: float | None = None
-    """SYNC period in the hand file."""
+    """SYNC period, from the hand file."""
     sync_s: Float = field(default_factory=lambda: np.empty(0))
     """Times of the SYNCs received, s; empty if the doctor sends SYNC."""
     sync_counters: tuple[int, ...] = ()
@@ -140,11 +140,11 @@ class BusFacts:
     nmt_commands: int = 0
     """Number of NMT commands received that a host of this hand would not send."""
     master_node_id: int | None = None
-    """Node-ID of the host's heartbeat, from the hand file."""
+    """Node-ID in the host's heartbeat, from the hand file."""
     master_beats_s: Float | None = None
     """Times at which the host's heartbeat was received, s."""
     heartbeat_ms: int | None = None
-    """Heartbeat period in the hand file."""
+    """Heartbeat period, from the hand file."""
     patches: tuple[PatchFacts, ...] = ()
 
     @property

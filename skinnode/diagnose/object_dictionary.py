@@ -249,7 +249,7 @@ def compare(
         remote: The node.
         eds: The file; each readable value given there is compared, except the node's state.
         node_id: Replaces $NODEID.
-        progress: Receives a text from time to time.
+        progress: Called with a description of the progress from time to time.
 
     Returns:
         The values that differ.

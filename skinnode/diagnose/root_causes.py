@@ -65,7 +65,7 @@ _CONTROLLER: Final = dict.fromkeys(_ERRORS, f"passive|bus-off|{_UNEXPLAINED}")
 _ANYTHING: Final[Mapping[str, str]] = {}
 
 # The first rule that matches a finding applies. Rules about a patch precede rules about its bus, and a rule
-# precedes any rule whose cause may be its consequence.
+# precedes any rule whose cause may be a consequence of its own cause.
 RULES: Final = (
     Rule(
         "two nodes have its node-ID",

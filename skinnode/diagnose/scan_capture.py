@@ -82,7 +82,7 @@ class ScanCapture:
         Args:
             node_id: The node.
             scale: Scale of its codes.
-            stated_noise: Relative noise of its converter in the hand file.
+            stated_noise: Relative noise of its converter, from the hand file.
         """
         patch = self._patches[node_id]
         patch.keep(patch.assembler.poll(time.monotonic_ns()), self._sync_ns)

@@ -87,7 +87,7 @@ def tare(
         node_id: The node.
         patch: Name of the patch; empty if no hand file names it.
         sync_period_s: SYNC period of a host that may be running.
-        progress: Receives a text for each step.
+        progress: Called with a description of each step.
 
     Returns:
         The result, even if the node does not answer or refuses.
@@ -135,7 +135,7 @@ def _tare(
 
 
 def _runs(connection: BusConnection, node_id: int) -> bool:
-    """Return whether a host has started the node, which then sends chunks or operational heartbeats."""
+    """Return whether a host has started the node, as chunks or operational heartbeats show."""
     beat = connection.listener.newest_beat(node_id)
     operational = beat is not None and beat.state == NmtState.OPERATIONAL
     return operational or connection.listener.cob_ids[od.chunk_cob_id(node_id)] > 0

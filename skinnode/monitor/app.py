@@ -215,7 +215,7 @@ class MonitorApp(App[None]):
         self.exit()
 
     def action_choose(self, step: int) -> None:
-        """Select the next patch, or the previous one."""
+        """Select the next or the previous patch."""
         self._selected = (self._selected + step) % len(self._names)
         self._draw()
 

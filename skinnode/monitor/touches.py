@@ -14,8 +14,8 @@ TOUCH: Final = 0.35
 """Minimum depth of touched skin, as a fraction of the maximum, if contacts are found by depth alone. Under
 Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
-"""Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds it once in 10 million
-fields."""
+"""Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds this depth once in 10
+million fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 

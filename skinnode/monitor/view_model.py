@@ -1,4 +1,4 @@
-"""Computes the content of the screen from snapshots, as frozen data. Pure functions, no terminal."""
+"""Computes the content of the screen from snapshots, as immutable data. Pure functions, no terminal."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum fraction of SYNC counters that do not follow their predecessor. Two producers break the sequence at
-half of the counters; lost SYNCs break it at a few."""
+"""Maximum fraction of SYNC counters that do not follow their predecessor. With two producers, half of the
+counters do not follow; with lost SYNCs, only a few do not."""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7

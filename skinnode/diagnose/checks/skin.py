@@ -59,7 +59,7 @@ def check_wires(bus: BusFacts) -> Iterator[Finding]:
 def _check_crossings(
     patch: PatchFacts, scans: ScanFacts, upper: set[int], lower: set[int]
 ) -> Iterator[Finding]:
-    """Check the crossings that are not on a wholly faulty wire."""
+    """Check the crossings that are not on an entirely faulty wire."""
     whole = max(1, int(scans.complete.sum()))  # crossings missing from a torn scan are unknown
     rest = np.ones(scans.n_open.shape, dtype=np.bool_)
     rest[sorted(upper), :] = False

@@ -15,7 +15,7 @@ from skinnode.model.layout import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchTrace:
-    """Plot data of one patch. Times in s since the first scan, lengths in m."""
+    """Data of one patch for the plot. Times in s since the first scan, lengths in m."""
 
     name: str
     rest_m: Float

@@ -25,7 +25,7 @@ MAP_SIZE = 16
 
 @dataclass(frozen=True, slots=True)
 class PatchView:
-    """View data of one patch. Lengths are in metres, NaN if not yet known."""
+    """Data of one patch for the view. Lengths are in metres, NaN if not yet known."""
 
     name: str
     health: str
@@ -41,7 +41,7 @@ class PatchView:
 
 @dataclass(frozen=True, slots=True)
 class BusView:
-    """View data of the bus and the run."""
+    """Data of the bus and the run for the view."""
 
     elapsed_s: float
     seconds: float

@@ -236,7 +236,7 @@ class MonitorApp(App[None]):
         self._draw()
 
     def action_pause(self) -> None:
-        """Freeze the picture, or continue."""
+        """Freeze or unfreeze the picture."""
         self._paused = not self._paused
         self._draw()
 

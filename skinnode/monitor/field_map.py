@@ -150,7 +150,7 @@ class Scale:
         self.full_m = _LEAST_M
 
     def update(self, t_ns: int, deepest_m: float) -> None:
-        """Update the scale with the deepest press at ``t_ns``, m."""
+        """Update the scale with the depth, m, of the deepest press at ``t_ns``."""
         while self._peaks and (self._peaks[0][0] < t_ns - _MEMORY_NS or self._peaks[0][0] > t_ns):
             self._peaks.popleft()
         while self._peaks and self._peaks[-1][1] <= deepest_m:

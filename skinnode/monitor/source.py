@@ -83,7 +83,7 @@ class Source(Protocol):
         """Progress of the recording; None if there is none."""
 
     def record(self, folder: Path) -> Path:
-        """Start a recording and return its path. Raises ConfigError if it cannot be written."""
+        """Start a recording and return its path. Raises ConfigError if the recording cannot be written."""
 
     def stop_recording(self) -> Recording:
         """End the recording and return its final statistics."""

@@ -66,8 +66,8 @@ def path(figures: dict[str, Any]) -> str:
     parts = [
         f"{machine(figures)} {figures['experiments']} random presses per setting, one wire, 30 unknowns. "
         "*Plain*: as in the paper, `Uniform(plain=True)`; *ours*: `Uniform()`. A call evaluates F with J; "
-        "calls are per step; with finite differences, as in the paper, each counts as 31. *Lost*: wires not "
-        "CONVERGED; the error is the mean of the others."
+        "calls are per step; with finite differences, as in the paper, each call counts as 31. *Lost*: wires "
+        "not CONVERGED; the error is the mean over the others."
     ]
     for setting in figures["settings"]:
         rows = []

@@ -154,7 +154,7 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Set the controller of the nodes on a bus to bus-off, or reconnect it.
+        """Put the controller of the nodes on a bus into bus-off, or reconnect it.
 
         The nodes exit if bus-off lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
         """

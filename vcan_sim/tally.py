@@ -94,7 +94,7 @@ class Tally:
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line for each of these sums that does not hold. Call when the node is idle."""
+        """Return one line for each kind of frame whose counts do not add up. Call when the node is idle."""
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [

@@ -45,7 +45,7 @@ def conformance(
     It RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
     parameters. It reads the configuration first and restores every change at the end. It sends commands to
     all nodes and frames that appear to come from other nodes: use a bus without another master, preferably
-    without any other node, on a machine that may safely stop.
+    without any other node, on a machine that can be stopped safely.
 
     Exit status 0 if no case failed, 1 if one did, 2 if the tests could not run.
     """

@@ -37,7 +37,7 @@ def doctor(
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
     The doctor only listens and reads, so a running hand is not disturbed. The skin is judged by its scans,
-    which a hand that is not running sends only with --active. Do not touch the skin during the examination.
+    which a hand that is not running sends only with --active. Do not touch the skin while the command runs.
     Exit status 0 if no fault was found, 1 if one was found, 2 if the examination could not run.
     """
     from skinnode.cli._bus import find_buses

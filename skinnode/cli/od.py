@@ -55,8 +55,8 @@ def od(
 ) -> None:
     """Read or write objects of a node. Indices are hexadecimal, with or without 0x.
 
-    Without INDEX the command dumps the whole dictionary. Exit status 0 if done, 1 if --diff found
-    differences, 2 if the node did not answer or refused.
+    Without INDEX the command dumps the whole dictionary. Exit status 0 on success, 1 if --diff
+    found differences, 2 if the node did not answer or refused the request.
     """
     from skinnode.cli._bus import find_node
     from skinnode.cli._console import print_json, progress

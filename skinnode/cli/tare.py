@@ -33,7 +33,9 @@ def tare(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Make the current resistances of patches their baseline R0. Do not touch the skin during the tare.
+    """Make the current resistances of patches their baseline R0.
+
+    Do not touch the skin while the command runs.
 
     Taring works by SDO, with or without a host on the bus: a running host reads the new baselines and
     continues. A patch loses its baseline at power-off unless it is stored (0x1010). A patch whose baseline

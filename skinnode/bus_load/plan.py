@@ -1,10 +1,10 @@
 """Traffic plan of a hand's buses: all frames, their load, and their worst-case delay.
 
 Each bus carries the SYNC, the host's heartbeat if enabled, the frames of other devices listed in the hand
-file, and a sequence of SDO transfers that uses :data:`SDO_SHARE` of the bus. For each patch, it also carries
-all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every heartbeat
-period. Configuring a returning node by SDO is not counted, because SDO has a lower priority than any PDO and
-therefore uses only spare bandwidth.
+file, and a sequence of SDO transfers that uses :data:`SDO_SHARE` of the bus. For each patch, the bus also
+carries all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every
+heartbeat period. The SDO transfers that configure a returning node are not counted: they have a lower
+priority than any PDO and therefore use only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCAN_SHARE: Final = 0.8
 """Fraction of the SYNC period in which a node sends its scan; the rest is for SDO, EMCY and late frames."""
 
 SDO_SHARE: Final = 0.01
-"""Fraction of a bus reserved for SDO; at 1 Mbit/s, one request and its response every 27 ms."""
+"""Fraction of the bus bandwidth reserved for SDO; at 1 Mbit/s, one request and its response every 27 ms."""
 
 NODE_LATENCY_S: Final = 2e-3
 """Maximum time from a SYNC to the first chunk, s, as specified for a patch on an idle machine."""
@@ -41,7 +41,7 @@ _SAMPLES: Final = 512
 
 @dataclass(frozen=True, slots=True)
 class PlannedFrame:
-    """Kind of frame on a bus."""
+    """Type of frame on a bus."""
 
     name: str
     can_id: int
@@ -54,7 +54,7 @@ class PlannedFrame:
     spacing_s: float
     """Minimum time between two frames of a period, s."""
     jitter_s: float
-    """Maximum deviation from the spacing, s."""
+    """Maximum deviation from this spacing, s."""
     worst_s: float
     """Time on the bus with the maximum number of stuff bits, s."""
     typical_s: float

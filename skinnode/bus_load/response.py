@@ -3,7 +3,7 @@
 The analysis follows Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis:
 Refuted, revisited and revised", Real-Time Systems 35, 2007, section 3. The lowest identifier wins
 arbitration, and a frame being sent is not interrupted. Every instance in the longest busy period of a
-priority level is examined, because the first instance is not always the slowest.
+priority level is examined, because the first instance does not always have the longest response time.
 
 Extension: frames may come in bursts of ``count`` frames ``spacing_ns`` apart in each period, as the chunks of
 a scan do. A window that starts with a burst contains the maximum number of frames, so the analysis holds with
@@ -71,7 +71,7 @@ class Message:
 
 
 def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -> int | None:
-    """Return the maximum time from the due time of a message to its last bit, ns.
+    """Return the maximum time from when a message is due until its last bit has been sent, ns.
 
     Args:
         message: the message.
@@ -81,7 +81,7 @@ def response_time_ns(message: Message, others: Sequence[Message], bit_ns: int) -
 
     Returns:
         The time, or None if it is unbounded because the message and all higher-priority messages together
-        need the whole bus.
+        need the whole bandwidth.
     """
     higher = [other for other in others if other.can_id < message.can_id]
     blocking_ns = max((other.time_ns for other in others if other.can_id > message.can_id), default=0)

@@ -31,7 +31,7 @@ def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
     """Return tables of the CRC by byte, and of the next run and number of stuff bits by ``run << 8 | byte``.
 
     A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
-    to 4. A fifth equal bit causes a stuff bit, which begins a new run.
+    to 4. After the fifth equal bit, a stuff bit is inserted, which begins a new run.
     """
     crc_table = []
     for byte in range(256):
@@ -74,8 +74,8 @@ def are_loaded() -> bool:
 def load_kernels() -> None:
     """Compile the kernels, or read them from the cache.
 
-    This takes half a second, during which a receiving thread could not answer requests, so call this function
-    in advance.
+    This takes half a second, during which a receiving thread cannot answer requests, so call this function in
+    advance.
     """
     global _loaded
     _loaded = True
@@ -127,7 +127,8 @@ def _classic(  # noqa: PLR0913 - arrays of a compiled kernel
         for k in range(begin, begin + length):
             crc = (crc << 8 & 0x7FFF) ^ np.int64(crc_of[crc >> 7 ^ np.int64(payload[k])])
         # Head and CRC have 19 + 15 bits, two more than four bytes, so six filler bits complete five bytes.
-        # Bytes of the stuffed region straddle payload bytes, so each is cut from two adjacent payload bytes.
+        # Bytes of the stuffed region straddle payload bytes, so each is assembled from two adjacent payload
+        # bytes.
         stream = (ALTERNATING & 0x3F) << 18 | head >> 1
         stuff: Any = 0
         run: Any = 0

@@ -6,14 +6,14 @@ ACK slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space. CRC: po
 initial value 0.
 
 CRC and stuffing are computed bytewise with tables. The head of a frame is padded on the left to whole bytes.
-For the CRC, the padding is zeros, which leave the CRC at 0. For stuffing, the padding is alternating bits
-that end in a 1, so the dominant start of frame begins a new run.
+For the CRC, the padding consists of zeros, which leave the CRC at 0. For stuffing, it consists of alternating
+bits that end in a 1, so the dominant start of frame begins a new run.
 
-CAN FD frames have an 11-bit identifier and switch the bit rate. Bit stuffing follows the same rule up to the
-end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16 data bytes), and
-fixed stuff bits: one before the field and one after every 4 bits. The bits from ESI to the CRC delimiter are
-sent at the data bit rate. The 17 bits before them and the 12 bits after them (ACK slot, ACK delimiter, 7-bit
-end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
+All CAN FD frames considered here have an 11-bit identifier and switch the bit rate. Bit stuffing follows the
+same rule up to the end of the data. The CRC field holds a 4-bit stuff count, 17 CRC bits (21 for more than 16
+data bytes), and fixed stuff bits: one at the start of the field and one after every 4 bits. The bits from ESI
+to the CRC delimiter are sent at the data bit rate. The 17 bits before them and the 12 bits after them (ACK
+slot, ACK delimiter, 7-bit end of frame and 3-bit inter-frame space) are sent at the nominal bit rate.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the bits in the longest frame: a stuff bit follows the first 5 bits and every 4 further bits.
+    """Return the maximum number of bits in a frame: stuff bits follow the first 5 and every 4 further bits.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -155,8 +155,8 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
     # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 bits and every 4 further bits. FDF,
-    # res and BRS alternate, ESI is 0 and the length code is known. The data are the worst case. The first run
-    # is one recessive bit, BRS.
+    # res and BRS alternate, ESI is 0 and the length code is known. The data are assumed to be the worst case.
+    # The first run is one recessive bit, BRS.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)
     choices: list[tuple[int, ...]] = [(0,), *((code >> shift & 1,) for shift in (3, 2, 1, 0))]
@@ -211,7 +211,7 @@ def exact_bits_batch(can_id: ArrayLike, dlc: ArrayLike, data: ArrayLike) -> _Int
 class BusLoad:
     """Counter of frames and of their exact total length in bits.
 
-    Adding a frame is cheap, because bits are computed in batches. The counter is not thread-safe.
+    Adding a frame is cheap, because bits are counted in batches. The counter is not thread-safe.
 
     Args:
         bitrate_bps: nominal bit rate, bit/s.
@@ -279,7 +279,7 @@ class BusLoad:
         return self._bits + round(self._fast_bits * self._data_bit)
 
     def load(self, time_s: float) -> float:
-        """Return the fraction of a time interval that the counted frames take; above 1, they do not fit.
+        """Return the fraction of a time interval that the counted frames occupy; above 1, they do not fit.
 
         Args:
             time_s: length of the interval, s.
@@ -289,7 +289,7 @@ class BusLoad:
     def _work_off(self) -> None:
         ids, data = self._classic
         self._frames += len(ids)
-        if not stuffing.are_loaded():  # loading would delay a command that listens for 1 or 2 s
+        if not stuffing.are_loaded():  # loading the kernels would delay a command that listens for 1 or 2 s
             self._bits += sum(map(exact_bits, ids, data))
         elif ids:
             self._bits += stuffing.classic_bits(*_packed(ids, data), 0, np.empty(len(ids), np.int64))

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class AbortCode(IntEnum):
-    """Reason for aborting a transfer, with the value defined by CiA 301."""
+    """Reason for aborting a transfer, with the code defined by CiA 301."""
 
     TOGGLE_BIT = 0x05030000
     TIMED_OUT = 0x05040000
@@ -42,7 +42,7 @@ class AbortCode(IntEnum):
 
 
 class Refused(Exception):
-    """Error for a refused object access, which the node's SDO server answers with the abort code.
+    """Refusal of access to an object; the node's SDO server responds with the abort code.
 
     Args:
         code: reason of the refusal.

@@ -33,7 +33,7 @@ class PdoDefault:
 
 
 def spare_pdo(cob_id: int | None) -> PdoDefault:
-    """Return a PDO that is unused until a client maps objects into it and switches it on.
+    """Return a PDO that is unused until a client maps objects into it and enables it.
 
     Args:
         cob_id: COB-ID without the node-ID, from the pre-defined connection set; None if the set does not

@@ -17,7 +17,7 @@ def fd_length(n_bytes: int) -> int:
         n_bytes: number of bytes.
 
     Raises:
-        ValueError: if the number exceeds 64, the maximum of a frame.
+        ValueError: if the number exceeds 64, the maximum for a frame.
     """
     for length in FD_LENGTHS:
         if n_bytes <= length:

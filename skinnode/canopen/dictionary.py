@@ -13,7 +13,7 @@ Value = int | float | str
 
 
 class ObjectType(enum.IntEnum):
-    """Object codes of CiA 301."""
+    """Object codes defined by CiA 301."""
 
     DOMAIN = 0x02
     VAR = 0x07
@@ -61,7 +61,7 @@ class Entry:
     access: str
     """ro, rw, wo, const, or rww (rw and mappable into an RPDO)."""
     default: Value | None = None
-    """Default value; None, for a device-specific value such as a serial number, means zero at start."""
+    """Default value; None for a device-specific value such as a serial number, which starts at zero."""
     plus_node_id: bool = False
     """Whether the node-ID is added to the default at start, as for a COB-ID."""
     mappable: bool = False
@@ -77,7 +77,7 @@ class Entry:
         return self.index << 16 | self.subindex << 8 | self.data_type.bits
 
     def value_at_start(self, node_id: int) -> Value | None:
-        """Return the default value on a node.
+        """Return the default value for a node.
 
         Args:
             node_id: node-ID of the node.

@@ -1,4 +1,4 @@
-"""Writer of an object dictionary as an EDS or DCF file (CiA 306).
+"""Writes an object dictionary as an EDS or DCF file (CiA 306).
 
 An EDS (electronic data sheet) describes a type of device; a DCF (device configuration file) describes the
 configuration of one device. REAL32 defaults are written as hexadecimal IEEE 754 bit patterns, as conforming
@@ -55,7 +55,7 @@ def render_eds(info: DeviceInfo, objects: Iterable[Object], device: Commissionin
     Args:
         info: the device.
         objects: object dictionary of the device.
-        device: the node for a DCF, which gives each writable object its start value; None for an EDS.
+        device: for a DCF, the node whose start values are written; None for an EDS.
     """
     listed = tuple(objects)
     lines = [*_head(info, device)]
@@ -171,7 +171,7 @@ def _options(entry: Entry, kind: ObjectType, device: Commissioning | None) -> It
 
 
 def _is_configuration(entry: Entry) -> bool:
-    """Return whether a DCF configures the entry; commands and histories are excluded."""
+    """Return whether a DCF sets the entry; commands and histories are excluded."""
     refused = entry.index in (od.ERROR_FIELD, od.STORE, od.RESTORE)
     return entry.access not in ("ro", "const") and entry.default is not None and not refused
 

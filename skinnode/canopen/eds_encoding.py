@@ -1,8 +1,8 @@
-"""Reader of the text of an EDS or DCF file in any encoding.
+"""Reads the text of an EDS or DCF file in any encoding.
 
 CiA 306 requires ASCII, but tools also write other encodings. Reading loses nothing: each non-ASCII byte
-becomes a lone surrogate (PEP 383), from which the bytes of a value can be recovered. :func:`for_people`
-decodes text for display.
+becomes a lone surrogate (PEP 383), from which the original bytes of a value can be recovered.
+:func:`for_people` decodes text for display.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CODECS: Final = {
     "Windows-1252": "cp1252",
     "Latin-1": "latin-1",
 }
-"""Python codec of the bytes behind an :class:`EdsText`, by encoding."""
+"""Python codec for the original bytes of an :class:`EdsText`, by encoding."""
 
 
 class EdsText(NamedTuple):
@@ -37,7 +37,7 @@ class EdsText(NamedTuple):
 
     @property
     def codec(self) -> str:
-        """Codec of the bytes behind the surrogates; UTF-16 has been converted to UTF-8."""
+        """Codec for the bytes that the surrogates represent; UTF-16 has been converted to UTF-8."""
         return _CODECS[self.encoding]
 
     @property
@@ -84,7 +84,7 @@ def octets_text(data: bytes) -> str:
 
 
 def octets(text: str) -> bytes:
-    """Return the bytes behind the text of a file; other text is encoded as UTF-8."""
+    """Return the original bytes of a file's text; genuine non-ASCII characters are encoded as UTF-8."""
     return text.encode("utf-8", "surrogateescape")
 
 

@@ -1,4 +1,4 @@
-"""Checks for EDS format errors (CiA 306) that parsers silently skip, reported with their line numbers."""
+"""Checks for EDS format errors (CiA 306) that parsers ignore silently; reports each with its line number."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z]\w*", re.IGNORECASE)
 """Pattern of section titles such as 1003Value and 1003ObjectLinks."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Pattern of section titles that are apparently meant for an object."""
+"""Pattern of section titles that are apparently intended for an object."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")
@@ -51,14 +51,16 @@ def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
     line = next(filter(None, numbers), None)
     if line is not None:
         shown = [*text.split("\n"), ""][min(line, text.count("\n") + 1) - 1]
-        allowed = "a file as in CiA 306: each [section] once, each key once per section, ';' before comments"
+        allowed = (
+            "a file in CiA 306 format: each [section] once, each key once per section, ';' before comments"
+        )
         return _mistake("EDS", shown, allowed, source, line)
     for line, section, key, value in _lines(text):
         if _OBJECT.fullmatch(section) and key.lower() in _NUMBERS and not _NUMBER.fullmatch(value):
             return _mistake(f"[{section}] {key}", value, "a number", source, line)
     within, missing = (getattr(error, name, None) for name in ("section", "option"))
     if within and missing:
-        return _mistake(f"[{within}]", Shown(f"no {missing}"), "a file as in CiA 306", source)
+        return _mistake(f"[{within}]", Shown(f"no {missing}"), "a file in CiA 306 format", source)
     titles = {section.lower() for _, section, key, _ in _lines(text) if not key}
     for line, section, key, _ in _lines(text):
         if (
@@ -70,7 +72,7 @@ def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
             allowed = f"section [{section[:4]}] before it"
             return _mistake("section", f"[{section}]", allowed, source, line)
     what = " ".join(str(error).split()) or type(error).__name__
-    return _mistake("EDS", Shown(what[:_LONGEST_SHOWN]), "a file as in CiA 306", source)
+    return _mistake("EDS", Shown(what[:_LONGEST_SHOWN]), "a file in CiA 306 format", source)
 
 
 def _mistake(key: str, got: str, allowed: str, source: str, line: int | None = None) -> ProfileError:

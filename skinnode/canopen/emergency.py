@@ -146,7 +146,7 @@ def history_text(entry: int, *, ours: bool) -> str:
 def says_too_slow(code: int, detail: bytes) -> bool:
     """Return whether an emergency reports scans skipped because of a slow computer or bus.
 
-    Such skipped scans are not a fault of the skin.
+    Such skipped scans do not indicate a fault in the skin.
 
     Args:
         code: the error code.
@@ -209,4 +209,4 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that return the text for the two or more manufacturer-specific bytes from a skinnode patch."""
+"""Functions that decode the manufacturer-specific bytes (at least two) from a skinnode patch to text."""

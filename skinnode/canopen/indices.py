@@ -31,9 +31,9 @@ NMT_COB_ID: Final = 0x000
 SYNC_COB_ID: Final = 0x080
 TIME_COB_ID: Final = 0x100
 LSS_RESPONSE_COB_ID: Final = 0x7E4
-"""COB-ID from LSS slave to master (CiA 305)."""
+"""COB-ID of messages from LSS slave to master (CiA 305)."""
 LSS_REQUEST_COB_ID: Final = 0x7E5
-"""COB-ID from LSS master to slaves."""
+"""COB-ID of messages from LSS master to slaves."""
 
 
 def emcy_cob_id(node_id: int) -> int:
@@ -67,17 +67,17 @@ def summary_cob_id(node_id: int) -> int:
 
 
 def sdo_response_cob_id(node_id: int) -> int:
-    """Return the COB-ID from a node's SDO server to its client."""
+    """Return the COB-ID of messages from a node's SDO server to its client."""
     return 0x580 + node_id
 
 
 def sdo_request_cob_id(node_id: int) -> int:
-    """Return the COB-ID from a client to a node's SDO server."""
+    """Return the COB-ID of messages from a client to a node's SDO server."""
     return 0x600 + node_id
 
 
 def heartbeat_cob_id(node_id: int) -> int:
-    """Return the COB-ID for boot-up, heartbeat and node guarding of a node."""
+    """Return the COB-ID of a node's boot-up, heartbeat and node guarding messages."""
     return 0x700 + node_id
 
 
@@ -130,13 +130,13 @@ MAX_PDOS: Final = 512
 PDO_MAPPING_OFFSET: Final = 0x200
 """Offset from the index of a PDO's communication parameter to the index of its mapping."""
 PDO_INVALID: Final = 1 << 31
-"""Bit of a COB-ID that switches its PDO off."""
+"""Bit of a COB-ID that disables its PDO."""
 PDO_COB_ID, PDO_TYPE, PDO_INHIBIT_TIME, PDO_EVENT_TIMER, PDO_SYNC_START = 1, 2, 3, 5, 6
 """Sub-indices of a PDO's communication parameter."""
 DUMMY_BITS: Final = {0x0002: 8, 0x0003: 16, 0x0004: 32, 0x0005: 8, 0x0006: 16, 0x0007: 32}
 """Lengths in bits of the data types that an RPDO can map as dummy objects, whose bytes this node ignores.
 
-BOOLEAN is missing because PDOs consist of whole bytes.
+BOOLEAN is not included because PDOs consist of whole bytes.
 """
 ERROR_FIELD_LENGTH: Final = 8
 HEARTBEAT_CONSUMERS: Final = 8
@@ -149,7 +149,8 @@ PDO_BYTES: Final = 12
 """Sub-index of the maximum PDO length, which is 8 bytes, or 64 over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""Sub-indices before the codes; over CAN FD they hold wire and scan counter, and the first column follows."""
+"""Sub-indices before the codes; over CAN FD they hold the wire and the scan counter, and the first column
+follows."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
@@ -171,7 +172,7 @@ LOWER_WIRE_FAULTS: Final = 0x2031
 REJECTED_FRAMES: Final = 0x2040
 """Counters; see :class:`skinnode.node.rejected.Rejected`."""
 CODES: Final = 0x2100
-"""Index of the last codes of upper wire 0, with one sub-index per column; add r for upper wire r."""
+"""Index of the latest codes of upper wire 0, with one sub-index per column; add r for upper wire r."""
 BASELINE: Final = 0x2200
 """Index of R0 of upper wire 0, ohm (0 if unknown), one sub-index per column; add r for upper wire r."""
 COORDINATES: Final = 0x2300

@@ -91,7 +91,7 @@ def encode(command: NmtCommand, node_id: int) -> bytes:
 
 
 def parse(data: bytes, node_id: int) -> NmtCommand | None:
-    """Return the command in a frame on COB-ID 0; None if it is for another node.
+    """Return the command in a frame on COB-ID 0; None if the frame addresses another node.
 
     Args:
         data: the payload.

@@ -11,9 +11,9 @@ from skinnode.config.table import Allowed, Name, NodeId, Table, one_of
 from skinnode.errors import ConfigError
 
 MAX_BUS_LOAD: Final = 0.70
-"""Default load limit of a bus. Above it, the response times of low-priority frames grow steeply (Davis,
-Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35, 2007), and
-no capacity is left to repeat frames after errors."""
+"""Default load limit of a bus. Above this limit, the response times of low-priority frames grow steeply
+(Davis, Burns, Bril, Lukkien: Controller Area Network (CAN) schedulability analysis, Real-Time Systems 35,
+2007), and no capacity is left to repeat frames after errors."""
 
 Role = Literal["master", "guest"]
 GuestSends = Literal["nothing", "sdo"]
@@ -25,7 +25,7 @@ _KEYS_OF_TABLE: Final = ("interface", "channel", "bitrate", "data_bitrate", "fd"
 class OtherFrame(Table):
     """Frame that another device, such as a drive, sends on the bus.
 
-    It adds to the bus load and delays the frames of the hand.
+    The frame adds to the bus load and delays the frames of the hand.
     """
 
     can_id: Annotated[int, Field(ge=0, le=0x7FF), Allowed("an integer from 0 to 0x7FF")]
@@ -42,7 +42,7 @@ class BusConfig(Table):
     """CAN bus, identified by the names of its interface and channel in python-can."""
 
     name: Name = "can0"
-    """Name of the bus, to which the patches refer in their key ``bus``."""
+    """Name of the bus, which each patch connected to it gives in its key ``bus``."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
     """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
@@ -66,7 +66,7 @@ class BusConfig(Table):
     guest_sends: Annotated[GuestSends, one_of(GuestSends)] = "nothing"
     """Frames that a guest may send: ``sdo`` to identify and configure the patches and to read their data."""
     heartbeat_node_id: Annotated[NodeId | None, Allowed("an integer from 1 to 127 that no node uses")] = None
-    """Node-ID with which the host, as master, sends a heartbeat. The patches monitor it and go
+    """Node-ID under which the host, as master, sends a heartbeat. The patches monitor this heartbeat and go
     pre-operational when it stops. None: no heartbeat."""
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
@@ -102,8 +102,8 @@ class SyncConfig(Table):
         float, Field(ge=0, allow_inf_nan=False), Allowed("a number of milliseconds, at least 0")
     ] = 0.0
     """Delay from the SYNC of one bus to the SYNC of the next if the host is the master, milliseconds. At 0,
-    all patches scan at the same instant and their scans end together, so the last field is solved after all
-    others."""
+    all patches scan at the same instant and their scans end together, so the last field has to
+    wait until all others have been solved."""
 
     @property
     def stagger_s(self) -> float:
@@ -117,14 +117,14 @@ class SyncConfig(Table):
 
 
 class BringUpConfig(Table):
-    """Settings for bringing up patches, at the start and later."""
+    """Settings for bringing up patches, at start-up and later."""
 
     missing: Annotated[Missing, one_of(Missing)] = "refuse"
-    """Action if a patch does not answer at the start: ``refuse`` to start, or start with the other patches
+    """Action if a patch does not answer at start-up: ``refuse`` to start, or start with the other patches
     and ``wait`` for it."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
     """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; a guest that sends
-    nothing only expects this period. At 250 ms, a lost node is detected within a second, and the heartbeats
+    nothing merely assumes this period. At 250 ms, a lost node is detected within a second, and the heartbeats
     of four nodes take 0.1 % of the bus."""
 
     @property

@@ -36,7 +36,7 @@ def first_error(
     first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
     location, kind = first["loc"], first["type"]
     cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, ConfigError):  # raised by a check of this package, whose key continues the location
+    if isinstance(cause, ConfigError):  # raised by a check here; its key is relative to the location
         path = (*location, *key_path(cause.key))
         return ConfigError(dotted(path), cause.got, cause.allowed, where=where(path))
     keys, allowed = _place(location, table)
@@ -55,7 +55,7 @@ def first_error(
 
 
 def short(value: object) -> object:
-    """Return ``value``, or the first 60 characters of its text if it is longer, to fit on one line."""
+    """Return ``value``, or the first 60 characters of its text if the text is longer, to fit on one line."""
     text = repr(value)
     return value if len(text) <= _LONGEST_SHOWN else Shown(text[: _LONGEST_SHOWN - 1] + "…")
 
@@ -103,6 +103,6 @@ def tables_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _marks_in(annotation: Any) -> list[str]:
-    """Return the texts of all :class:`Allowed` marks, also inside a union such as ``Stiffness | None``."""
+    """Return the texts of all :class:`Allowed` marks, even those in a union such as ``Stiffness | None``."""
     own = [mark.text for mark in getattr(annotation, "__metadata__", ()) if isinstance(mark, Allowed)]
     return own + [text for part in get_args(annotation) for text in _marks_in(part)]

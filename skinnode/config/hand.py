@@ -21,14 +21,14 @@ from skinnode.model.layout_file import impossible
 from skinnode.text.words import counted
 
 MOST_BUSES: Final = 64
-"""Maximum number of buses per hand, far above the number of CAN interfaces of any machine."""
+"""Maximum number of buses per hand, far above the number of CAN interfaces on any machine."""
 
 
 class HandConfig(Table):
     """Hand with its buses and patches, and the settings of the host.
 
     A duplicate name, node-ID or serial number, an unknown bus, an impossible geometry or a conflict with the
-    role of a bus raises a ConfigError, which pydantic wraps in its ValidationError; :func:`parse_hand`
+    role of a bus causes a ConfigError, which pydantic wraps in its ValidationError; :func:`parse_hand`
     unwraps it. :func:`skinnode.bus_load.plan.check_plan` checks whether the plan fits its buses.
     """
 
@@ -50,7 +50,7 @@ class HandConfig(Table):
     _read_of: Document = PrivateAttr(Document("", {}, {}))
 
     def bus(self, name: str) -> BusConfig:
-        """Return the bus with that name.
+        """Return the bus called ``name``.
 
         Raises:
             KeyError: The hand has no such bus.
@@ -58,7 +58,7 @@ class HandConfig(Table):
         return {bus.name: bus for bus in self.buses}[name]
 
     def patch(self, name: str) -> PatchConfig:
-        """Return the patch with that name.
+        """Return the patch called ``name``.
 
         Raises:
             KeyError: The hand has no such patch.
@@ -66,7 +66,7 @@ class HandConfig(Table):
         return {patch.name: patch for patch in self.patches}[name]
 
     def patches_on(self, bus: str) -> tuple[PatchConfig, ...]:
-        """Return the patches on the bus with that name, in file order."""
+        """Return the patches on the bus called ``bus``, in file order."""
         return tuple(patch for patch in self.patches if patch.bus == bus)
 
     def where(self, key: str) -> str:
@@ -188,7 +188,7 @@ def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: s
     """Validate a table with the keys of a hand file.
 
     Args:
-        table: The table, as tomllib reads it.
+        table: The table, as returned by tomllib.
         folder: Base folder for relative paths; by default the working directory.
         where: File name for errors.
 

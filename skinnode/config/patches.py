@@ -106,7 +106,7 @@ class LayoutConfig(Table):
 def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
     """Return a preset layout from a cache.
 
-    Most patches of a hand have the same layout, and every check of the hand needs it. Layouts are immutable
+    Most patches of a hand have the same layout, which every check of the hand needs. Layouts are immutable
     and can be shared.
     """
     return PatchLayout.preset(name, **sizes)  # type: ignore[arg-type]
@@ -161,14 +161,14 @@ class CalibrationConfig(Table):
     young_pa: Annotated[
         float, Field(ge=1e3, le=1e10, allow_inf_nan=False), Allowed("a number of Pa from 1e3 to 1e10")
     ] = _RUBBER.young_pa
-    """Young's modulus of the rubber, from which the posterior computes forces."""
+    """Young's modulus of the rubber, from which the posterior method computes forces."""
     poisson: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False), Allowed("a number from 0 to 0.5")] = (
         _RUBBER.poisson
     )
     """Poisson's ratio of the rubber."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """One factor per upper wire; it restores the wire's resistances to their values at the time of the
-    baseline."""
+    """One correction factor per upper wire, which restores the wire's resistances to their values at the time
+    of the baseline."""
 
     @property
     def rubber(self) -> Rubber:
@@ -189,7 +189,7 @@ class PatchConfig(Table):
     """Name of the robot link that carries the patch, for programs with a robot model."""
     pose: PoseConfig = PoseConfig()
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
-    """Electronic data sheet (EDS) to compare with the wire format of this patch; the path is relative to the
+    """Electronic data sheet (EDS) to check against the wire format of this patch; the path is relative to the
     hand file."""
     layout: LayoutConfig = LayoutConfig()
     code_bits: Annotated[Literal[16, 24], Allowed("16 or 24")] = 16
@@ -200,12 +200,13 @@ class PatchConfig(Table):
     """Required serial number of the node (0x1018:4); None accepts any. If no node answers at the node-ID, the
     host finds the node by its serial number over LSS and assigns the node-ID."""
     relative_noise: Ratio = 3e-6
-    """Relative standard deviation of the analogue noise of a resistance, without quantisation."""
+    """Relative standard deviation of the analogue noise in a resistance measurement, excluding
+    quantisation."""
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
-    """File of the resistances at rest, ohm, with one line per upper wire and one number per lower wire. None:
-    the host reads them from the node."""
+    """File with the resistances at rest, ohm, with one line per upper wire and one number per lower wire.
+    None: the host reads them from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
 
     @field_validator("eds", "baseline")

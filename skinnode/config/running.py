@@ -19,7 +19,7 @@ class SolverConfig(Table):
 
     method: Annotated[Method, one_of(Method)] = "auto"
     """Method: ``exact`` inverse of each wire, ``posterior`` of the patch, or ``auto`` to choose between them
-    by layout and noise."""
+    according to layout and noise."""
     operator: Annotated[Operator, one_of(Operator)] = "dogleg"
     """Operator of the exact inverse."""
     stiffness_n_per_m: Stiffness | None = None
@@ -30,9 +30,9 @@ class SolverConfig(Table):
     ] = None
     """Time limit per frame, microseconds, after which the estimate so far is returned; None: no limit."""
     estimate_noise: bool = False
-    """Estimate the noise of the resistances from the stream; requires the posterior."""
+    """Estimate the noise in the measured resistances from the stream; requires the posterior."""
     drift: Annotated[Drift, one_of(Drift)] = "none"
-    """Estimate a common gain of the resistances of the ``patch``, or of each upper ``wire``, together with
+    """Estimate a gain common to all resistances of the ``patch``, or of each upper ``wire``, together with
     the displacement; requires the posterior."""
     normal_only: bool = False
     """Solve only for the height of the electrodes, without shear."""
@@ -47,5 +47,5 @@ class StreamConfig(Table):
     """Handling of incomplete scans, which lack chunks or the summary with the scan check: ``pass`` them on
     unchecked with a mask of the valid resistances, or ``withhold`` them. Both are counted."""
     capacity_fields: Annotated[int, Field(ge=1, le=1_000_000), Allowed("an integer from 1 to 1000000")] = 64
-    """Maximum number of fields that a subscriber may lag behind before the oldest are lost. 64 fields cover
-    more than a second for four patches at 12.5 scans per second."""
+    """Maximum number of fields by which a subscriber may lag before the oldest fields are lost. 64 fields
+    cover more than a second for four patches at 12.5 scans per second."""

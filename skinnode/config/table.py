@@ -13,7 +13,7 @@ from skinnode.canopen.indices import MAX_NODE_ID
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Annotation that describes, for error messages, the values allowed in a field."""
+    """Annotation that describes, for error messages, the values allowed for a field."""
 
     text: str
 
@@ -30,7 +30,7 @@ def one_of(names: Any) -> Allowed:
 
 
 def existing_file(value: Path | None, info: ValidationInfo, what: str) -> Path | None:
-    """Return the path of ``value``, which is relative to the folder of the hand file.
+    """Resolve ``value``, a path relative to the folder of the hand file.
 
     Raises:
         ValueError: There is no such file.

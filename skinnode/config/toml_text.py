@@ -35,8 +35,8 @@ _DEEPEST: Final = 32
 """Maximum number of parts in a key; a hand file needs six."""
 _PART: Final = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
 _LONG_KEY: Final = re.compile(rf"(?<![\w\-\"'])(?:{_PART}\.[ \t]*+){{{4 * _DEEPEST}}}")
-"""Pattern of a key with far more parts than that; also matches long runs of numbers joined by dots, which no
-hand file has."""
+"""Pattern of a key with far more than ``_DEEPEST`` parts; also matches long runs of numbers joined by dots,
+which no hand file has."""
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # integer range of TOML 1.0
 _INTEGERS: Final = "integers from -2^63 to 2^63 - 1"
 _TOO_LONG: Final = Shown("a longer integer")
@@ -66,7 +66,7 @@ def read_toml(path: Path, what: str) -> Document:
 
     Args:
         path: The file.
-        what: Kind of file, for errors.
+        what: Type of file, for errors.
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or has
@@ -117,7 +117,7 @@ def _leaves(table: dict[str, Any]) -> Iterator[tuple[KeyPath, Any]]:
 def _syntax_error(where: str, text: str, message: str) -> ConfigError:
     """Convert a tomllib message to a ConfigError.
 
-    The message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
+    The tomllib message ends with the position, ``(at line 3, column 5)`` or ``(at end of document)``.
     """
     match = re.fullmatch(r"(?P<what>.*) \(at (?P<place>.*)\)", message, flags=re.DOTALL)
     what, place = (match["what"], match["place"]) if match else (message, "somewhere")

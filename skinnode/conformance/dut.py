@@ -99,7 +99,7 @@ class Dut:
             if self.bus.take(self.sdo.answer_id, _ASK_EACH_S) is not None:
                 self.up = True
                 return
-        raise NodeTimeout(self.node_id, f"no boot-up message and no answer within {BOOT_S:g} s of a reset")
+        raise NodeTimeout(self.node_id, f"no boot-up message and no response within {BOOT_S:g} s of a reset")
 
     def operational(self) -> None:
         """Start the node."""
@@ -140,7 +140,7 @@ class Dut:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Request the state by a remote frame and return the response byte; None if there is no response."""
+        """Request the state with a remote frame and return the response byte, or None without a response."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -158,7 +158,7 @@ class Dut:
         return entry
 
     def need_storage(self, index: int, subindex: int) -> None:
-        """Raise NotApplicable if the device does not store (0x1010) or restore (0x1011) on command.
+        """Raise NotApplicable if the device cannot store (0x1010) or restore (0x1011) parameters on command.
 
         Bit 0 of the value indicates the capability (CiA 301, 7.5.2.13 and 7.5.2.14).
         """
@@ -175,7 +175,7 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Restore the node's defaults if it supports this on command, and reset the node."""
+        """Restore the node's defaults if the node supports this command, and reset the node."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)

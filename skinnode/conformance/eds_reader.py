@@ -176,7 +176,7 @@ def _hex(text: str) -> bytes | None:
 
 
 def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
-    """Read an EDS or DCF in any encoding; the ``source`` of the result names an encoding other than ASCII.
+    """Read an EDS or DCF in any encoding; ``source`` in the result names the encoding unless it is ASCII.
 
     Args:
         path: The file.
@@ -193,7 +193,7 @@ def parse_eds_file(path: Path, key: str = "EDS") -> tuple[Eds, EdsText]:
     try:
         read = read_eds_text(data)
     except UnicodeDecodeError:
-        raise ProfileError("EDS", Shown("malformed UTF-16"), "a file as in CiA 306", where=name) from None
+        raise ProfileError("EDS", Shown("malformed UTF-16"), "a file in CiA 306 format", where=name) from None
     eds = parse_eds(read.text, name, read.codec)
     return (replace(eds, source=f"{name}, {read.note}") if read.note else eds), read
 
@@ -223,7 +223,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
             options["parametername"] = for_people(options["parametername"], codec)
     if "deviceinfo" not in sections or "1000" not in sections:
         raise ProfileError(
-            "EDS", Shown("no section DeviceInfo or 1000"), "a file as in CiA 306", where=source
+            "EDS", Shown("no section DeviceInfo or 1000"), "a file in CiA 306 format", where=source
         )
     entries, found = _entries(sections, source)
     dummies = sections.get("dummyusage", {})
@@ -231,7 +231,7 @@ def parse_eds(text: str, source: str, codec: str = "utf-8") -> Eds:
         found += _listed(sections, {index for index, _ in entries})
         dummy_types = [kind for kind in range(1, 0x20) if number(dummies.get(f"dummy{kind:04x}", "0") or "0")]
     except ValueError as error:  # text in place of a number
-        allowed = "numbers as in CiA 306 in the lists of objects and dummy entries"
+        allowed = "numbers in CiA 306 format in the lists of objects and dummy entries"
         raise ProfileError("EDS", Shown(str(error)), allowed, where=source) from None
     return Eds(
         source=source,

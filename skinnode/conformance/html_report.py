@@ -72,7 +72,7 @@ auto; font: 12.5px/1.45 ui-monospace, monospace; max-height: 26rem; }
 
 
 def as_html(report: Report, title: str, when: datetime.datetime) -> str:
-    """Return the report as HTML, with failed cases unfolded.
+    """Return the report as HTML, with failed cases expanded.
 
     Args:
         report: Results of the run.

@@ -47,16 +47,16 @@ class Pdo:
 
 
 class Unsupported(Exception):
-    """Raised if a PDO rejects a transmission type or lacks a sub-index; the standard permits both."""
+    """Raised if the device lacks a sub-index or a transmission type of a PDO; the standard permits both."""
 
 
 def rpdos(dut: Dut) -> list[Pdo]:
-    """Return the RPDOs of the EDS."""
+    """Return the RPDOs described in the EDS."""
     return [Pdo(index) for index in dut.eds.indices(0x1400, 0x15FF)]
 
 
 def tpdos(dut: Dut) -> list[Pdo]:
-    """Return the TPDOs of the EDS."""
+    """Return the TPDOs described in the EDS."""
     return [Pdo(index) for index in dut.eds.indices(0x1800, 0x19FF)]
 
 

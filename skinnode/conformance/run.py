@@ -20,7 +20,7 @@ from skinnode.protocol.profile import BusType, PatchProfile
 from skinnode.transport import CanPort
 
 SILENT_CASES: Final = 3
-"""Number of successive cases with a silent node after which the remaining cases are not run."""
+"""Number of consecutive cases with a silent node after which the remaining cases are not run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def connect(port: CanPort, node_id: int, eds: Eds | None = None) -> Dut:
     Args:
         port: The bus.
         node_id: The node.
-        eds: Its EDS. A patch of this project needs no EDS, because its EDS follows from its descriptor
+        eds: Its EDS. A patch of this project needs none, because its EDS is derived from its descriptor
             (0x2000).
 
     Raises:
@@ -92,7 +92,7 @@ def _own_eds(sdo: SdoClient) -> Eds:
 def run_cases(dut: Dut, cases: Iterable[Case], say: Callable[[Result], None] = lambda _: None) -> Report:
     """Run ``cases`` one after another.
 
-    Any behaviour of the node leads to a result. At the end the node is reset, with its original
+    Every case yields a result, however the node behaves. At the end the node is reset and has its original
     configuration.
 
     Args:
@@ -141,7 +141,7 @@ def run_case(dut: Dut, case: Case) -> Result:
         verdict, why = Verdict.FAILED, str(failure)
     except BusError:
         raise
-    except Exception as error:  # an unexpected answer fails the case, not the run
+    except Exception as error:  # an unexpected response fails the case, not the run
         verdict, why = Verdict.FAILED, f"unexpected answer ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 

@@ -1,7 +1,7 @@
 """SDO client built on raw frames (CiA 301 v4.2.0, 7.2.4.3): expedited, segmented and block transfer.
 
-The client is made for testing: it checks every answer byte by byte, and can violate the protocol on request.
-It shares no code with this project's server.
+The client is made for testing: it checks every response byte by byte, and can violate the protocol on
+request. It shares no code with this project's server.
 """
 
 from __future__ import annotations
@@ -99,17 +99,17 @@ class SdoClient:
         self._bus.send(self.request_id, request.ljust(8, b"\0"))
 
     def answer(self, what: str) -> bytes:
-        """Return the next answer. Raises Failed if no answer arrives or its length is not eight bytes."""
+        """Return the next response. Raises Failed if none arrives or its length is not eight bytes."""
         return self._checked(self._bus.take(self.answer_id, ANSWER_S), what)
 
     def ask(self, request: bytes, what: str) -> bytes:
-        """Discard earlier answers, send a request and return its answer, which may be an abort."""
+        """Discard earlier responses, send a request and return the response, which may be an abort."""
         self._bus.pending(self.answer_id)
         self.send(request)
         return self.answer(what)
 
     def served(self, request: bytes, what: str) -> bytes:
-        """Send a request as :meth:`ask` does. Raises Aborted if the answer is an abort."""
+        """Send a request as :meth:`ask` does. Raises Aborted if the response is an abort."""
         return _not_aborted(self.ask(request, what), what)
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:

@@ -1,7 +1,7 @@
 """Sends and receives raw frames on a bus, and keeps a trace of them.
 
 Received frames wait in an inbox, in order of arrival, until a case asks for them. A PDO that arrives before
-the SDO answer is therefore not lost. Every wait is bounded.
+the SDO response is therefore not lost. Every wait is bounded.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from skinnode.transport import CanPort, Frame
 
 ANSWER_S: Final = 1.0
-"""Maximum wait for an answer; far longer than a device needs, so that a busy machine fails no case."""
+"""Maximum wait for a response; far longer than a device needs, so that no case fails on a busy machine."""
 
 QUIET_S: Final = 0.06
 """Time without frames that counts as silence."""
@@ -32,7 +32,7 @@ class Failed(Exception):
 
 
 class TraceLine(NamedTuple):
-    """A sent or received frame of a case."""
+    """Frame sent or received during a case."""
 
     t_s: float
     """Time since the case began."""

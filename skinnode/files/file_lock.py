@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum attempts to lock; an attempt fails only if the owner removes the file between open and lock."""
+"""Maximum locking attempts; one fails only if the previous owner removes the file after we open it."""
 
 
 class FileInUse(BlockingIOError):
@@ -41,7 +41,7 @@ class FileLock:
     process: int
 
     def release(self) -> None:
-        """Release the lock; call only once. A forked child that inherited the lock keeps it locked."""
+        """Release the lock; call only once. A forked child that inherited the lock keeps the file locked."""
         if self.process == os.getpid():
             with contextlib.suppress(OSError):
                 self.path.unlink()
@@ -55,7 +55,7 @@ def lock_file(path: Path) -> FileLock:
         The lock, which the caller must release.
 
     Raises:
-        FileInUse: This process or another one owns the lock.
+        FileInUse: This or another process owns the lock.
         NotARegularFile: ``path`` exists and is not a regular file.
         OSError: The file cannot be created.
     """

@@ -10,8 +10,8 @@ from typing import Final
 from skinnode.errors import ConfigError
 
 MOST_BYTES: Final = 1 << 20
-"""Maximum size of a text file: ten times the largest known hand file, layout or baseline. Parsers need
-about a hundred times the memory of the text."""
+"""Maximum size of a text file: ten times the size of the largest known hand file, layout or baseline. Parsers
+need about a hundred times as much memory as the text."""
 
 
 def read_input(key: str, path: Path, most_bytes: int = MOST_BYTES) -> bytes:

@@ -1,8 +1,8 @@
 """Writes files atomically.
 
-The new content is written to a file with a random name in the same folder, which is created exclusively and
-never through a symbolic link, and is renamed once it is complete. Readers always see either the old or the
-new content; after an error the old content remains.
+The new content is written to a file with a random name in the same folder. This file is created exclusively,
+never through a symbolic link, and renamed once it is complete. Readers always see either the old or the new
+content; after an error the old content remains.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
         durable: Whether to return only once the file and its name are on the storage medium.
 
     Raises:
-        OSError: The file cannot be written; it keeps its old content.
+        OSError: The file cannot be written and keeps its old content.
     """
     beside = create_beside(path, data, mode=mode, durable=durable)
     try:
@@ -40,7 +40,7 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = 
 
 
 def create_beside(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> Path:
-    """Write ``data`` to a new file in the folder of ``path``, which the caller must rename or discard.
+    """Write ``data`` to a new file beside ``path``; the caller must rename or discard the new file.
 
     Args:
         path: The file to be replaced by the new file.
@@ -89,7 +89,7 @@ def discard_leftovers(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the names in ``folder`` to the storage medium; a rename is durable once its folder is flushed."""
+    """Flush the directory entries of ``folder`` to the storage medium, which makes renames in it durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

@@ -80,7 +80,7 @@ def check_eds(path: Path, profile: PatchProfile) -> None:
     try:
         text = read_eds_text(data).readable
     except UnicodeDecodeError:
-        allowed = "a file as in CiA 306"
+        allowed = "a file in CiA 306 format"
         raise ProfileError("EDS", Shown("malformed UTF-16"), allowed, where=str(path)) from None
     check_form(text, str(path))
     try:

@@ -1,9 +1,9 @@
 """Starts child processes that survive signals from the command's terminal.
 
-A terminal also sends Ctrl-C (SIGINT) and SIGHUP to the children of a command. Python would print a
-traceback in a child that is still importing, and SIGHUP would end the resource tracker of ``multiprocessing``
-before it has cleaned up. Children therefore start with both signals blocked and keep them blocked; the
-command terminates them.
+A terminal sends SIGINT (Ctrl-C) and SIGHUP not only to a command but also to its children. Python would print
+a traceback in a child that is still importing, and SIGHUP would end the resource tracker of
+``multiprocessing`` before it has cleaned up. Children therefore start with both signals blocked and keep them
+blocked; the command terminates them.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ def without_long_collections() -> Iterator[None]:
 def responsive_threads() -> Iterator[None]:
     """Make computing threads yield after 0.5 ms, instead of Python's 5 ms, for the duration of the block.
 
-    With 5 ms, a thread that receives or draws could delay a scan for longer than solving it takes.
+    With 5 ms, a thread that receives or draws could delay a scan by more than the time needed to solve it.
     """
     kept = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)

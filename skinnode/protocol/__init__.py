@@ -3,5 +3,5 @@
 Node:  resistances → ``codes`` → codes → ``chunk``, ``summary`` → PDO payloads, mapped as ``profile`` defines.
 Host:  PDO payloads → ``chunk``, ``summary`` → ``assembler`` → one complete scan → ``codes`` → resistances.
 
-``codec`` only collects the public names of these files for users.
+``codec`` only re-exports the public names of these modules.
 """

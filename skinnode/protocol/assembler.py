@@ -12,7 +12,7 @@ node-ID, are detected when a frame is received twice with different content. The
 assigned to either scan, so the whole scan is discarded. The same applies to a scan with missing frames whose
 chunks are more than two periods apart: it began with a chunk that carried the counter of a later scan, and
 the later scan's own chunk arrives after the timeout. If the frames of the two scans do not overlap, only the
-check reveals that they are not one scan.
+check reveals that the frames belong to different scans.
 
 **The check.** A summary with :attr:`~skinnode.protocol.summary.SummaryFlag.CHECKED` carries a CRC over all
 codes that the receiver must hold (:mod:`skinnode.protocol.scan_check`). If the check fails, the wrong chunk
@@ -22,13 +22,13 @@ sent. A stream is *checked* from the first check that passes, or from a :meth:`S
 lacks codes of chunks that were not sent again, is published as *unchecked*, and a summary without a check is
 rejected. Patches of revision 1.0 send no checks; their scans are complete when all chunks have been received.
 
-**Order of counters.** A counter up to half the counter range ahead is newer; any other counter is late, and
-its frame is dropped. After a timeout without an accepted frame, any counter starts a new stream, because the
-node or the SYNC producer may have been restarted.
+**Order of counters.** A frame whose counter is up to half the counter range ahead is newer; a frame with any
+other counter is late and is dropped. After a timeout without an accepted frame, a frame with any counter
+starts a new stream, because the node or the SYNC producer may have been restarted.
 
 **Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the others keep
-their last codes (:mod:`skinnode.protocol.partial_scan`). If any scan since then was lost, torn or overrun, or
-a silence was long enough to hide such a scan, these codes may have changed and are invalid until their chunks
+their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan has since been lost, torn or overrun, or a
+silence was long enough to hide such a scan, these codes may have changed and are invalid until their chunks
 are sent again.
 """
 
@@ -68,8 +68,8 @@ class ScanAssembler:
     Args:
         profile: sizes of the patch.
         counter_overflow: value of 0x1019; scan counters run from 1 to this number with the SYNC, or freely
-            from 0 to 255 if it is 0.
-        period_ns: time between two scans, ns; sets the timeout.
+            from 0 to 255 if this value is 0.
+        period_ns: time between two scans, ns; determines the timeout.
         grace_ns: time to wait for late frames after the summary or all chunks have arrived, ns.
         node_id: node-ID shown in the errors passed to ``on_reject``.
         on_reject: called with a CodecError for each frame of the wrong length or form.
@@ -211,7 +211,10 @@ class ScanAssembler:
         return self._close() if deadline is not None and t_ns >= deadline else None
 
     def next_deadline_ns(self) -> int | None:
-        """Return when :meth:`poll` will return a scan if no frame arrives, ns; None if no scan is open."""
+        """Return the time at which :meth:`poll` will close the open scan, ns; None if no scan is open.
+
+        The time assumes that no further frame arrives.
+        """
         if self._counter == _NONE_OPEN:
             return None
         if self._received >= self._sent != _NEVER:
@@ -356,7 +359,7 @@ class ScanAssembler:
         self._expires_ns = t_ns + self._timeout_ns
 
     def _steps_to(self, counter: int, last: int) -> int:
-        """Return the number of scans from ``last`` to the next with this counter, 1 … range."""
+        """Return the number of scans from ``last`` to the next scan with this counter, 1 … range."""
         return (counter - last) % self._range or self._range
 
     def _book(self) -> None:

@@ -78,7 +78,7 @@ class CodeScale:
 
     @property
     def relative_std(self) -> float:
-        """RMS rounding error relative to R0: step / √12, as for an error uniform over one step."""
+        """RMS rounding error relative to R0: step / √12, for an error uniformly distributed over one step."""
         return self.step / math.sqrt(12.0)
 
 
@@ -99,7 +99,7 @@ def encode(resistance_ohm: ArrayLike, baseline_ohm: ArrayLike, scale: CodeScale)
 
     +inf and NaN become the code for open; zero and negative values become the code for short. R/R0 outside lo
     … hi becomes the over-range code, as does a measurement without a baseline (R0 not positive and finite). A
-    value within half a step of the range counts as inside it.
+    value up to half a step outside the range counts as inside.
 
     Args:
         resistance_ohm: any shape, ohm.

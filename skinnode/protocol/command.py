@@ -13,7 +13,7 @@ _COB_ID: Final = od.command_cob_id(0)
 
 
 class SendMode(enum.IntEnum):
-    """Selection of the chunks that are sent per scan, 0x2020:1."""
+    """Selection of the chunks that are sent in each scan, 0x2020:1."""
 
     FULL = 0
     CHANGED = 1

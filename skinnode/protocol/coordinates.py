@@ -1,7 +1,7 @@
 """Object 0x2300, which holds the electrode coordinates as bytes.
 
 Coordinates are signed 32-bit nanometres, little-endian: x y z of every upper electrode, wire by wire, then of
-every lower electrode. The layout hash is also computed over nanometres, so the received layout has the same
+every lower electrode. The layout hash is also computed from nanometres, so the received layout has the same
 hash as the layout sent.
 """
 
@@ -30,7 +30,7 @@ def pack_coordinates(layout: PatchLayout) -> bytes:
 def unpack_coordinates(
     data: bytes, profile: PatchProfile, resistivity_ohm_per_m: float, name: str = "custom"
 ) -> PatchLayout:
-    """Return the layout in the bytes of 0x2300, for a patch with the sizes in ``profile``.
+    """Return the layout encoded in the bytes of 0x2300, for a patch with the sizes in ``profile``.
 
     Raises ConfigError if the number of bytes is wrong, ValueError if the coordinates do not form a layout.
     """

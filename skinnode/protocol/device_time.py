@@ -8,7 +8,7 @@ TIME_STEP_US: Final = 64
 """Unit of the 16-bit device time in a checked summary, µs.
 
 The unit is a power of two, so the 16-bit time, which wraps every 4.2 s, stays in step with the 32-bit time in
-µs. A host that knows the time to ±2 s can restore the upper bits.
+µs. A host that knows the time to within ±2 s can restore the upper bits.
 """
 TIME_SHIFT: Final = 6
 """Shift in bits between a time in µs and a time in steps of 64 µs."""
@@ -37,10 +37,10 @@ class DeviceTimeTracker:
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
-        """Return the 32-bit device time nearest to the last device time plus the host time that has elapsed.
+        """Return the 32-bit device time nearest to the last device time plus the host time elapsed since.
 
         The upper bits of the first time are taken from the host's clock. They are correct if the summary is
-        received up to three seconds after the scan.
+        received no more than three seconds after the scan.
 
         Args:
             low_us: low bits of the time from a checked summary, µs.

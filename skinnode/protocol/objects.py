@@ -20,9 +20,10 @@ _U8, _U16, _U32, _REAL32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNS
 DEFAULT_CODE_LO: Final = 0.25
 """R/R0 at code 0."""
 DEFAULT_CODE_HI: Final = 1.25
-"""R/R0 at the highest code; pressing moves electrodes closer and lowers R, but sliding moves some apart."""
+"""R/R0 at the highest code; pressing moves electrodes together and lowers R, but sliding moves some apart."""
 DEFAULT_REFRESH_SCANS: Final = 10
-"""Number of scans per full scan; lost codes are sent again within 0.8 s, at a tenth of the full traffic."""
+"""Number of scans from one full scan to the next; lost codes are sent again within 0.8 s, at a tenth of the
+full traffic."""
 
 
 def patch_objects(profile: PatchProfile) -> tuple[Object, ...]:

@@ -34,7 +34,7 @@ DEFAULT_PERIOD_MS: Final = 80
 """SYNC period on which the defaults are based, ms; four 10×30 patches use about 2/3 of 1 Mbit/s."""
 
 BusType = Literal["classic", "fd"]
-"""Kind of frame that carries PDOs: CAN 2.0 with up to 8 bytes, or CAN FD with up to 64 bytes."""
+"""Type of frame that carries PDOs: CAN 2.0 with up to 8 bytes, or CAN FD with up to 64 bytes."""
 
 _MOST_SUBINDICES: Final = 254  # CiA 301: sub-index 255 is reserved
 
@@ -63,7 +63,7 @@ class PatchProfile:
     tpdos: int = 4
     """Number of TPDOs: TPDO1 carries chunks and TPDO2 summaries; the others are spare."""
     bus: BusType = "classic"
-    """Kind of frame that carries PDOs."""
+    """Type of frame that carries PDOs."""
     checked: bool = True
     """Whether summaries carry a check over the scan; False for a patch of revision 1.0, whose summaries carry
     32 bits of device time instead."""
@@ -98,7 +98,7 @@ class PatchProfile:
         Args:
             layout: electrodes of the patch.
             code_bits: width of a code, bits: 16 or 24.
-            bus: kind of frame that carries PDOs.
+            bus: type of frame that carries PDOs.
         """
         rows, upper_electrodes = layout.upper_m.shape[:2]
         columns, lower_electrodes = layout.lower_m.shape[:2]
@@ -116,7 +116,7 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum bytes per PDO and also maximum mapped objects, because the smallest object is one byte."""
+        """Maximum number of bytes per PDO and of mapped objects, because the smallest object is one byte."""
         return 8 if self.bus == "classic" else 64
 
     @property

@@ -56,8 +56,8 @@ class AssemblerStats:
     scans_torn: int
     """Scans published with chunks missing."""
     scans_unchecked: int
-    """Scans that contain all sent chunks but were not published as complete, because, in a checked stream,
-    the summary was lost or the codes of chunks that were not sent again are unknown."""
+    """Scans of a checked stream that contain all sent chunks but were not published as complete, because the
+    summary was lost or the codes of chunks that were not sent again are unknown."""
     scans_missed: int
     """Scans of which no frame was received, counted from gaps in the counters."""
     scans_discarded: int
@@ -67,14 +67,15 @@ class AssemblerStats:
     scans_corrupt: int
     """Scans discarded because their check failed, so the codes differ from the codes that the node packed."""
     scans_joined: int
-    """Scans that were in progress when reception began, so were received only in part and never published."""
+    """Scans that were in progress when reception began, and were thus received in part and never
+    published."""
     chunks_accepted: int
     """* Chunks assigned to a scan."""
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing when their scan was published. Not counted are the chunks of missed scans and, while
-    only changed chunks are sent, of scans without a summary."""
+    """Chunks missing when their scan was published. The chunks of missed scans are not counted, nor are,
+    while only changed chunks are sent, those of scans without a summary."""
     summaries_lost: int
     """Summaries missing when their scan was published."""
     duplicates: int

@@ -35,13 +35,14 @@ def scan_check(check_of_codes: int, head: bytes) -> int:
 
     1. All U·K codes, one upper wire after another, little-endian: 2 bytes each, or 3 for 24-bit codes.
        These are the codes that a receiver holds after this scan. If only changed chunks are sent, they are
-       the codes last sent in every chunk, which may differ from the newest reading by the delta threshold.
+       the codes last sent in every chunk, which may differ from the newest reading by up to the delta
+       threshold.
     2. ``head``, the first 6 bytes of the summary: scan counter, flags, chunks sent, device time. The matrix
        of a different scan therefore fails the check.
 
     The check always detects changes within a span of 16 bits, such as a change of one 16-bit code, and any
-    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. The check
-    misses one in 65,536 of all other errors.
+    odd number of wrong bits. In matrices of up to 4,087 bytes it also detects any two wrong bits. Of all
+    other errors, the check misses one in 65,536.
 
     Args:
         check_of_codes: result of :func:`check_of_codes`.

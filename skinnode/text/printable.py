@@ -6,7 +6,7 @@ Text from a device, a file, a recording or the command line is untrusted. The ru
   (:func:`printable`). The bytes themselves are preserved in ``od --json``, in a DCF and in comparisons.
 * Names in hand.toml are rejected unless they are printable (``skinnode.config``).
 * The output of every command passes through :class:`PrintableStream`, and rich output through the console of
-  ``skinnode.cli``. This is a safety net for echoed text such as file names and arguments.
+  ``skinnode.cli``. Both are a safety net for echoed text such as file names and arguments.
 * Pages also escape HTML, and untrusted text is never interpreted as markup.
 
 Printable is defined by :meth:`str.isprintable`: no control characters (C0, DEL, C1), no format characters
@@ -20,7 +20,7 @@ import re
 from typing import Any, Final, TextIO
 
 MOST: Final = 200
-"""Maximum number of characters shown from an untrusted text; longer than any name, but short enough for one
+"""Maximum number of characters shown of an untrusted text; longer than any name, but short enough for one
 line."""
 
 _SUSPECT: Final = re.compile(r"[^ -~]")
@@ -42,7 +42,7 @@ def printable(text: str | bytes, most: int = MOST) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` without control sequences, in full length, with line ends and tabs.
+    """Return ``text`` without control sequences but at full length, with line ends and tabs.
 
     Use this for messages that contain untrusted parts.
     """

@@ -162,8 +162,8 @@ MISTAKES = {
     "2=0x2010": ("2=0x201q", "[ManufacturerObjects] 2: got '0x201q', allowed: an index such as 0x1018"),
     "1=0x1000": ("1=0x11000", "[MandatoryObjects] 1: got '0x11000', allowed: an index such as 0x1018"),
     "SupportedObjects=3": ("SupportedObjects=x", "[MandatoryObjects] SupportedObjects: got 'x', allowed: a "),
-    "[MandatoryObjects]": ("[Mandatory", "EDS: got '[Mandatory', allowed: a file as in CiA 306"),
-    "[2011]": ("[2010]", "EDS: got '[2010]', allowed: a file as in CiA 306"),
+    "[MandatoryObjects]": ("[Mandatory", "EDS: got '[Mandatory', allowed: a file in CiA 306 format"),
+    "[2011]": ("[2010]", "EDS: got '[2010]', allowed: a file in CiA 306 format"),
     "DataType=0x0007": ("DataType=zz", "[1000] DataType: got 'zz', allowed: a number"),
 }
 OF_ONE_READER = ("[MandatoryObjects]", "[2011]", "DataType=0x0007")

@@ -123,7 +123,7 @@ def test_files_that_a_hand_names_are_read(key: str, tmp_path: Path) -> None:
         str(found.exception)
         == {
             "eds": f"{other}:1: EDS: got 'root:x:0:0:root:/root:/bin/bash', "
-            "allowed: a file as in CiA 306: each [section] once, each key once per section, "
+            "allowed: a file in CiA 306 format: each [section] once, each key once per section, "
             "';' before comments",
             "baseline": f"{other}: baseline, line 1: got 'root:x:0:0:root:/root:/bin/bash', "
             "allowed: 10 lines of 30 positive resistances in ohm",

@@ -288,4 +288,4 @@ def test_utf_16_that_is_none_is_one_line(bus: BusConfig, tmp_path: Path) -> None
     file.write_bytes(b"\xff\xfe[")
     done = run(["od", NODE_ID, "--diff", file], bus)
     assert done.status == 2
-    assert done.stderr == f"error: {file}: EDS: got malformed UTF-16, allowed: a file as in CiA 306"
+    assert done.stderr == f"error: {file}: EDS: got malformed UTF-16, allowed: a file in CiA 306 format"

@@ -421,5 +421,5 @@ def test_eds_that_is_none(hand: HandConfig, tmp_path: Path) -> None:
     with pytest.raises(ProfileError) as caught, Host.from_config(with_eds(hand, path)):
         pass
     assert str(caught.value).startswith(f"{path}:1: EDS: got 'once upon a time', ")
-    assert "allowed: a file as in CiA 306" in str(caught.value)
+    assert "allowed: a file in CiA 306 format" in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -41,7 +41,7 @@ def _first(lines: list[str]) -> str:
 def _missing(eds: Eds) -> Iterator[str]:
     for index, subindex in _MANDATORY:
         if eds.find(index, subindex) is None:
-            yield f"0x{index:04X}:{subindex:02X} is mandatory and missing"
+            yield f"0x{index:04X}:{subindex:02X} is mandatory but missing"
     for parameter in (*eds.indices(0x1400, 0x15FF), *eds.indices(0x1800, 0x19FF)):
         if not eds.has(parameter + 0x200):
             yield f"0x{parameter:04X} has no mapping parameter 0x{parameter + 0x200:04X}"
@@ -81,7 +81,7 @@ def _entry(entry: EdsEntry, node_id: int) -> Iterator[str]:
     if entry.mappable and not (entry.into_rpdo or entry.into_tpdo):
         yield f"{entry}: mappable, but its access type permits neither RPDOs nor TPDOs"
     if entry.mappable and entry.data_type == _DOMAIN:
-        yield f"{entry}: mappable, although a DOMAIN"
+        yield f"{entry}: mappable, although it is a DOMAIN"
     try:
         entry.default_bytes(node_id)
         value = _default(entry, node_id)

@@ -62,7 +62,7 @@ def register_after(dut: Dut) -> None:
         raise Failed(f"0x1001:00 = 0x{frame.data[2]:02X} as in {describe(frame)}", f"0x{got:02X}")
 
 
-@case("EMCY-06", "0x1003:01 holds the last error; 0 clears the history, another value does not", "7.5.2.4")
+@case("EMCY-06", "0x1003:01 holds the last error; only writing 0 clears the history", "7.5.2.4")
 def history_after(dut: Dut) -> None:
     dut.need(_HISTORY, 1)
     frame = short_pdo(dut)

@@ -55,7 +55,7 @@ def others(dut: Dut) -> None:
     for node_id in range(1, 128):
         if node_id != dut.node_id:
             dut.bus.send(0x700 + node_id, remote=True)
-    dut.bus.expect_silence(dut.error_control_id, "answer to remote frames for other nodes")
+    dut.bus.expect_silence(dut.error_control_id, "response to remote frames for other nodes")
     guarded(dut, 127, 0, "after remote frames for other nodes")
 
 

@@ -1,4 +1,4 @@
-"""OD 1 to 9: all EDS objects on the device; 1 to 6 for objects up to 0x1FFF, 7 to 9 for objects above."""
+"""OD 1 to 9: all EDS objects on the device; 1 to 6 for indices up to 0x1FFF, 7 to 9 for higher indices."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def _none(expected: str, faults: list[str]) -> None:
 
 
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
-    """Compare default values with the EDS.
+    """Compare default values with those in the EDS.
 
-    0x1010 and 0x1011 return the device's capabilities rather than defaults, so a difference there is a
-    warning.
+    0x1010 and 0x1011 return the device's capabilities rather than defaults, so a difference in these objects
+    only causes a warning.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -62,7 +62,7 @@ def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
             (doubts if entry.index in (STORE, RESTORE) and entry.subindex else faults).append(text)
     _none("the defaults of the EDS", faults)
     if doubts:
-        raise Warned(f"its store or restore capabilities differ from the EDS: {'; '.join(doubts)}")
+        raise Warned(f"its store or restore capabilities differ from those in the EDS: {'; '.join(doubts)}")
 
 
 @case(

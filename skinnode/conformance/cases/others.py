@@ -26,7 +26,7 @@ RESTRICTED = (
 
 
 def _change(dut: Dut) -> tuple[dict[int, bytes], dict[int, bytes]]:
-    """Write non-default values to harmless objects; return their values before and after."""
+    """Write non-default values to harmless objects; return their old and new values."""
     before, after = {}, {}
     for index, value in ((_EMCY_INHIBIT, 1000), (HEARTBEAT, 20_000)):
         entry = dut.eds.find(index)
@@ -124,7 +124,7 @@ def restore_communication(dut: Dut) -> None:
     _restore(dut, 2)
 
 
-@case("OTHER-09", "0x1020 keeps date and time after storing and reset, and is cleared by writing an object",
+@case("OTHER-09", "0x1020 keeps date and time after storing and reset; a write to another object clears it",
       "7.5.2.23")  # fmt: skip
 def verify(dut: Dut) -> None:
     dut.need(_VERIFY, 1)

@@ -36,7 +36,7 @@ _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check transmission types, and COB-IDs: the first four as pre-defined, and all valid ones distinct."""
+    """Check the transmission types, and that valid COB-IDs are unique and the first four as pre-defined."""
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -101,7 +101,7 @@ def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
 
 @case(
     "PDO-04",
-    "OPERATIONAL: types 254 and 255 are sent when the event timer elapses, not before the inhibit time",
+    "OPERATIONAL: types 254 and 255 are sent when the event timer elapses, but not before the inhibit time",
     "7.2.2.2, 7.5.2.37",
 )
 def event_driven(dut: Dut) -> None:
@@ -119,13 +119,15 @@ def event_driven(dut: Dut) -> None:
         # A delayed frame shortens the next interval; the mean hardly changes.
         if statistics.mean(gaps) < 40 * 0.95 or min(gaps) < 20:
             shown = ", ".join(f"{gap:.1f}" for gap in gaps)
-            raise Failed(f"{pdo} no closer than its inhibit time of 40 ms", f"gaps of {shown} ms")
+            raise Failed(f"{pdo} at intervals of at least its inhibit time of 40 ms", f"gaps of {shown} ms")
 
     each_tpdo(dut, trial)
 
 
 @case(
-    "PDO-05", "OPERATIONAL: the event timer sends the TPDO each time it elapses, 0 turns it off", "7.5.2.37"
+    "PDO-05",
+    "OPERATIONAL: the TPDO is sent each time its event timer elapses, and never if the timer is 0",
+    "7.5.2.37",
 )
 def event_timer(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -165,7 +167,7 @@ def cyclic(dut: Dut) -> None:
 
 
 def _first_of_cycle(dut: Dut, can_id: int, kind: int, name: str) -> int:
-    """Return the number of the SYNC, from 1, that triggered the first TPDO of a cycle."""
+    """Return the number of the SYNC, counted from 1, that triggered the first TPDO of a cycle."""
     for number in range(1, kind + 1):
         sync(dut)
         if dut.bus.take(can_id, _FIRST_S if number < kind else ANSWER_S) is not None:
@@ -267,7 +269,7 @@ def stopped_event(dut: Dut) -> None:
     each_tpdo(dut, _silent(STOP, 255, "STOPPED", event_ms=_EVENT_MS))
 
 
-@case("PDO-11", "STOPPED: the event timer of a TPDO (254) sends nothing", "7.3.2.2.4")
+@case("PDO-11", "STOPPED: a timer-driven TPDO (254) is not sent", "7.3.2.2.4")
 def stopped_timer(dut: Dut) -> None:
     each_tpdo(dut, _silent(STOP, 254, "STOPPED", event_ms=_EVENT_MS))
 
@@ -297,7 +299,7 @@ def pre_operational_event(dut: Dut) -> None:
     each_tpdo(dut, _silent(PRE_OPERATIONAL, 255, "PRE-OPERATIONAL", event_ms=_EVENT_MS))
 
 
-@case("PDO-17", "PRE-OPERATIONAL: the event timer of a TPDO (254) sends nothing", "7.3.2.2.2")
+@case("PDO-17", "PRE-OPERATIONAL: a timer-driven TPDO (254) is not sent", "7.3.2.2.2")
 def pre_operational_timer(dut: Dut) -> None:
     each_tpdo(dut, _silent(PRE_OPERATIONAL, 254, "PRE-OPERATIONAL", event_ms=_EVENT_MS))
 

@@ -75,7 +75,7 @@ def _slots(dut: Dut, pdo: Pdo) -> int:
     return max(entry.subindex for entry in dut.eds.between(pdo.mapping, pdo.mapping))
 
 
-@case("PDO-21", "Default mappings name mappable objects of the EDS with their length, and fit a frame",
+@case("PDO-21", "Default mappings name mappable objects of the EDS with their lengths, and fit into a frame",
       "7.5.2.36, 7.5.2.38")  # fmt: skip
 def default_mapping(dut: Dut) -> None:
     pdos = [*rpdos(dut), *tpdos(dut)]
@@ -201,7 +201,7 @@ def too_long(dut: Dut) -> None:
         what = f"{pdo}: {count} × {8 * entry.size} bits"
         dut.sdo.aborts(request, pdo.mapping, 0, TOO_MUCH, what)
     if not tried:
-        raise NotApplicable("no PDO can map more objects than fit a frame")
+        raise NotApplicable("no PDO can map more objects than fit into a frame")
 
 
 def _fits(entry: EdsEntry, pdo: Pdo) -> bool:

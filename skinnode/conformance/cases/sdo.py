@@ -57,7 +57,7 @@ def check(dut: Dut, index: int, value: int, size: int) -> None:
         raise Failed(f"0x{value:0{2 * size}X} read back from 0x{index:04X}:00", f"0x{got:0{2 * size}X}")
 
 
-@case("SDO-01", "0x1000 is read expedited, four bytes", "7.2.4.3.6")
+@case("SDO-01", "0x1000 is read by expedited transfer, four bytes", "7.2.4.3.6")
 def read_expedited(dut: Dut) -> None:
     answer = dut.sdo.served(b"\x40" + mux(_DEVICE_TYPE, 0), "read of 0x1000:00")
     if answer[:4] != b"\x43" + mux(_DEVICE_TYPE, 0):
@@ -102,7 +102,7 @@ def no_subindex(dut: Dut) -> None:
     dut.sdo.aborts(b"\x40" + mux(_DEVICE_TYPE, 1), _DEVICE_TYPE, 1, NO_SUBINDEX, "read of 0x1000:01")
 
 
-@case("SDO-06", "Reading and writing an object that does not exist is refused", "7.2.4.3.17")
+@case("SDO-06", "Reading and writing an object that does not exist are refused", "7.2.4.3.17")
 def no_object(dut: Dut) -> None:
     index = next(i for i in (0x1004, 0x1013, 0x1FFF) if not dut.eds.has(i))
     dut.sdo.aborts(b"\x40" + mux(index, 0), index, 0, NO_OBJECT, f"read of 0x{index:04X}:00")

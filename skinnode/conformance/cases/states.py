@@ -115,7 +115,7 @@ def _emcy(dut: Dut, what: str) -> None:
 
 @case(
     "STATE-03",
-    "OPERATIONAL: SDO, PDO, EMCY are served; 0x1029 applies to a communication error",
+    "OPERATIONAL: SDO, PDO and EMCY are served; 0x1029 applies to a communication error",
     "7.3.2.2.3, 7.5.2.32",
 )
 def operational(dut: Dut) -> None:
@@ -154,7 +154,7 @@ def stopped(dut: Dut) -> None:
     for can_id in can_ids:
         drain(dut, can_id)
     dut.sdo.send(b"\x40\x00\x10\x00")
-    dut.bus.expect_silence(dut.sdo.answer_id, "SDO answer in STOPPED")
+    dut.bus.expect_silence(dut.sdo.answer_id, "SDO response in STOPPED")
     dut.bus.expect_silence(SYNC_ID, "SYNC of the producer in STOPPED")
     sync(dut)
     for can_id in can_ids:
@@ -164,7 +164,7 @@ def stopped(dut: Dut) -> None:
     dut.nmt(PRE_OPERATIONAL)
     dut.expect_state(127, "after enter pre-operational")
     if dut.bus.take(dut.sdo.answer_id, QUIET_S) is not None:
-        raise Failed("no late answer to an SDO request sent in STOPPED", "one")
+        raise Failed("no late response to an SDO request sent in STOPPED", "one")
     dut.sdo.read(0x1000)
 
 

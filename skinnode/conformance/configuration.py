@@ -34,7 +34,7 @@ def read_configuration(dut: Dut) -> dict[tuple[int, int], bytes]:
 
 
 def write_back(dut: Dut, before: Values) -> list[str]:
-    """Reset the node and put its configuration back, after a case that stored or restored parameters.
+    """Put back the configuration of a node that was reset after a case stored or restored parameters.
 
     Restores the defaults, writes each value in ``before`` that differs from them, and stores the result.
 

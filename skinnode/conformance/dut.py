@@ -145,7 +145,7 @@ class Dut:
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
         if frame is not None and len(frame.data) != 1:
-            raise Failed(f"one byte in answer to a remote frame, {what}", describe(frame))
+            raise Failed(f"one byte in response to a remote frame, {what}", describe(frame))
         return None if frame is None else frame.data[0]
 
     # --- object dictionary

@@ -142,7 +142,7 @@ def run_case(dut: Dut, case: Case) -> Result:
     except BusError:
         raise
     except Exception as error:  # an unexpected response fails the case, not the run
-        verdict, why = Verdict.FAILED, f"unexpected answer ({type(error).__name__}: {error})"
+        verdict, why = Verdict.FAILED, f"unexpected response ({type(error).__name__}: {error})"
     return Result(case, verdict, why, time.monotonic() - begun_s, dut.bus.trace)
 
 

@@ -114,9 +114,9 @@ class SdoClient:
 
     def _checked(self, frame: Frame | None, what: str) -> bytes:
         if frame is None:
-            raise Failed(f"an answer to {what} within {ANSWER_S:g} s", "nothing")
+            raise Failed(f"a response to {what} within {ANSWER_S:g} s", "nothing")
         if len(frame.data) != 8:
-            raise Failed(f"an answer of 8 bytes to {what}", describe(frame))
+            raise Failed(f"a response of 8 bytes to {what}", describe(frame))
         return frame.data
 
     def abort(self, index: int, subindex: int, code: int = GENERAL_ERROR) -> None:

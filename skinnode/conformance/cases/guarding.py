@@ -16,9 +16,11 @@ def guarded(dut: Dut, state: int, toggle: int | None, what: str) -> None:
     got = dut.guard(what)
     toggle_text = "any toggle bit" if toggle is None else f"toggle bit {toggle}"
     if got is None:
-        raise Failed(f"{STATES[state]} and {toggle_text} in answer to a remote frame, {what}", "nothing")
+        raise Failed(f"{STATES[state]} and {toggle_text} in response to a remote frame, {what}", "nothing")
     if got & 0x7F != state or (toggle is not None and got >> 7 != toggle):
-        raise Failed(f"{STATES[state]} and {toggle_text} in answer to a remote frame, {what}", f"0x{got:02X}")
+        raise Failed(
+            f"{STATES[state]} and {toggle_text} in response to a remote frame, {what}", f"0x{got:02X}"
+        )
 
 
 @case("GUARD-01", "0x100C and 0x100D are 0 by default: no life guarding", "7.5.2.11, 7.5.2.12")

@@ -58,7 +58,7 @@ class PlannedFrame:
     worst_s: float
     """Time on the bus with the maximum number of stuff bits, s."""
     typical_s: float
-    """Mean time on the bus with random data, s."""
+    """Mean time on the bus if the data is random, s."""
     scans: bool = False
     """Whether the period is the SYNC period."""
     response_s: float | None = None

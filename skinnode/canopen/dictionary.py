@@ -63,7 +63,7 @@ class Entry:
     default: Value | None = None
     """Default value; None for a device-specific value such as a serial number, which starts at zero."""
     plus_node_id: bool = False
-    """Whether the node-ID is added to the default at start, as for a COB-ID."""
+    """Whether the node-ID is added to the default at start-up, as for a COB-ID."""
     mappable: bool = False
     """Whether the entry can be mapped into a PDO."""
     low: int | None = None

@@ -9,7 +9,7 @@ from typing import Final
 from skinnode.config.hand import HandConfig
 
 SCHEMA_FILE: Final = Path(__file__).with_name("hand.schema.json")
-"""Shipped schema file, which a test compares with the code."""
+"""Shipped schema file, which a test compares with the generated schema."""
 
 
 def schema_text() -> str:

@@ -240,7 +240,7 @@ class SdoClient:
         _check(answer, b"\x60" + mux(index, subindex) + bytes(4), what)
 
     def write_integer(self, index: int, subindex: int, value: int, size: int) -> None:
-        """Download an unsigned number of ``size`` bytes, expedited."""
+        """Download an unsigned number of ``size`` bytes by expedited transfer."""
         self.write(index, subindex, value.to_bytes(size, "little"))
 
     def write_segments(self, index: int, subindex: int, data: bytes) -> None:

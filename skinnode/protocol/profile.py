@@ -140,7 +140,7 @@ class PatchProfile:
 
     @property
     def codes_per_chunk(self) -> int:
-        """Number of codes per chunk: 3 with 16 bits or 2 with 24 bits, over CAN FD up to 30 or 20."""
+        """Number of codes per chunk: 3 of 16 bits or 2 of 24 bits; over CAN FD, up to 30 or 20."""
         return self._most_codes if self.bus == "classic" else -(-self.columns // self.chunks_per_line)
 
     @property

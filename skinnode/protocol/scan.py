@@ -93,4 +93,4 @@ class AssemblerStats:
     bad_form: int
     """* Summaries without a check in a checked stream."""
     resyncs: int
-    """Number of times that the stream resumed after a silence with a counter out of sequence."""
+    """Number of times that the counter was out of sequence when the stream resumed after a silence."""

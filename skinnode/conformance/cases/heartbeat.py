@@ -76,7 +76,9 @@ def in_time(dut: Dut) -> None:
     dut.expect_state(5, "while heartbeats arrive in time")
 
 
-@case("HB-06", "Late heartbeats cause EMCY 0x8130, but not before the consumer time", "7.2.8.2.2.2")
+@case(
+    "HB-06", "Late heartbeats cause EMCY 0x8130, but not before the consumer time has elapsed", "7.2.8.2.2.2"
+)
 def too_late(dut: Dut) -> None:
     partner = foreign_id(dut)
     consume(dut, partner, 100)

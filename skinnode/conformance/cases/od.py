@@ -125,7 +125,7 @@ def structure(dut: Dut) -> None:
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
-        # Mappings (PDO-25), the error field (only 0) and signatures follow other rules.
+        # Mappings (PDO-25), the error field (which accepts only 0) and signatures follow other rules.
         if (entry.index in _PDOS and entry.subindex == 0) or entry.index in (*_COMMANDS, _ERROR_FIELD):
             continue
         for limit, beyond, codes in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):

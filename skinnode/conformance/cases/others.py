@@ -84,7 +84,7 @@ def _restore(dut: Dut, subindex: int) -> None:
     )
 
 
-@case("OTHER-01", "0x1010:01 stores nothing with a wrong signature", "7.5.2.13")
+@case("OTHER-01", "0x1010:01 stores nothing if the signature is wrong", "7.5.2.13")
 def store_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 1)
 
@@ -94,7 +94,7 @@ def store_all(dut: Dut) -> None:
     _store(dut, 1)
 
 
-@case("OTHER-03", "0x1011:01 restores nothing with a wrong signature", "7.5.2.14")
+@case("OTHER-03", "0x1011:01 restores nothing if the signature is wrong", "7.5.2.14")
 def restore_all_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 1)
 
@@ -104,7 +104,7 @@ def restore_all(dut: Dut) -> None:
     _restore(dut, 1)
 
 
-@case("OTHER-05", "0x1010:02 (communication) stores nothing with a wrong signature", "7.5.2.13")
+@case("OTHER-05", "0x1010:02 (communication) stores nothing if the signature is wrong", "7.5.2.13")
 def store_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, STORE, 2)
 
@@ -114,7 +114,7 @@ def store_communication(dut: Dut) -> None:
     _store(dut, 2)
 
 
-@case("OTHER-07", "0x1011:02 (communication) restores nothing with a wrong signature", "7.5.2.14")
+@case("OTHER-07", "0x1011:02 (communication) restores nothing if the signature is wrong", "7.5.2.14")
 def restore_communication_wrong(dut: Dut) -> None:
     _wrong_signature(dut, RESTORE, 2)
 

@@ -51,7 +51,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value < math.inf:
-        raise typer.BadParameter(f"{text!r} is not a non-negative number of seconds")
+        raise typer.BadParameter(f"{text!r} is not a number of seconds, at least 0")
     return value
 
 

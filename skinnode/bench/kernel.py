@@ -29,8 +29,8 @@ SHORT: Final = 1e-3
 class NumpyWire:
     """Computes F and Jᵀ of one wire as fast as NumPy allows: a structure of arrays, preallocated buffers.
 
-    This is the fastest of the axis orders and summation methods that were tried; it takes 85 % of the time
-    that the obvious method takes.
+    This is the fastest combination of axis order and summation method that was tried; it takes 85 % of the
+    time of the obvious one.
     """
 
     def __init__(self, lower: Float, electrodes: int) -> None:

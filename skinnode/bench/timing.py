@@ -17,8 +17,8 @@ from skinnode.files.output_file import write_text
 ROUNDS: Final = 31
 """Default number of rounds; odd, so that the median is a measured time."""
 TURN_S: Final = 4e-3
-"""Duration of a turn, s: long compared with the clock's resolution, short compared with bursts of other
-load."""
+"""Duration of a turn, s: long compared with the clock's resolution, short compared with bursts of
+background load."""
 
 
 @dataclass(frozen=True)

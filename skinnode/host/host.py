@@ -151,7 +151,7 @@ class Host:
         Raises:
             ConfigError: if options, EDS or baseline files contradict the hand, or a layout cannot be solved.
             BusLoadError: if the planned traffic does not fit a bus.
-            BusError: if an interface cannot be opened, or no node of a bus answers and ``bring_up.missing``
+            BusError: if an interface cannot be opened, or no node on a bus answers and ``bring_up.missing``
                 is not ``wait``.
             NodeTimeout: if a node does not answer and ``bring_up.missing`` is not ``wait``.
             NodeError: if a node does not match the hand, or does not keep its configuration.

@@ -172,7 +172,7 @@ class NodeSupervision:
         self._await_again(node, now_ns, was_silent=True)  # Another node may replace a refused node.
 
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
-        """Mark a patch as faulty after a defect.
+        """Mark a patch as faulty because a defect was reported.
 
         If this raises an exception, the call is retried on the next turn.
         """

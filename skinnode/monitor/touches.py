@@ -11,8 +11,8 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth of touched skin, as a fraction of the maximum, if contacts are found by depth alone. Under
-Hertzian pressure the rim of a contact is half as deep as its centre."""
+"""Minimum depth at which skin counts as touched, as a fraction of the maximum depth, if contacts are found by
+depth alone. Under Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
 """Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds this depth once in 10
 million fields."""

@@ -1,10 +1,10 @@
 """Traffic plan of a hand's buses: all frames, their load, and their worst-case delay.
 
 Each bus carries the SYNC, the host's heartbeat if enabled, the frames of other devices listed in the hand
-file, and a sequence of SDO transfers that uses :data:`SDO_SHARE` of the bus. For each patch, the bus also
-carries all chunks and the summary of a scan in every SYNC period, and a heartbeat and one EMCY in every
-heartbeat period. The SDO transfers that configure a returning node are not counted: they have a lower
-priority than any PDO and therefore use only spare bandwidth.
+file, and a sequence of SDO transfers that uses the fraction :data:`SDO_SHARE` of the bandwidth. For each
+patch, the bus also carries all chunks and the summary of a scan in every SYNC period, and a heartbeat and one
+EMCY in every heartbeat period. The SDO transfers that configure a returning node are not counted: they have a
+lower priority than any PDO and therefore use only spare bandwidth.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ PACE_JITTER_S: Final = 0.2e-3
 """Maximum deviation of a chunk from its scheduled time, s, as specified for a patch on an idle machine."""
 
 _SAMPLES: Final = 512
-"""Number of random-data frames averaged to estimate a typical length, with a standard error of 0.1 bits."""
+"""Number of random-data frames averaged to estimate the typical length to a standard error of 0.1 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFrame:
-    """Type of frame on a bus."""
+    """Frames with one identifier in the traffic plan of a bus."""
 
     name: str
     can_id: int
@@ -52,13 +52,13 @@ class PlannedFrame:
     count: int
     """Number of frames per period."""
     spacing_s: float
-    """Minimum time between two frames of a period, s."""
+    """Minimum time between consecutive frames of a period, s."""
     jitter_s: float
     """Maximum deviation from this spacing, s."""
     worst_s: float
     """Time on the bus with the maximum number of stuff bits, s."""
     typical_s: float
-    """Mean time on the bus if the data is random, s."""
+    """Mean time on the bus with random data, s."""
     scans: bool = False
     """Whether the period is the SYNC period."""
     response_s: float | None = None
@@ -88,7 +88,7 @@ class ScanTime:
     node_id: int
     chunks: int
     paced_s: float
-    """Time from the first chunk to the last when paced by the inhibit time, s."""
+    """Time from the first chunk to the last, as paced by the inhibit time, s."""
     worst_s: float | None
     """Worst-case time from queueing the SYNC to the end of the summary, s; None if it is unbounded."""
 
@@ -191,8 +191,8 @@ def plan_of(hand: HandConfig) -> tuple[BusPlan, ...]:
         hand: the hand.
 
     Raises:
-        ConfigError: if the wire format cannot carry a patch, or a frame of another device uses an identifier
-            of the hand.
+        ConfigError: if the wire format cannot carry the data of a patch, or another device's frame uses one
+            of the hand's identifiers.
     """
     profiles = {patch.name: _profile(hand, i, patch) for i, patch in enumerate(hand.patches)}
     return tuple(
@@ -334,7 +334,7 @@ def _ceil_ns(time_s: float) -> int:
 def _scan_time(
     patch: PatchConfig, profile: PatchProfile, hand: HandConfig, answers: dict[int, float | None]
 ) -> ScanTime:
-    """Return the scan time; the worst case includes SYNC, node latency, pacing, last chunk and summary."""
+    """Return the scan time; its worst case sums SYNC, node latency, pacing, last chunk and summary."""
     spacing_s = inhibit_time_100us(hand.sync.period_ms, profile.n_chunks + 1) * 1e-4
     paced_s = (profile.n_chunks - 1) * spacing_s
     parts = [

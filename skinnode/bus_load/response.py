@@ -9,8 +9,7 @@ Extension: frames may come in bursts of ``count`` frames ``spacing_ns`` apart in
 a scan do. A window that starts with a burst contains the maximum number of frames, so the analysis holds with
 that number instead of the paper's ⌈(t + J) / T⌉.
 
-Retransmission after an error, and controllers whose buffers send a lower-priority frame first, are not
-covered.
+Retransmission after an error, and controllers that may send a lower-priority frame first, are not covered.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ class Message:
     time_ns: int
     """Maximum duration of a frame including the inter-frame space, ns."""
     period_ns: int
-    """Minimum time between two bursts, ns."""
+    """Minimum time from the start of one burst to the start of the next, ns."""
     count: int = 1
     """Number of frames per burst."""
     spacing_ns: int = 0
-    """Minimum time between two frames of a burst, ns."""
+    """Minimum time between consecutive frames of a burst, ns."""
     jitter_ns: int = 0
     """Maximum queueing jitter of a frame, ns; frames of the same message keep their order."""
 
@@ -55,7 +54,7 @@ class Message:
             raise ValueError(f"spacing_ns: got {burst}, must fit {self.period_ns} ns")
 
     def due_ns(self, instance: int) -> int:
-        """Return the time at which an instance is due, ns after instance 0."""
+        """Return the time from instance 0 to the time at which an instance is due, ns."""
         burst, number = divmod(instance, self.count)
         return burst * self.period_ns + number * self.spacing_ns
 

@@ -16,7 +16,7 @@ from skinnode.compiled.jit import njit_brief
 HEAD_BITS: Final = 19  # SOF, 11-bit identifier, RTR, IDE, r0, 4-bit DLC
 CRC_BITS: Final = 15
 TAIL_BITS: Final = 13
-"""Length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and inter-frame space (3), bits."""
+"""Total length of CRC delimiter, ACK slot, ACK delimiter, end of frame (7), inter-frame space (3), bits."""
 FD_NOMINAL_BITS: Final = 17 + 12  # SOF, 11-bit identifier, RRS, IDE, FDF, res, BRS; then the tail
 _CRC_POLYNOMIAL: Final = 0x4599
 _RUN: Final = 5
@@ -28,7 +28,7 @@ _Bytes = NDArray[np.uint8]
 
 @functools.cache
 def tables() -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-    """Return tables of the CRC by byte, and of the next run and number of stuff bits by ``run << 8 | byte``.
+    """Return tables: the CRC by byte; the next run and the number of stuff bits by ``run << 8 | byte``.
 
     A run is encoded as 0 before the first bit, otherwise as (value << 2 | length − 1) + 1 with a length of 1
     to 4. After the fifth equal bit, a stuff bit is inserted, which begins a new run.
@@ -91,8 +91,9 @@ def classic_bits(ids: NDArray[np.uint32], lengths: _Bytes, payload: _Bytes, stri
         ids: (n,) identifiers.
         lengths: (n,) data lengths, bytes.
         payload: the data of all frames, concatenated.
-        stride: bytes from the start of one frame's data to the next; 0 if there are no gaps.
-        bits: (n,) output, bits of each frame.
+        stride: number of bytes from the start of one frame's data to the start of the next frame's; 0 if
+            there are no gaps.
+        bits: (n,) output, number of bits in each frame.
 
     Returns:
         Total number of bits.
@@ -164,8 +165,9 @@ def _fd(  # noqa: PLR0913 - arrays of a compiled kernel
         else:
             code = 11 + length // 16  # 32, 48, 64
 
-        # Two filler bits extend the 22 bits up to the length code to three bytes, and the data bytes follow.
-        # FDF, res and BRS alternate, so no stuff bit falls between the first two bytes (nominal) and ESI.
+        # Two filler bits extend the 22 bits up to and including the length code to three bytes, and the data
+        # bytes follow. FDF, res and BRS alternate, so no stuff bit falls between the first two bytes
+        # (nominal) and ESI.
         stream = 0b01 << 22 | np.int64(ids[i] & 0x7FF) << 10 | 0b10100000 | code
         slow: Any = 0
         stuff: Any = 0

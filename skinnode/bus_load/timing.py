@@ -56,7 +56,7 @@ def nominal_bits(dlc: int, *, extended: bool = False) -> int:
 
 
 def worst_case_bits(dlc: int, *, extended: bool = False) -> int:
-    """Return the maximum number of bits in a frame: stuff bits follow the first 5 and every 4 further bits.
+    """Return the maximum number of bits in a frame, with a stuff bit after the first 5 and each further 4.
 
     Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1.
     """
@@ -123,7 +123,8 @@ def fd_bits(can_id: ArrayLike, data: ArrayLike) -> tuple[_Int, _Int]:
         (n,) bits at the nominal bit rate, including inter-frame space, and (n,) bits at the data bit rate.
 
     Raises:
-        ValueError: if a shape is wrong, an identifier has more than 11 bits, or no frame has that length.
+        ValueError: if a shape is wrong, an identifier has more than 11 bits, or the length is not valid in
+        CAN FD.
     """
     ids, payload = np.asarray(can_id, np.int64), np.asarray(data, np.uint8)
     if ids.ndim != 1 or payload.ndim != 2 or len(payload) != len(ids):
@@ -150,12 +151,12 @@ def fd_worst_case_bits(length: int) -> tuple[int, int]:
         Bits at the nominal and at the data bit rate, as in :func:`fd_bits`.
 
     Raises:
-        ValueError: if no frame has that length.
+        ValueError: if the length is not valid in CAN FD.
     """
     if length not in FD_LENGTHS:
         raise ValueError(f"length: got {length}, must be one of {FD_LENGTHS}")
     # In the 14 bits from SOF to IDE a stuff bit may follow the first 5 bits and every 4 further bits. FDF,
-    # res and BRS alternate, ESI is 0 and the length code is known. The data are assumed to be the worst case.
+    # res and BRS alternate, ESI is 0 and the length code is known. For the data, the worst case is assumed.
     # The first run is one recessive bit, BRS.
     stuff = {(1 << 2) + 1: 0}
     code = FD_LENGTHS.index(length)

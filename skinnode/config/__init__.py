@@ -1,4 +1,4 @@
-"""Options of a hand, read from ``hand.toml``, with one module per table of the file.
+"""Configuration of a hand, read from ``hand.toml``, with one module per table of the file.
 
 ::
 

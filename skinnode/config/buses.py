@@ -42,7 +42,7 @@ class BusConfig(Table):
     """CAN bus, identified by the names of its interface and channel in python-can."""
 
     name: Name = "can0"
-    """Name of the bus, which each patch connected to it gives in its key ``bus``."""
+    """Name of the bus, to which a patch refers in its key ``bus``."""
     interface: Annotated[str, Field(min_length=1), Allowed("the name of a python-can interface")] = "virtual"
     """Name of the interface in python-can: socketcan, pcan, kvaser, udp_multicast, ..."""
     channel: Annotated[str, Field(min_length=1), Allowed("the name of a channel, as a string")] = "skin"
@@ -71,7 +71,7 @@ class BusConfig(Table):
     max_load: Annotated[
         float, Field(gt=0, le=1, allow_inf_nan=False), Allowed("a number above 0 and up to 1")
     ] = MAX_BUS_LOAD
-    """Maximum bus load of the plan, as a fraction, if every frame has its maximum length."""
+    """Maximum planned bus load, as a fraction, with every frame at its maximum length."""
     others: Annotated[tuple[OtherFrame, ...], Field(strict=False)] = ()
     """Frames that other devices send on this bus; the plan takes them into account."""
 
@@ -101,13 +101,13 @@ class SyncConfig(Table):
     stagger_ms: Annotated[
         float, Field(ge=0, allow_inf_nan=False), Allowed("a number of milliseconds, at least 0")
     ] = 0.0
-    """Delay from the SYNC of one bus to the SYNC of the next if the host is the master, milliseconds. At 0,
+    """Delay from the SYNC on one bus to the SYNC on the next when the host is the master, milliseconds. At 0,
     all patches scan at the same instant and their scans end together, so the last field has to
     wait until all others have been solved."""
 
     @property
     def stagger_s(self) -> float:
-        """Delay from the SYNC of one bus to the SYNC of the next, s."""
+        """Delay from the SYNC on one bus to the SYNC on the next, s."""
         return self.stagger_ms * 1e-3
 
     @property
@@ -120,12 +120,12 @@ class BringUpConfig(Table):
     """Settings for bringing up patches, at start-up and later."""
 
     missing: Annotated[Missing, one_of(Missing)] = "refuse"
-    """Action if a patch does not answer at start-up: ``refuse`` to start, or start with the other patches
-    and ``wait`` for it."""
+    """Action if a patch does not answer at start-up: ``refuse`` to start, or start with the other patches and
+    ``wait`` for the missing patch."""
     heartbeat_ms: Annotated[int, Field(ge=20, le=10_000), Allowed("an integer from 20 to 10000")] = 250
     """Heartbeat period of the nodes, milliseconds. The host sets this period in the nodes; a guest that sends
     nothing merely assumes this period. At 250 ms, a lost node is detected within a second, and the heartbeats
-    of four nodes take 0.1 % of the bus."""
+    of four nodes take 0.1 % of the bandwidth."""
 
     @property
     def heartbeat_s(self) -> float:

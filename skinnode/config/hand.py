@@ -70,15 +70,15 @@ class HandConfig(Table):
         return tuple(patch for patch in self.patches if patch.bus == bus)
 
     def where(self, key: str) -> str:
-        """Return ``file:line:column`` of a dotted key, for errors; empty if there is no file."""
+        """Return ``file:line:column`` of a dotted key, for error messages; empty if there is no file."""
         return self._read_of.where(key_path(key))
 
     def on(self, interface: str | None = None, channel: str | None = None) -> HandConfig:
         """Return a copy of the hand that uses another interface or channel.
 
         Args:
-            interface: python-can interface for all buses, instead of the file's.
-            channel: Channel, instead of the file's.
+            interface: python-can interface for all buses, in place of the interfaces in the file.
+            channel: Channel, in place of the channel in the file.
 
         Raises:
             ConfigError: A channel is given for a hand with several buses, or a name is empty.
@@ -97,9 +97,9 @@ class HandConfig(Table):
     @model_validator(mode="before")
     @classmethod
     def _counts(cls, table: Any) -> Any:
-        """Check the number of buses and patches before building them.
+        """Check the numbers of buses and patches before their models are built.
 
-        Building ten thousand patches would take minutes.
+        Building the models of ten thousand patches would take minutes.
         """
         if isinstance(table, Mapping):
             buses, patches = table.get("buses"), table.get("patches")
@@ -190,7 +190,7 @@ def parse_hand(table: Mapping[str, Any], *, folder: Path | None = None, where: s
     Args:
         table: The table, as returned by tomllib.
         folder: Base folder for relative paths; by default the working directory.
-        where: File name for errors.
+        where: File name for error messages.
 
     Raises:
         ConfigError: As :func:`load_hand`.

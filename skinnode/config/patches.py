@@ -113,7 +113,7 @@ def _preset(name: str, **sizes: float | int | None) -> PatchLayout:
 
 
 class PoseConfig(Table):
-    """Pose of the patch's frame (x along the upper wires, z out of the skin) in the frame of the hand."""
+    """Pose of the patch's frame (x along the upper wires, z out of the skin) in the hand's frame."""
 
     position_m: Annotated[
         tuple[_Metres, _Metres, _Metres], Field(strict=False), Allowed("three numbers [x, y, z], metres")
@@ -167,7 +167,7 @@ class CalibrationConfig(Table):
     )
     """Poisson's ratio of the rubber."""
     upper_gain: Annotated[tuple[_Gain, ...] | None, Field(strict=False), Allowed("a list of numbers")] = None
-    """One correction factor per upper wire, which restores the wire's resistances to their values at the time
+    """Correction factors, one per upper wire, that restore the wire's resistances to their values at the time
     of the baseline."""
 
     @property
@@ -186,7 +186,7 @@ class PatchConfig(Table):
     bus: Name = "can0"
     """Name of the bus to which the patch is connected."""
     link: Name | None = None
-    """Name of the robot link that carries the patch, for programs with a robot model."""
+    """Name of the robot link that carries the patch, for programs that use a robot model."""
     pose: PoseConfig = PoseConfig()
     eds: Annotated[Path | None, Field(strict=False), Allowed("the path of an EDS file")] = None
     """Electronic data sheet (EDS) to check against the wire format of this patch; the path is relative to the
@@ -205,7 +205,7 @@ class PatchConfig(Table):
     baseline: Annotated[
         Path | None, Field(strict=False), Allowed("the path of a file of resistances in ohm")
     ] = None
-    """File with the resistances at rest, ohm, with one line per upper wire and one number per lower wire.
+    """File of the resistances at rest, ohm: one line per upper wire, one number per lower wire.
     None: the host reads them from the node."""
     calibration: CalibrationConfig = CalibrationConfig()
 

@@ -20,7 +20,7 @@ class SimulationConfig(Table):
     """Scene that ``vcan-sim`` simulates on each patch: press, slide, lift, repeat. The host ignores it."""
 
     seed: Annotated[int, Field(ge=0), Allowed("an integer of at least 0")] = 1
-    """Random seed of the converter noise and of the positions of the indenters."""
+    """Random seed for the converter noise and the positions of the indenters."""
     indenter_radius_m: Length = 0.04
     """Radius of the spherical indenter."""
     depth: Ratio = 0.1
@@ -32,6 +32,6 @@ class SimulationConfig(Table):
     slide_speed_m_per_s: _Speed = 0.008
     """Sliding speed."""
     cycle_s: _Cycle = 4.0
-    """Duration of one press, slide and lift."""
+    """Duration of one cycle of press, slide and lift."""
     converter_noise: Ratio = 3e-6
     """Standard deviation of the simulated converter's noise, relative to the resistance."""

@@ -47,7 +47,7 @@ _NAME: Final = "a string of 1 to 64 printable characters, not all blank"
 
 
 def _printable(value: str) -> str:
-    """Check that a name, which is printed unescaped, contains no terminal controls or line ends."""
+    """Check that a name, which is printed unescaped, contains no terminal control codes or line breaks."""
     if not value.isprintable() or not value.strip():
         raise ValueError(_NAME)
     return value

@@ -66,11 +66,11 @@ def read_toml(path: Path, what: str) -> Document:
 
     Args:
         path: The file.
-        what: Type of file, for errors.
+        what: Type of file, for error messages.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or has
-            integers outside the range that TOML guarantees. The message is one line.
+        ConfigError: The file cannot be read, is not TOML, is nested more deeply than any hand file, or
+            contains integers outside the range that TOML guarantees. The message is one line.
     """
     try:
         text = read_input(what, path).decode()

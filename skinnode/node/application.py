@@ -37,7 +37,7 @@ class Application(Protocol):
         ...
 
     def on_timer(self, t_ns: int) -> None:
-        """Do everything that is due at ``t_ns``."""
+        """Perform all actions due at ``t_ns``."""
         ...
 
 

@@ -16,10 +16,10 @@ class Pacing:
     """Timer precision of a node's thread, traded against processor time."""
 
     slack_ns: int
-    """Maximum lateness of a timer, ns, which lets one wake-up serve several timers. Frames are always served
-    immediately."""
+    """Permitted lateness of a timer, ns, so that one wake-up can serve several timers. Frames are always
+    served immediately."""
     catch_up_ns: int
-    """Maximum lateness that the chunk pacing makes up for, ns; 0 for a strict inhibit time. See
+    """Maximum lateness for which the chunk pacing compensates, ns; 0 for a strict inhibit time. See
     :mod:`skinnode.node.patch.scan_stream`."""
 
 
@@ -34,10 +34,10 @@ THRIFTY: Final = Pacing(slack_ns=2_000_000, catch_up_ns=50_000_000)
 """Pacing for many nodes on one machine.
 
 Four nodes at 0.6 ms per chunk and 12.5 scans/s use 13 % of one core of a small machine if the thread wakes
-for every chunk, and 7 % with 2 ms of slack. Each node then sends bursts of three frames.
+for every chunk, and 7 % with 2 ms of slack. With the slack, each node sends bursts of three frames.
 
-A kernel with 100 timer ticks per second wakes a thread 10 to 20 ms late, and a busy machine wakes it later
-still. With ``catch_up_ns`` at 10 ms, nodes in a User Mode Linux guest skipped a third of their scans at
-10 scans/s and kept reporting an overrun (0x8110). At 50 ms, they skipped no scans. The mean pace is
-unchanged, but a thread that was delayed by 50 ms sends 50 ms of chunks in one burst.
+A kernel with 100 timer ticks per second wakes a thread 10 to 20 ms late, and even later on a busy machine.
+With ``catch_up_ns`` at 10 ms, nodes in a User Mode Linux guest skipped a third of their scans at 10 scans/s
+and kept reporting an overrun (0x8110). At 50 ms, they skipped no scans. The mean pace is unchanged, but a
+thread that was delayed by 50 ms sends 50 ms of chunks in one burst.
 """

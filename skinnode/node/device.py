@@ -2,7 +2,7 @@
 
 The device is synchronous and deterministic: it has no thread and reads no clock. The caller passes in frames
 and times, and reads the time of the next call from the device. On a bus the caller is
-:class:`~skinnode.node.runner.NodeRunner`; a test passes plain numbers. No received frame raises an exception,
+:class:`~skinnode.node.runner.NodeRunner`; a test passes plain numbers. No received frame causes an exception,
 but an exception from the application or from ``send`` propagates to the caller.
 """
 
@@ -48,11 +48,11 @@ class CanopenDevice:
     Args:
         node_id: 1 to 127, or 255 to wait for a node-ID. A node-ID that LSS stored in the memory takes
             precedence.
-        objects: its object dictionary.
+        objects: declarations of the node's object dictionary.
         application: called once, with the device's services, to create the application.
         send: called with the COB-ID and payload of each frame that the node sends, in order.
         serial: serial number (0x1018:4), u32.
-        memory: keeps values across a power cycle; None if nothing is kept, which 0x1010 then indicates.
+        memory: keeps values across a power cycle; None to keep nothing, as 0x1010 then indicates.
         kind: sizes and layout of the patch, which must match those in the memory; see
             :class:`~skinnode.node.memory.Kept`.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
@@ -133,10 +133,10 @@ class CanopenDevice:
         """Handle a frame with an 11-bit identifier.
 
         Args:
-            can_id: its identifier.
-            data: its payload; ignored for a remote frame.
-            t_ns: when it was received, ns.
-            remote: whether it is a remote frame.
+            can_id: identifier of the frame.
+            data: payload of the frame; ignored for a remote frame.
+            t_ns: time of reception, ns.
+            remote: whether the frame is a remote frame.
         """
         if self._bit_rate_change.silent(t_ns):
             return
@@ -240,7 +240,7 @@ class CanopenDevice:
                 self._nmt.obey(command, t_ns)
 
     def _reset(self, objects: tuple[int, int], t_ns: int) -> None:
-        """Initialise and boot with the node-ID set by LSS, or wait for a node-ID if there is none."""
+        """Initialise and boot with the node-ID set by LSS, or wait for a node-ID if none is set."""
         self._enter(NmtState.INITIALISING, t_ns)
         self._lss.reset_communication()
         self.node_id = self._lss.node_id
@@ -363,7 +363,7 @@ class CanopenDevice:
         handlers: dict[int, Handler] = self._error_control.handlers()
         if self._time.cob_id is not None:
             handlers[self._time.cob_id] = self._on_time
-        # Last, so that no configuration can replace the handlers of SYNC, SDO, NMT and LSS.
+        # Registered last, so that no configuration can replace the handlers of SYNC, SDO, NMT and LSS.
         handlers[self._sync.cob_id] = self._on_sync
         handlers[od.sdo_request_cob_id(self.node_id)] = self._on_sdo
         handlers[od.NMT_COB_ID] = self._on_nmt

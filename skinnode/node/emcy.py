@@ -20,8 +20,8 @@ from skinnode.node.object_dictionary import ObjectStore
 from skinnode.node.pdo.parameters import COB_ID_MASK, INVALID_BIT, check_cob_id
 
 _WAITING: Final = 16
-"""Maximum number of messages held back by the inhibit time, a stopped node or the bus; the oldest are
-dropped."""
+"""Maximum number of messages held back by the inhibit time, the STOPPED state or the bus; beyond this number,
+the oldest are dropped."""
 _RESERVED_BIT: Final = 1 << 30
 
 
@@ -139,7 +139,7 @@ class EmcyProducer:
     def _try(self, t_ns: int) -> None:
         """Send the queued messages if the bus accepts them; otherwise leave them for the next timer event.
 
-        A BusError is suppressed, because the caller still has to handle the error that it is reporting.
+        A BusError is suppressed, because the caller still has to handle the error being reported.
         """
         with contextlib.suppress(BusError):
             self.on_timer(t_ns)
@@ -171,7 +171,7 @@ class EmcyProducer:
         store.watch(od.COB_ID_EMCY, lambda _: self._on_cob_id())
 
     def _read_history(self, subindex: int) -> bytes:
-        """Return the number of errors (sub-index 0) or one of the errors; sub-index 1 is the newest."""
+        """Return the number of errors (sub-index 0) or one of the errors; sub-index 1 holds the newest."""
         if subindex == 0:
             return bytes((len(self._history),))
         if subindex > len(self._history):

@@ -27,7 +27,8 @@ _RIVAL_BEATS: Final = 3
 """Duration of silence after which another node with this node-ID counts as gone, in heartbeat periods of this
 node. Both nodes usually have the same period, set by the same master, and one heartbeat may be lost."""
 _RIVAL_NS: Final = 750_000_000
-"""Time after which the other node counts as gone if this node sends no heartbeats, ns; three default periods.
+"""Duration of silence after which another node with this node-ID counts as gone when this node sends no
+heartbeats, ns; three default periods.
 """
 
 

@@ -19,7 +19,7 @@ _BOOTED: Final = 1
 
 
 class HeartbeatProducer:
-    """Schedule of the heartbeats, which drifts only if a heartbeat is late by a period or more."""
+    """Heartbeat schedule, which drifts only if a heartbeat is late by a period or more."""
 
     def __init__(self) -> None:
         self.period_ns = 0
@@ -38,7 +38,7 @@ class HeartbeatProducer:
         self.deadline_ns = t_ns + self.period_ns if period_ms else NO_DEADLINE_NS
 
     def set_period(self, period_ms: int, t_ns: int) -> None:
-        """Change the period; a heartbeat is due immediately, so that no consumer waits for the old period.
+        """Change the period; a heartbeat is due immediately, so that no consumer waits out the old period.
 
         Args:
             period_ms: heartbeat period, ms; 0 for no heartbeats.
@@ -87,12 +87,12 @@ class HeartbeatConsumer:
         return list(self._monitored)
 
     def reset(self) -> None:
-        """Apply 0x1016 after a reset, with no heartbeat received yet."""
+        """Apply 0x1016 after a reset, when no heartbeat has been received yet."""
         self._monitored = {}
         self.on_written(0)
 
     def on_written(self, t_ns: int) -> None:
-        """Apply a write to 0x1016, which restarts the monitoring of a changed entry."""
+        """Apply a write to 0x1016, and restart the monitoring of a changed entry."""
         words = [self._store.integer(od.HEARTBEAT_CONSUMER, i + 1) for i in range(od.HEARTBEAT_CONSUMERS)]
         wanted = [_Monitored(word >> 16, (word & 0xFFFF) * 1_000_000) for word in words]
         before, self._monitored = self._monitored, {}
@@ -109,13 +109,13 @@ class HeartbeatConsumer:
     def on_heartbeat(self, node_id: int, state: int, t_ns: int) -> None:
         """Handle a heartbeat or boot-up message of a monitored node.
 
-        A boot-up message does not start monitoring, because heartbeats need not follow. A boot-up message
-        after a heartbeat shows that the node has restarted.
+        A boot-up message does not start monitoring, because a node that boots need not send heartbeats. A
+        boot-up message after a heartbeat shows that the node has restarted.
 
         Args:
             node_id: node-ID of the monitored node.
             state: NMT state in the message.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
         """
         item = self._monitored[node_id]
         if state == NmtState.INITIALISING:

@@ -26,7 +26,7 @@ from skinnode.node.clock import NO_DEADLINE_NS
 _CIA_301_TABLE: Final = 0
 
 _OUT_OF_RANGE, _CANNOT_STORE, _STORE_FAILED = 1, 1, 2
-"""Error codes in responses to the configuration services; the meaning of 1 depends on the service."""
+"""Error codes in responses to the configuration services; the meaning of code 1 depends on the service."""
 
 
 # For each frame of *switch selective* and *identify*: the part of the address tested, and the comparison.
@@ -53,9 +53,9 @@ class LssSlave:
         node_id: persistent node-ID, 1 to 127, or :data:`NOT_CONFIGURED`.
         bit_rates_bps: supported bit rates, bit/s; empty if the slave cannot change its bit rate.
         bit_rate_bps: previously configured bit rate, bit/s; None if there is none.
-        store: saves the pending node-ID and bit rate across a power cycle and raises OSError on failure;
+        store: saves the pending node-ID and bit rate permanently and raises OSError on failure;
             None if nothing can be saved.
-        activate: called with the pending bit rate and the delay in ms to start the change of the bit rate;
+        activate: called with the pending bit rate and the delay in ms, to start the bit rate change;
             see :meth:`on_request`.
     """
 
@@ -121,7 +121,7 @@ class LssSlave:
         ignored, as the standard requires, because it may be meant for other slaves.
 
         After *activate bit timing* the node stops sending immediately, changes its bit rate after one delay,
-        and may send again after a second delay, when all other nodes have changed their bit rates.
+        and may send again after a second delay, by which time all other nodes have changed their bit rates.
 
         Args:
             data: the payload.

@@ -1,7 +1,7 @@
 """Values that a node keeps across a power cycle.
 
-A memory stores one :class:`Kept` as a unit. Reading returns either the last or the previous saved content,
-never a mixture. :mod:`skinnode.node.memory_file` stores the content in a file.
+A memory stores one :class:`Kept` as a unit. Reading returns the content of either the last save or the one
+before it, never a mixture. :mod:`skinnode.node.memory_file` stores the content in a file.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Memory(Protocol):
     """Interface of a memory."""
 
     def load(self) -> Kept | None:
-        """Return the last saved content; None if nothing was ever saved.
+        """Return the last saved content; None if nothing has ever been saved.
 
         Raises:
             MemoryFault: if the memory has no usable content.
@@ -82,7 +82,7 @@ class Memory(Protocol):
 
 
 class VolatileMemory:
-    """Memory that lasts as long as this object; serves as the non-volatile memory of a simulated board."""
+    """Memory whose content lasts as long as this object: the non-volatile memory of a simulated board."""
 
     def __init__(self) -> None:
         self._kept: Kept | None = None

@@ -28,8 +28,8 @@ this."""
 class FileMemory:
     """Memory in a human-readable JSON file with a checksum.
 
-    Saving waits some milliseconds for the storage medium. During this time, the node and all other nodes on
-    its thread are blocked.
+    Saving waits a few milliseconds for the storage medium and meanwhile blocks the node and all other nodes
+    on its thread.
 
     A memory owns the file exclusively from :meth:`claim` or the first :meth:`save` until :meth:`close`, the
     end of a ``with`` block or the deletion of the object. The claim is a kernel lock on a lock file beside
@@ -158,7 +158,7 @@ def unpack(data: bytes) -> Kept:
         data: the bytes of the file.
 
     Raises:
-        MemoryFault: if the file is not one that :func:`pack` could have written.
+        MemoryFault: if :func:`pack` cannot have written the file.
     """
     try:
         document = json.loads(data)

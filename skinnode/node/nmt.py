@@ -16,7 +16,7 @@ class NmtSlave:
     Args:
         store: object dictionary; 0x1029 holds the error behaviour.
         rejected: counts frames that are not NMT commands.
-        entered: called with the new state, the previous state and the time in ns after each change.
+        entered: called after each change with the new state, the previous state and the time in ns.
     """
 
     def __init__(
@@ -47,13 +47,13 @@ class NmtSlave:
         self.enter(AFTER_COMMAND[command], t_ns)
 
     def enter(self, state: NmtState, t_ns: int) -> None:
-        """Enter a state, unless the node is in it already."""
+        """Enter a state, unless the node is already in it."""
         if state is not self.state:
             before, self.state = self.state, state
             self._entered(state, before, t_ns)
 
     def on_communication_error(self, t_ns: int) -> None:
-        """Change the state after a heartbeat, guarding or bus-off failure as 0x1029 specifies.
+        """Change the state as 0x1029 specifies, after a missed heartbeat, a life guarding event or bus-off.
 
         0: change from OPERATIONAL to PRE-OPERATIONAL; 1: no change; 2: enter STOPPED.
         """

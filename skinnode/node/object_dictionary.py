@@ -140,7 +140,7 @@ class ObjectStore:
         self._watchers[index] = watcher
 
     def watch_changes(self, watcher: ChangeWatcher) -> None:
-        """Register ``watcher``, called after a client changes a parameter (writable and not computed)."""
+        """Register ``watcher``, called after a client changes a writable object that is not computed."""
         self._change_watcher = watcher
 
     def find(self, index: int, subindex: int) -> Entry:

@@ -27,7 +27,7 @@ class Rejected(IntEnum):
     RPDO = 6
     """RPDO that is shorter than its mapped objects."""
     OWN_ERROR_CONTROL = 7
-    """Boot-up message or heartbeat with this node's own node-ID, which another node therefore uses too."""
+    """Boot-up message or heartbeat with this node's own node-ID; another node uses the same node-ID."""
 
 
 class RejectedFrames:

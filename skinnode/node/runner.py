@@ -24,21 +24,22 @@ _RETRY_S: Final = 0.02
 """Pause after a bus error, s; a full queue drains within this time."""
 
 _CATCH_UP_FRAMES: Final = 4096
-"""Maximum number of frames served before a node is reported as silent; a full bus at 1 Mbit/s carries this
-number in half a second."""
+"""Maximum number of frames served before a node is reported as silent; a full bus at 1 Mbit/s carries as many
+in half a second."""
 
 OFF_AFTER_S: Final = 0.1
 """Duration of uninterrupted bus errors after which nodes treat their controller as bus-off, s; a full queue
 drains sooner."""
 
 REOPEN_S: Final = 1.0
-"""Duration of uninterrupted bus errors after which the interface is reopened, s, in case it was replugged."""
+"""Duration of uninterrupted bus errors after which the interface is reopened, s, in case it was unplugged and
+plugged in again."""
 
 
 class NodeRunner:
     """Runner that powers nodes on and runs them until :meth:`stop`.
 
-    A runner can be started once. Bus errors do not stop it. The runner's thread owns the nodes from
+    A runner can be started only once. Bus errors do not stop it. The runner's thread owns the nodes from
     :meth:`start` to :meth:`stop`; other threads may only read the nodes' counters. The port stays open
     afterwards. Timers are as precise as the most demanding node requires.
 
@@ -63,10 +64,10 @@ class NodeRunner:
         self.bus_errors = 0
         """Number of bus errors so far."""
         self.bus_error = ""
-        """First error of the latest run of errors, in one line."""
+        """First error of the latest series of errors, in one line."""
         self._heard = 0
         self._bus_state = BusState.ACTIVE
-        self._sent_before = 0  # frames sent before the bus went off; one more shows that it has recovered
+        self._sent_before = 0  # frames sent before bus-off; one more shows that the bus has recovered
         self._powered, self._stopping = threading.Event(), threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"nodes {port.config.name}", daemon=True)

@@ -118,8 +118,8 @@ class Storage:
     def restore(self, first: int, last: int) -> None:
         """Set the objects from index ``first`` to ``last`` to their power-on values.
 
-        A saved value undergoes the same checks as a client's write. An object without a saved value, or whose
-        saved value is no longer allowed, is set to its default.
+        A saved value undergoes the same checks as a value written by a client. An object without a saved
+        value, or whose saved value is no longer allowed, is set to its default.
         """
         self._store.restore(first, last)
         values: dict[Key, bytes] = {}
@@ -219,7 +219,7 @@ class Storage:
         return {key: value for key, value in changed.items() if key not in od.COMMANDS}
 
     def _for_this_node(self, key: Key, value: bytes, node_id: int) -> bytes:
-        """Translate a COB-ID that was the default of ``node_id`` into the default of this node."""
+        """Translate a COB-ID that was the default for ``node_id`` into the default for this node."""
         if not self._store.has(*key):
             return value
         entry = self._store.find(*key)

@@ -40,7 +40,7 @@ class SyncWindow:
         self._sync_ns = t_ns
 
     def forget(self, t_ns: int) -> None:
-        """Discard the last SYNC and all missed TPDOs, because the node has entered another NMT state."""
+        """Forget the last SYNC and all discarded TPDOs, because the node has entered another NMT state."""
         self._sync_ns = None
         for number in tuple(self._missed):
             self._clear(number, t_ns)
@@ -109,7 +109,7 @@ class Sync:
         return bool(self._store.integer(od.COB_ID_SYNC) & PRODUCER_BIT)
 
     def reload(self) -> None:
-        """Apply written or reset objects.
+        """Apply objects that were written or reset.
 
         A producer sends its next SYNC one period later, and its first SYNC has counter 1.
         """
@@ -120,7 +120,7 @@ class Sync:
         """Handle a change of the NMT state.
 
         SYNC is produced and consumed in PRE-OPERATIONAL and OPERATIONAL. The counter restarts at 1 when the
-        node enters either of them from any other state.
+        node enters one of these states from a state other than these two.
         """
         if communicates != self._communicates:
             self._communicates, self._wrong_length, self._period_ns = communicates, None, 0
@@ -152,7 +152,7 @@ class Sync:
 
         Args:
             message: the payload.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
         """
         counted = self._overflow > 0
         if len(message) == counted:

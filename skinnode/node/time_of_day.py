@@ -1,8 +1,8 @@
 """TIME consumer: the time of day (CiA 301 v4.2, 7.2.6 and object 0x1012).
 
 A device has no real-time clock. Instead, the node keeps the last time received, and the time of its own clock
-at reception. From these, object 0x2022 gives the current time of day, and the device time of a scan can be
-converted to a date.
+at reception. From these two times, object 0x2022 gives the current time of day, and the device time of a scan
+can be converted to a date.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class TimeConsumer:
 
     def __init__(self, store: ObjectStore, now: Clock) -> None:
         self._store, self._now = store, now
-        self._received_ms = 0  # time since 1984-01-01 at _received_ns of the node's clock
+        self._received_ms = 0  # time since 1984-01-01 when the node's clock read _received_ns
         self._received_ns = 0
         self._messages = 0
         store.guard(od.COB_ID_TIME, self._guard)
@@ -51,7 +51,7 @@ class TimeConsumer:
 
         Args:
             data: the payload.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
 
         Returns:
             False if the payload is not a time of day; the stored time is then unchanged.

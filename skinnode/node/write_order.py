@@ -1,4 +1,4 @@
-"""Order of writing a stored configuration that satisfies the rules of CiA 301."""
+"""Order in which CiA 301 permits the values of a stored configuration to be written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Object dictionary and PDO contents of a patch, as pure code without a bus or clock.
+"""Object dictionary and PDO contents of a patch, as pure code that needs no bus or clock.
 
 Node:  resistances → ``codes`` → codes → ``chunk``, ``summary`` → PDO payloads, mapped as ``profile`` defines.
 Host:  PDO payloads → ``chunk``, ``summary`` → ``assembler`` → one complete scan → ``codes`` → resistances.

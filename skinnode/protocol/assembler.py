@@ -1,11 +1,11 @@
-"""Assembler of one patch's received chunks and summaries into scans; not thread-safe, and without a clock.
+"""Assembly of one patch's received chunks and summaries into scans, not thread-safe and without a clock.
 
 **Scans are never mixed.** A scan holds only frames with its own counter that arrived within the *timeout* of
 its first frame, and it is closed permanently when a frame of a newer scan arrives. Frames of two scans can
 therefore share a scan only if they carry the same counter and arrive within the timeout of each other. Such
-mixing cannot happen while counter range × period is longer than the timeout plus the age of the oldest frame,
-measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter range is
-shorter), so with the usual range of 240 scans a frame may be 237 periods old.
+mixing cannot happen as long as counter range × period is longer than the timeout plus the age of the oldest
+frame, measured from the SYNC of its scan to its arrival. The timeout is three periods (less if the counter
+range is shorter), so with the usual range of 240 scans a frame may be 237 periods old.
 
 **Two scans with the same counter**, from a node that did not increment it or from two nodes with the same
 node-ID, are detected when a frame is received twice with different content. The other frames then cannot be
@@ -26,10 +26,10 @@ rejected. Patches of revision 1.0 send no checks; their scans are complete when 
 other counter is late and is dropped. After a timeout without an accepted frame, a frame with any counter
 starts a new stream, because the node or the SYNC producer may have been restarted.
 
-**Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the others keep
-their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan has since been lost, torn or overrun, or a
-silence was long enough to hide such a scan, these codes may have changed and are invalid until their chunks
-are sent again.
+**Chunks that were not sent.** If the summary indicates that only changed chunks were sent, the other chunks
+keep their last codes (:mod:`skinnode.protocol.partial_scan`). If a scan has since been lost, torn or overrun,
+or a silence was long enough to hide such a scan, these codes may have changed and are invalid until their
+chunks are sent again.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _BASELINE_CHANGED: Final = int(SummaryFlag.BASELINE_CHANGED)
 
 
 class ScanAssembler:
-    """Assembler of one patch's scans. Every method returns at most one scan, in ascending order.
+    """Assembler of one patch's scans. Every method returns at most one scan, and scans are returned in order.
 
     Call :meth:`poll` after each batch of frames and at :meth:`next_deadline_ns`. ``poll`` returns a scan
     whose missing frames have timed out, or a scan that ended in the same call as the scan before it.
@@ -107,7 +107,7 @@ class ScanAssembler:
         self._node_id = node_id
         self._on_reject = on_reject
         self.on_discarded: Callable[[], None] | None = None
-        """Callback for a discarded scan that may have been the first scan of a new baseline."""
+        """Callback for a discarded scan that may have been the first scan with a new baseline."""
 
         # the open scan, or the last scan while none is open
         self._counter = _NONE_OPEN
@@ -142,10 +142,10 @@ class ScanAssembler:
 
         Args:
             data: payload of TPDO1; kept, not copied.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
 
         Returns:
-            The scan ended by the chunk; None if it ended no scan.
+            The scan ended by the chunk; None if the chunk ended no scan.
         """
         if len(data) != self._chunk_bytes:
             self._reject_length(chunk_cob_id(self._node_id), data, self._chunk_bytes, "chunk")
@@ -168,10 +168,10 @@ class ScanAssembler:
 
         Args:
             data: payload of TPDO2.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
 
         Returns:
-            The scan ended by the summary; None if it ended no scan.
+            The scan ended by the summary; None if the summary ended no scan.
         """
         if len(data) != PDO_BYTES:
             self._reject_length(summary_cob_id(self._node_id), data, PDO_BYTES, "scan summary")
@@ -228,7 +228,7 @@ class ScanAssembler:
 
         Args:
             under_way: whether the node may already be sending; chunks missing at the start of the first scan
-                then count as not received instead of lost.
+                then count as not received rather than lost.
             checked: whether the node is known to send a check with every summary; if false, checks are
                 required after the first check that passes.
         """
@@ -359,7 +359,7 @@ class ScanAssembler:
         self._expires_ns = t_ns + self._timeout_ns
 
     def _steps_to(self, counter: int, last: int) -> int:
-        """Return the number of scans from ``last`` to the next scan with this counter, 1 … range."""
+        """Return the number of scans, at least 1, from ``last`` to the next scan with this counter."""
         return (counter - last) % self._range or self._range
 
     def _book(self) -> None:
@@ -427,7 +427,7 @@ class ScanAssembler:
     def _discard(self, *, doubt: bool = True) -> None:
         """Discard a scan, and prevent later scans from inheriting its codes.
 
-        ``doubt``: whether the scan may have been the first scan of a new baseline.
+        ``doubt``: whether the scan may have been the first scan with a new baseline.
         """
         self._held.forget()
         if doubt and self.on_discarded is not None:

@@ -1,6 +1,6 @@
 """Wire format of a patch, collected in one module.
 
-``codes`` converts resistances to codes, ``chunk`` and ``summary`` pack these into PDOs, ``scan_check`` and
+``codes`` converts resistances to codes, ``chunk`` and ``summary`` pack the PDOs, ``scan_check`` and
 ``device_time`` compute two fields of the summary, ``command`` packs the host's commands, and ``self_test``
 the record 0x2023. All functions are pure, without a bus or clock.
 """

@@ -73,7 +73,7 @@ class CodeScale:
 
     @functools.cached_property
     def step(self) -> float:
-        """Width of one code, relative to R0."""
+        """Step from one code to the next, relative to R0."""
         return (self.hi - self.lo) / self.steps
 
     @property

@@ -1,8 +1,8 @@
 """Object 0x2300, which holds the electrode coordinates as bytes.
 
 Coordinates are signed 32-bit nanometres, little-endian: x y z of every upper electrode, wire by wire, then of
-every lower electrode. The layout hash is also computed from nanometres, so the received layout has the same
-hash as the layout sent.
+every lower electrode. The layout hash is also computed from coordinates in nanometres, so the received layout
+has the same hash as the layout that was sent.
 """
 
 from __future__ import annotations

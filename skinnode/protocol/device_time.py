@@ -37,7 +37,7 @@ class DeviceTimeTracker:
         self._time_us = self._t_time_ns = 0
 
     def restore_us(self, low_us: int, t_ns: int) -> int:
-        """Return the 32-bit device time nearest to the last device time plus the host time elapsed since.
+        """Return the 32-bit device time nearest to the last one plus the host time elapsed since then.
 
         The upper bits of the first time are taken from the host's clock. They are correct if the summary is
         received no more than three seconds after the scan.

@@ -65,7 +65,7 @@ REFERENCE_PROFILES: Final = (
     PatchProfile(10, 30, 10, 10, 16, bus="fd"),
     PatchProfile(10, 30, 10, 10, 24, bus="fd"),
 )
-"""One profile per wire format; their EDS files are in ``eds/``."""
+"""Reference profiles, one per wire format; their EDS files are in ``eds/``."""
 
 
 def write_reference_files(folder: Path) -> None:

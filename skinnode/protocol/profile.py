@@ -6,8 +6,8 @@ scan and carries a check over all codes of the matrix (:mod:`skinnode.protocol.s
 
 Over CAN FD a chunk carries part of one upper wire: u8 wire, u8 scan counter, u16 first column and up to 30
 codes of 16 bits (or 20 of 24 bits). All chunks of a patch have the same length, the length of the mapping
-padded to the next valid CAN FD length. A patch with more columns splits each wire into several chunks, as
-equal in size as possible.
+padded to the next valid CAN FD length. If a patch has more columns, the codes of each upper wire are split
+into several chunks, as equal in size as possible.
 
 ``python -m skinnode.protocol.profile eds/`` regenerates the reference EDS files
 (:mod:`skinnode.protocol.eds_files`).
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from skinnode.config import BusConfig, PatchConfig
 
 DEFAULT_PERIOD_MS: Final = 80
-"""SYNC period on which the defaults are based, ms; four 10×30 patches use about 2/3 of 1 Mbit/s."""
+"""SYNC period on which the defaults are based, ms; four 10×30 patches then use about 2/3 of 1 Mbit/s."""
 
 BusType = Literal["classic", "fd"]
 """Type of frame that carries PDOs: CAN 2.0 with up to 8 bytes, or CAN FD with up to 64 bytes."""
@@ -59,7 +59,7 @@ class PatchProfile:
     code_bits: int = 16
     """Width of a code, bits: 16 or 24."""
     rpdos: int = 4
-    """Number of RPDOs: RPDO1 takes commands; the others are spare."""
+    """Number of RPDOs: RPDO1 carries commands; the others are spare."""
     tpdos: int = 4
     """Number of TPDOs: TPDO1 carries chunks and TPDO2 summaries; the others are spare."""
     bus: BusType = "classic"
@@ -116,7 +116,7 @@ class PatchProfile:
 
     @property
     def pdo_bytes(self) -> int:
-        """Maximum number of bytes per PDO and of mapped objects, because the smallest object is one byte."""
+        """Maximum number of bytes in a PDO, and of mapped objects, which are at least one byte each."""
         return 8 if self.bus == "classic" else 64
 
     @property

@@ -30,7 +30,7 @@ class Scan:
     chunks_received: int
     """Number of chunks that arrived."""
     device_time_us: int | None
-    """Node time of the scan, µs, which wraps at 2³²; None if the summary was lost.
+    """Device time of the scan, µs, which wraps at 2³²; None if the summary was lost.
 
     A checked summary carries this time in steps of 64 µs, and the host derives the upper 10 bits, initially
     from its own clock."""
@@ -74,8 +74,8 @@ class AssemblerStats:
     summaries_accepted: int
     """* Summaries assigned to a scan."""
     chunks_lost: int
-    """Chunks missing when their scan was published. The chunks of missed scans are not counted, nor are,
-    while only changed chunks are sent, those of scans without a summary."""
+    """Chunks missing when their scan was published. The chunks of missed scans are not counted. While only
+    changed chunks are sent, neither are the chunks of scans without a summary."""
     summaries_lost: int
     """Summaries missing when their scan was published."""
     duplicates: int

@@ -19,7 +19,7 @@ class SelfTestFault(enum.IntFlag):
     """Faults found by a self-test, 0x2023:2."""
 
     SOURCE = 0x01
-    """The converter failed to return a valid reading at least once."""
+    """At least once, the converter returned no valid reading."""
     NOISE = 0x02
     OPEN_WIRE = 0x04
     SHORTED_WIRE = 0x08
@@ -43,7 +43,7 @@ class SelfTest(NamedTuple):
 
 _SELF_TEST: Final = struct.Struct("<BHBfHHII")
 SELF_TEST_NEVER_RUN: Final = bytes(_SELF_TEST.size)
-"""Record before the first self-test."""
+"""Value of the record before the first self-test."""
 
 
 def pack_self_test(test: SelfTest) -> bytes:

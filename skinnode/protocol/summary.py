@@ -54,7 +54,7 @@ class Summary(NamedTuple):
     :attr:`SummaryFlag.CHECKED`."""
 
 
-_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time of testing an enum flag
+_CHECKED: Final = int(SummaryFlag.CHECKED)  # testing an int takes a tenth of the time of an enum flag
 
 
 def pack_summary(scan: int, flags: int, chunks: int, device_time_us: int) -> bytes:
@@ -85,8 +85,8 @@ def pack_checked_summary(
         flags: bits of :class:`SummaryFlag`.
         chunks: chunks sent in this scan.
         device_time_us: clock of the node, µs; wraps at 2³².
-        check_of_codes: :func:`~skinnode.protocol.scan_check.check_of_codes` of the codes that the receiver
-            must hold.
+        check_of_codes: result of :func:`~skinnode.protocol.scan_check.check_of_codes` for the codes that the
+            receiver must hold.
 
     Raises:
         ValueError: if a number other than the time does not fit its field.

@@ -1,4 +1,4 @@
-"""Journal of a recording: JSON lines, next to the log, with all that a replay needs other than the frames.
+"""Journal of a recording: a JSON Lines file next to the log, with all that a replay needs except the frames.
 
 The first line holds the hand and the offset of the host's clock (:class:`Header`). Each further line is an
 event that affected how the host decoded the frames: ``at`` is the number of frames received on ``bus`` before
@@ -99,7 +99,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
     Args:
         table: Content of a journal line.
         patch: The patch.
-        bus: Its bus.
+        bus: Bus of the patch.
 
     Raises:
         KeyError, TypeError, OverflowError, ValueError: The table is malformed.
@@ -124,7 +124,7 @@ def facts_of(table: Mapping[str, Any], patch: PatchConfig, bus: BusConfig) -> No
             own["name"],
         )
     scale = CodeScale(patch.code_bits, table["lo"], table["hi"])
-    checked = table.get("checked", False)  # absent in the first versions, whose nodes sent no checks
+    checked = table.get("checked", False)  # absent from the first versions, whose nodes sent no checks
     if not isinstance(checked, bool):
         raise TypeError(f"checked: got {checked!r}, must be true or false")
     return NodeFacts(
@@ -187,7 +187,7 @@ def _read_lines(path: Path, file: BinaryIO) -> tuple[Header, list[dict[str, Any]
 
 
 def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
-    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it holds no valid event."""
+    """Parse a line. Raises KeyError, TypeError, RecursionError or ValueError if it is not a valid event."""
     event: dict[str, Any] = json.loads(line)
     _whole(event["at"])
     _whole(event["t_ns"])
@@ -197,7 +197,7 @@ def _event(line: bytes, hand: HandConfig) -> dict[str, Any]:
         case "dropped":
             _whole(event["frames"])
         case "ended":
-            _whole(event.get("frames", 0))  # absent in the first versions
+            _whole(event.get("frames", 0))  # absent from journals of the first versions
         case kind if kind in _OF_PATCHES and hand.patch(event["patch"]).bus == event["bus"]:
             if kind == "overtaken":
                 _whole(event["scan"])

@@ -1,4 +1,4 @@
-"""Record the frames of a running host.
+"""Recorder for the frames of a running host.
 
 The host's threads queue entries and the recorder's own thread writes them, so that a slow disk delays only
 the recording.
@@ -30,11 +30,11 @@ from skinnode.transport.frame_log import SUFFIXES, FrameLog, LogFormat, LoggedFr
 _log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 0.25
-"""Interval between flushes to the kernel: older entries survive a crash of this process."""
+"""Interval between flushes to the kernel, s; entries older than this survive a crash of this process."""
 
 SYNC_S: Final = 1.0
-"""Interval between fsync calls: older entries are on the disk. Each fsync takes the writer thread about 10
-ms."""
+"""Interval between fsync calls, s; entries older than this are on the disk. Each fsync takes the writer
+thread about 10 ms."""
 
 CAPACITY: Final = 50_000
 """Maximum number of batches queued for the disk: several seconds of traffic on four fully loaded buses."""
@@ -57,7 +57,7 @@ class RecorderStats:
 
 
 def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datetime) -> Path:
-    """Return the path of a recording in ``folder``, named after hand, date and time."""
+    """Return the path of a recording in ``folder``, named after the hand, the date and the time."""
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in hand.name)
     return folder / f"{name}-{now:%Y%m%d-%H%M%S}.{kind}"
 
@@ -65,7 +65,7 @@ def name_in(folder: Path, hand: HandConfig, kind: LogFormat, now: datetime.datet
 def make_folder(path: Path) -> Path | None:
     """Create the folder ``path`` with its parents, and return it; None if it already existed.
 
-    A name with a suffix is treated as a misspelt name of a recording file. Raises ConfigError for such a
+    A name with a suffix is treated as the misspelt name of a recording file. Raises ConfigError for such a
     name, or if the folder cannot be created.
     """
     if path.is_dir():
@@ -82,7 +82,7 @@ def make_folder(path: Path) -> Path | None:
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether ``path`` is a folder. Raises ConfigError if it can be neither folder nor file."""
+    """Return whether ``path`` is a folder. Raises ConfigError if it can be neither a folder nor a file."""
     try:
         return path.is_dir()
     except OSError as error:
@@ -105,17 +105,17 @@ class Recorder:
     Args:
         hand: The hand.
         path: A file ending in .log or .blf, or a folder, created if needed, in which the file is named after
-            hand, date and time. The journal is written next to it.
+            the hand, the date and the time. The journal is written next to it.
         kind: Format of a file in a folder.
 
     Raises:
-        ConfigError: A file exists already, or a file or the folder cannot be created.
+        ConfigError: A file already exists, or a file or the folder cannot be created.
     """
 
     def __init__(self, hand: HandConfig, path: Path | str, kind: LogFormat = "log") -> None:
         now, asked, path = datetime.datetime.now().astimezone(), str(path), Path(path)
         self._made: Path | None = None
-        """Folder that this recorder created; None if it existed."""
+        """Folder that this recorder created; None if it already existed."""
         if asked and (_is_folder(path) or path.suffix not in SUFFIXES):
             self._made = make_folder(path)
             path = name_in(path, hand, kind, now)
@@ -195,7 +195,7 @@ class Recorder:
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(SUFFIX).unlink(missing_ok=True)
             if self._made is not None:
-                with suppress(OSError):  # another process may use it
+                with suppress(OSError):  # another process may be using the folder
                     self._made.rmdir()
 
     def _put(self, entry: _Entry, frames: int) -> None:

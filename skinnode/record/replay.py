@@ -1,11 +1,11 @@
-"""Replay a recording as fields, using the code that decodes live frames.
+"""Replay of a recording as fields, by the code that decodes live frames.
 
 The dispatcher, assembler, decoder, stream, solver and publisher are those of the host. No threads are used:
 each scan is solved when its last frame is dispatched.
 
 **Same as live.** Scans that were solved live give bit-identical fields if the recording began before the host
 started and is complete, if the build and the processor are the same, and if no deadline cut a solve short.
-Times are on the recording host's clock, to 1 µs, the resolution of log files. If frames are missing or
+Times are on the recording host's clock, with the resolution of log files, 1 µs. If frames are missing or
 damaged, journal events are placed by time instead of by frame count, and incomplete scans are ended on the
 basis of the times of later frames.
 """
@@ -37,13 +37,13 @@ from skinnode.text.words import counted
 from skinnode.transport.frame_log_reader import FrameLogReader
 
 LONGEST_SILENCE_S: Final = 60.0
-"""Maximum duration of a replayed silence; a longer silence may be due to a damaged timestamp."""
+"""Maximum duration of a replayed silence, s; a longer silence may be due to a damaged timestamp."""
 
 _ROUNDING_NS: Final = 2_000
-"""Maximum rounding error of a timestamp in a log."""
+"""Maximum rounding error of a timestamp in a log, ns."""
 
 _SLICE_S: Final = 0.1
-"""Maximum delay of :meth:`Replay.stop`."""
+"""Maximum delay of :meth:`Replay.stop`, s."""
 
 
 def _never() -> bool:
@@ -63,7 +63,7 @@ def replay(path: Path | str, *, speed: float | None = None, cancelled: Callable[
     Args:
         path: File ending in .log or .blf.
         speed: 1 for the speed of the recording, 2 for twice as fast; None for as fast as possible.
-        cancelled: Called repeatedly; True ends the iteration, as :meth:`Replay.stop` does.
+        cancelled: Called repeatedly; returning True ends the iteration, as :meth:`Replay.stop` does.
 
     Raises:
         ConfigError: The recording cannot be read, or ``speed`` is not positive.
@@ -196,7 +196,7 @@ class Replay:
             time.sleep(min(left_s, _SLICE_S))
 
     def complain(self, event: dict[str, Any], what: str) -> None:
-        """Report a malformed event of the journal."""
+        """Report a malformed event in the journal."""
         self.complaints.append(f"{self._journal} line {event['line']}: {what}")
 
     def clock(self) -> int:
@@ -229,7 +229,7 @@ class _Pace:
 
 
 class _PollerlessDispatcher(Dispatcher):
-    """Dispatcher that never polls streams: the journal determines when to poll, not the end of a batch."""
+    """Dispatcher that never polls streams: the journal, not the end of a batch, determines when to poll."""
 
     def poll_with(self, poller: Callable[[int], None], defects: Defects | None = None) -> None:
         pass

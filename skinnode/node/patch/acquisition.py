@@ -15,7 +15,7 @@ from skinnode.protocol.codes import Codes, CodeScale, encode
 from skinnode.protocol.profile import PatchProfile
 
 TARE_READS: Final = 16
-"""Number of readings averaged for a baseline, whose noise is 1/4 of a reading's and adds 3 % to that of
+"""Number of readings averaged for a baseline; its noise, 1/4 of a reading's, adds 3 % to the noise of
 R/R0."""
 
 
@@ -103,7 +103,7 @@ class Acquisition:
         self.forget_sent()
 
     def set_baseline(self, row: int, column: int, value_ohm: float) -> None:
-        """Set one R0, ohm; the client must then set all others, as the node no longer tares by itself."""
+        """Set one R0, ohm; the client must also set all others: the node no longer tares by itself."""
         self.baseline_ohm[row, column] = value_ohm
         self.tared = True
         self.forget_sent()
@@ -116,7 +116,7 @@ class Acquisition:
 
     @property
     def sent(self) -> Codes:
-        """(U, K) codes last sent in each chunk, if :meth:`changed_chunks` selects the chunks."""
+        """(U, K) codes last sent in each chunk, when :meth:`changed_chunks` selects the chunks."""
         return self.codes if self._sent is None else self._sent
 
     def forget_sent(self) -> None:
@@ -127,10 +127,10 @@ class Acquisition:
         """Return the indices of the chunks to send, and record them as sent.
 
         A chunk is selected if, since it was last sent, one of its codes has changed by more than the
-        threshold, or has become or ceased to be a reserved code.
+        threshold, or has changed to or from a reserved code.
 
         Args:
-            threshold: threshold, codes.
+            threshold: largest change of a code that is ignored.
             full_every: number of scans from one full scan to the next; 0 for no full scans.
 
         Returns:

@@ -156,7 +156,7 @@ class PatchApplication:
         return None
 
     def _new_baseline(self) -> None:
-        """Save a complete new baseline, measured or written, without a save command."""
+        """Save a complete new baseline, measured or written, without waiting for a save command."""
         self._mark_baseline()
         self._storage.keep_baseline()
         self._storage.report(self._now())
@@ -249,7 +249,8 @@ class PatchApplication:
             case od.SELF_TEST if value not in (0, od.SELF_TEST_SIGNATURE):
                 raise Refused(AbortCode.CANNOT_STORE)
             case od.SINGLE_SCAN if value:
-                # If SYNC numbers the scans, a receiver would mistake this scan for the scan of the next SYNC.
+                # If the SYNC counter numbers the scans, a receiver would mistake this scan for the scan of
+                # the next SYNC.
                 numbered_by_sync = not self._period_ns and self._store.integer(od.SYNC_COUNTER_OVERFLOW)
                 if numbered_by_sync or not self._operational:
                     raise Refused(AbortCode.DEVICE_STATE)

@@ -36,9 +36,9 @@ class PatchNode(CanopenDevice):
         serial: serial number (0x1018:4 and 0x2000:11), u32.
         baseline_ohm: (U, K) initial R0, ohm; None to tare at the first power-on. A baseline in the memory
             takes precedence.
-        pacing: :data:`~skinnode.node.clock.EXACT` for a board, THRIFTY if many nodes share a machine.
-        memory: keeps configuration, baseline and node-ID across a power cycle; None if nothing is kept,
-            which 0x1010 then indicates.
+        pacing: :data:`~skinnode.node.clock.EXACT` for a board, THRIFTY for many nodes on one machine.
+        memory: keeps configuration, baseline and node-ID across a power cycle; None to keep nothing, as
+            0x1010 then indicates.
         set_bit_rate: changes the bit rate (bit/s) for LSS; None if the node cannot change it.
 
     Raises:
@@ -102,7 +102,7 @@ class PatchNode(CanopenDevice):
 
     @property
     def memory_problem(self) -> str:
-        """Latest problem with the memory, in one line; empty if there was none."""
+        """Latest problem with the memory, in one line; empty if there was no problem."""
         return self._storage.problem
 
     @property

@@ -1,4 +1,4 @@
-"""Scan stream, which sends each scan as chunks paced by their TPDO's inhibit time, then as a summary.
+"""Scan stream, which sends each scan as chunks paced by their TPDO's inhibit time, then its summary.
 
 The TPDO whose first object is 0x2010 carries the chunks of a scan if it is event-driven or was due at the
 SYNC that started the scan. TPDOs whose first object is 0x2011 carry the summary after the chunks:
@@ -11,9 +11,9 @@ therefore compensates for lateness of up to ``catch_up_ns``, if necessary with s
 never exceeds the mean rate (generic cell rate algorithm, ITU-T I.371). With ``catch_up_ns = 0`` the minimum
 interval is strict.
 
-The node receives the time of a SYNC, but cannot measure how long sampling then takes. The node therefore
-requests a timer event immediately after the first chunk of a scan. This event supplies the current time, from
-which the interval to the second chunk is measured.
+The node receives the time of a SYNC, but cannot measure how long the subsequent sampling takes. The node
+therefore requests a timer event immediately after the first chunk of a scan. This event supplies the current
+time, from which the interval to the second chunk is measured.
 
 Synchronous TPDOs obey the synchronous window (0x1007): chunks and a summary not sent before the window closes
 are discarded. The window does not apply to event-driven TPDOs.
@@ -96,7 +96,7 @@ class ScanStream:
         return self._next_scan is not None
 
     def is_held_up(self, t_ns: int) -> bool:
-        """Return whether scans take longer than their inhibit times require.
+        """Return whether scans take longer to send than the inhibit time requires.
 
         If so, the node's thread receives too little processor time, or the bus refuses frames.
         """

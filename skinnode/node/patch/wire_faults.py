@@ -58,7 +58,7 @@ def find_faults(codes: Codes, scale: CodeScale) -> WireFaults:
 
 
 class WireFaultReporter:
-    """Reporter of wire faults when they occur and when they end.
+    """Reporter of the start and the end of wire faults.
 
     Args:
         profile: sizes of the patch.

@@ -23,7 +23,7 @@ COB_ID_MASK: Final = 0x7FF
 SYNC_CYCLIC_MAX: Final = 240
 """Highest synchronous transmission type."""
 SYNC_REMOTE, REMOTE = 252, 253
-"""Transmission types sent only on remote request: sampled at SYNC (252), and sampled on request (253)."""
+"""Transmission types of PDOs sent only on remote request: sampled at SYNC (252) or on request (253)."""
 EVENT_TYPES: Final = (254, 255)
 """Event-driven transmission types."""
 
@@ -82,7 +82,7 @@ class PdoParameters:
     cob_id: int
     """Its 11-bit CAN-ID."""
     answers_rtr: bool
-    """Whether its COB-ID allows remote frames."""
+    """Whether the COB-ID allows remote frames."""
     kind: int
     """Transmission type."""
     inhibit_ns: int

@@ -3,7 +3,7 @@
 RPDOs of types 0 to 240 apply, at each SYNC, the last PDO received within the synchronous window (0x1007);
 RPDOs of types 254 and 255 apply a PDO immediately. Bytes beyond the mapping are ignored, and a PDO that is
 too short is not applied. Each of these errors is reported by EMCY once, and again only after a PDO of the
-right length. In OPERATIONAL, an event timer monitors its RPDO from the first PDO received.
+right length. In OPERATIONAL, an event timer monitors its RPDO from the first PDO received onwards.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class RpdoEngine:
     # --- events
 
     def enter(self, *, operational: bool) -> None:
-        """Handle a change of the NMT state by dropping received PDOs and stopping the monitoring.
+        """Handle a change of the NMT state by dropping received PDOs and stopping monitoring.
 
         Deadlines are monitored only in OPERATIONAL (CiA 301 v4.2, 7.5.2.33), so no RPDO remains marked as
         late.
@@ -127,12 +127,12 @@ class RpdoEngine:
             self._recover(self._late, number, EmcyCode.RPDO_TIMEOUT, self._now())
 
     def on_frame(self, cob_id: int, data: bytes, t_ns: int) -> None:
-        """Handle a frame, which any number of RPDOs may receive, because several can share its COB-ID.
+        """Pass a frame to every RPDO that has its COB-ID.
 
         Args:
             cob_id: identifier of the frame.
             data: payload of the frame.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
         """
         if self._operational:
             for rpdo in tuple(self._by_cob_id.get(cob_id, ())):

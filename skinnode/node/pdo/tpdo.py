@@ -39,7 +39,7 @@ class Tpdo:
 
     Args:
         number: number of the TPDO, counted from 0.
-        records: its records in the object dictionary.
+        records: the TPDO's records in the object dictionary.
     """
 
     def __init__(self, number: int, records: PdoRecords) -> None:

@@ -31,8 +31,8 @@ SLOWEST_SEGMENT_NS: Final = 8 * SEGMENT_NS
 """Maximum mean time between two segments, ns; at this pace, segments take a quarter of the capacity of a 125
 kbit/s bus. If the bus refuses segments even at this pace, the pace is not the cause."""
 SEGMENTS_AT_ONCE: Final = 4
-"""Maximum number of segments sent per timer event, to compensate for a thread that wakes late (by 2 ms by
-default).
+"""Maximum number of segments sent per timer event, to compensate for a thread that wakes late (by default, up
+to 2 ms).
 
 The transmit queue of a Linux CAN interface holds 10 frames, and a delayed thread may handle two events in a
 row.
@@ -211,7 +211,7 @@ class BlockDownload(Transfer):
 
     def on_request(self, request: bytes, t_ns: int) -> bool:
         """Handle a frame that belongs to the transfer; return whether the transfer is over."""
-        if self._last is not None and _is_end(request):  # first, because the previous frame may be equal
+        if self._last is not None and _is_end(request):  # first: it may equal the previous frame
             self._end(request, self._last)
             return True
         if request == self._previous:

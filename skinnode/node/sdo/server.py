@@ -1,7 +1,7 @@
 """SDO server (CiA 301 v4.2, 7.2.4.3): starts all transfers, and runs expedited and segmented transfers.
 
 Block transfer is in :mod:`skinnode.node.sdo.block`. The canopen library's SDO server is not used, because it
-does not abort an unknown first command and has neither a time-out nor block transfer.
+does not answer an unknown first command with an abort, and supports neither a time-out nor block transfer.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class SdoServer:
         self._transfer = None
 
     def on_timer(self, t_ns: int) -> None:
-        """At ``t_ns``, continue a block upload, or abort the transfer of a silent client."""
+        """Continue a block upload at ``t_ns``, or abort the transfer of a silent client."""
         transfer = self._transfer
         if transfer is not None and t_ns >= transfer.deadline_ns:
             try:
@@ -79,7 +79,7 @@ class SdoServer:
 
         Args:
             request: eight bytes.
-            t_ns: when it was received, ns.
+            t_ns: time of reception, ns.
         """
         transfer = self._transfer
         if request[0] == ABORT:

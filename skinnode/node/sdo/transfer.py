@@ -76,7 +76,7 @@ class Transfer(ABC):
 
 
 class Incoming:
-    """Value of a download, collected until it is complete and then stored at once.
+    """Value of a download, collected until it is complete and then stored as a whole.
 
     Args:
         store: object dictionary.

@@ -156,7 +156,7 @@ class CanopenDevice:
     def on_bus(self, state: BusState, t_ns: int) -> None:
         """Handle a change of the CAN controller's state.
 
-        EMCY reports bus-off once the bus has recovered; the error behaviour (0x1029) applies immediately.
+        EMCY reports bus-off after the bus has recovered; the error behaviour (0x1029) applies immediately.
 
         Args:
             state: state of the controller.

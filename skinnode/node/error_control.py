@@ -36,7 +36,7 @@ class ErrorControl:
     """Error control services of a node.
 
     Args:
-        services: the shared parts of the node.
+        services: the resources that the node's services share.
         listen: called when the result of :meth:`handlers` has changed.
         failed: called with the time in ns of a heartbeat event or life guarding event.
     """

@@ -56,7 +56,7 @@ class Guarding:
             self._start(t_ns)
 
     def end(self, t_ns: int) -> None:
-        """End guarding, because heartbeats replace it; the next request restarts it."""
+        """End guarding, because heartbeats replace it; the next request restarts guarding."""
         self._guarded = False
         self.deadline_ns = NO_DEADLINE_NS
         self._emcy.clear(EmcyCode.HEARTBEAT, t_ns)

@@ -1,4 +1,5 @@
-"""Parts shared by all CiA services of a node: object dictionary, emergencies, counters, sender and clock."""
+"""Resources shared by all CiA services of a node: object dictionary, emergencies, counters, sender and
+clock."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ Send = Callable[[int, bytes], None]
 
 @dataclass(frozen=True, slots=True)
 class NodeServices:
-    """Parts of a node that its services share."""
+    """Resources of a node that its services share."""
 
     store: ObjectStore
     """Object dictionary."""

@@ -39,7 +39,7 @@ class Storage:
     byte is a :class:`~skinnode.node.memory.Fault`.
 
     Args:
-        services: the shared parts of the node.
+        services: the resources that the node's services share.
         memory: the memory; if None, 0x1010 and 0x1011 read 0 and refuse writes (CiA 301).
         patch: sizes and layout of the patch; see :class:`~skinnode.node.memory.Kept`.
     """

@@ -79,7 +79,7 @@ class Sync:
     a SYNC accepted by :meth:`accept`.
 
     Args:
-        services: the shared parts of the node.
+        services: the resources that the node's services share.
     """
 
     def __init__(self, services: NodeServices) -> None:

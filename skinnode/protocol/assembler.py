@@ -213,7 +213,7 @@ class ScanAssembler:
     def next_deadline_ns(self) -> int | None:
         """Return the time at which :meth:`poll` will close the open scan, ns; None if no scan is open.
 
-        The time assumes that no further frame arrives.
+        The time applies if no further frame arrives.
         """
         if self._counter == _NONE_OPEN:
             return None

@@ -6,8 +6,8 @@ each scan is solved when its last frame is dispatched.
 **Same as live.** Scans that were solved live give bit-identical fields if the recording began before the host
 started and is complete, if the build and the processor are the same, and if no deadline cut a solve short.
 Times are on the recording host's clock, with the resolution of log files, 1 µs. If frames are missing or
-damaged, journal events are placed by time instead of by frame count, and incomplete scans are ended on the
-basis of the times of later frames.
+damaged, journal events are placed by time instead of by frame count, and the times of later frames determine
+when incomplete scans end.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class RpdoEngine:
     """The RPDOs of a node.
 
     Args:
-        services: the shared parts of the node.
+        services: the resources that the node's services share.
         count: number of RPDOs.
         window: the synchronous window.
     """

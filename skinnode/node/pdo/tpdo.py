@@ -134,7 +134,7 @@ class TpdoEngine:
     """The TPDOs of a node.
 
     Args:
-        services: the shared parts of the node.
+        services: the resources that the node's services share.
         count: number of TPDOs.
         window: the synchronous window.
     """

@@ -145,8 +145,10 @@ class EmcyProducer:
             self.on_timer(t_ns)
 
     def _loss(self) -> bytes:
-        """Return the message that reports dropped messages. Detail bytes 0 and 1 hold the number of lost
-        scans, here 0."""
+        """Return the message that reports dropped messages.
+
+        Detail bytes 0 and 1 hold the number of lost scans, here 0.
+        """
         detail = struct.pack("<HH", 0, min(self._lost, 0xFFFF))
         self._remember(EmcyCode.CAN_OVERRUN, detail)
         return _message(EmcyCode.CAN_OVERRUN, self.register | EmcyCode.CAN_OVERRUN.register_bit | 1, detail)

@@ -1,5 +1,4 @@
-"""Resources shared by all CiA services of a node: object dictionary, emergencies, counters, sender and
-clock."""
+"""Resources shared by all CiA services of a node: object dictionary, EMCY, counters, sender and clock."""
 
 from __future__ import annotations
 

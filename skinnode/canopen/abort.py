@@ -45,7 +45,7 @@ class Refused(Exception):
     """Refusal of access to an object; the node's SDO server responds with the abort code.
 
     Args:
-        code: reason of the refusal.
+        code: reason for the refusal.
     """
 
     def __init__(self, code: AbortCode) -> None:

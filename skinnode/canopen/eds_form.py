@@ -11,9 +11,9 @@ from skinnode.errors import ProfileError, Shown
 _HEADER: Final = re.compile(r"\[(.+)\]")
 _OBJECT: Final = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2})?", re.IGNORECASE)
 _FURTHER: Final = re.compile(r"[0-9a-f]{4}(?!sub)[g-z]\w*", re.IGNORECASE)
-"""Pattern of section titles such as 1003Value and 1003ObjectLinks."""
+"""Pattern for section titles such as 1003Value and 1003ObjectLinks."""
 _OF_OBJECT: Final = re.compile(r"[0-9]\w*|[0-9a-f]{4}sub.*", re.IGNORECASE)
-"""Pattern of section titles that are apparently intended for an object."""
+"""Pattern for section titles apparently intended for an object."""
 _NUMBER: Final = re.compile(r"0x[0-9a-f]{1,8}|[0-9]{1,10}", re.IGNORECASE)
 _LISTS: Final = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NUMBERS: Final = ("objecttype", "datatype", "pdomapping", "subnumber", "compactsubobj")

@@ -209,4 +209,4 @@ _DETAILS: Final[dict[int, Callable[[bytes], str]]] = {
     EmcyCode.CAN_ID_COLLISION: lambda detail: f"0x{_word(detail):03X}",
     EmcyCode.SOURCE: lambda detail: _SOURCE_FAULTS.get(detail[0], ""),
 }
-"""Functions that decode the manufacturer-specific bytes (at least two) from a skinnode patch to text."""
+"""Functions that convert the manufacturer-specific bytes (at least two) of a skinnode patch to text."""

@@ -149,8 +149,8 @@ PDO_BYTES: Final = 12
 """Sub-index of the maximum PDO length, which is 8 bytes, or 64 over CAN FD."""
 CHUNK: Final = 0x2010
 CHUNK_INDEX, CHUNK_SCAN = 1, 2
-"""Sub-indices before the codes; over CAN FD they hold the wire and the scan counter, and the first column
-follows."""
+"""Sub-indices before the codes; over CAN FD they hold the wire and the scan counter, and the codes start with
+the first column."""
 SUMMARY: Final = 0x2011
 SUMMARY_SCAN, SUMMARY_FLAGS, SUMMARY_CHUNKS, SUMMARY_TIME = 1, 2, 3, 4
 SUMMARY_TIME_64US, SUMMARY_CHECK = 5, 6
@@ -160,7 +160,8 @@ SEND_MODE, SEND_THRESHOLD, SEND_REFRESH = 1, 2, 3
 ACQUISITION: Final = 0x2021
 ACQUISITION_PERIOD, ACQUISITION_AVERAGING, SELF_TEST, TARE, SINGLE_SCAN = 1, 2, 3, 4, 5
 COMMANDS: Final = frozenset({(ACQUISITION, SELF_TEST), (ACQUISITION, TARE), (ACQUISITION, SINGLE_SCAN)})
-"""Objects that a client writes as commands; not being parameters, they are neither saved nor verified."""
+"""Objects that a client writes as commands; they are not parameters, so they are neither saved nor
+verified."""
 TIME_OF_DAY: Final = 0x2022
 TIME_DAYS, TIME_MS, TIME_MESSAGES, TIME_DEVICE_US = 1, 2, 3, 4
 SELF_TEST_RESULT: Final = 0x2023

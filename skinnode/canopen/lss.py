@@ -21,10 +21,10 @@ BIT_RATES_BPS: Final = {
 """Bit rates in table 0 of the bit timing service, bit/s; 5 is reserved, 9 means automatic detection."""
 
 LSS_DONE: Final = 0
-"""Error code of a successful configuration service."""
+"""Error code returned by a successful configuration service."""
 
 LSS_MANUFACTURER_ERROR: Final = 0xFF
-"""Error code of a configuration service whose next byte is a manufacturer-specific error code."""
+"""Error code announcing that the next byte holds a manufacturer-specific error code."""
 
 RESET_SCAN: Final = 0x80
 """Fastscan bit-check value that makes every node without a node-ID answer and restart at the vendor-ID."""

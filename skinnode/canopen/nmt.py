@@ -98,7 +98,7 @@ def parse(data: bytes, node_id: int) -> NmtCommand | None:
         node_id: the node-ID of this node.
 
     Raises:
-        ValueError: if the payload does not have two bytes, or the specifier is unknown.
+        ValueError: if the payload is not two bytes long, or the specifier is unknown.
     """
     if len(data) != 2:
         raise ValueError(f"NMT: got {counted(len(data), 'byte')}, must be 2")

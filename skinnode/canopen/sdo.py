@@ -6,7 +6,7 @@ import struct
 from typing import Final
 
 SEGMENT_BYTES: Final = 7
-"""Data bytes of a segment."""
+"""Maximum number of data bytes in a segment."""
 
 MAX_BLOCK_SEGMENTS: Final = 127
 """Maximum number of segments in a block."""

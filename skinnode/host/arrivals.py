@@ -1,6 +1,6 @@
 """Predict when a patch's next scan will end, so that the receiver can let other frames accumulate until then.
 
-On a full bus, this is not always one period after the end of the previous scan: if heartbeats precede the
+On a full bus, a scan does not always end one period after the previous scan: if heartbeats precede the
 frames of several nodes, the end may alternate between two instants within the period (in ``bench pipeline``,
 they were 12 ms apart at every fifth scan; without heartbeats, the end did not alternate). The prediction
 therefore includes each instant within the period at which one of the most recent scans ended.
@@ -21,7 +21,7 @@ MOST: Final = 3
 
 
 class ArrivalPredictor:
-    """Predictor of the end of a patch's next scan; scan period ``period_ns``. Owned by one thread."""
+    """Predictor of the end of a patch's next scan, given its ``period_ns``. Owned by one thread."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns

@@ -64,7 +64,7 @@ class BaselineWatch:
         node.job = self._pool.submit(read)
 
     def _watch_register(self, node: Supervised, now_ns: int) -> None:
-        """Read the error register of a node with an error: the frame that clears it may have been lost."""
+        """Read the error register of a node in error: the frame clearing the error may have been lost."""
         remote = node.remote
         if not remote.monitor.error_register or remote.listen_only or now_ns < node.register_ns:
             return

@@ -64,7 +64,7 @@ class FieldCallback:
 
     @property
     def ended(self) -> bool:
-        """Whether calls of the function have ended."""
+        """Whether calls to the function have ended."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:

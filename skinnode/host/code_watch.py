@@ -18,10 +18,10 @@ consecutive windows. Taking the second difference of a code over time removes st
 if the mean square of this difference exceeds ``NOISY`` times both that of the median wire on its side and
 that of the expected noise. A wire drifts if the resistances of all its crossings changed by the same fraction
 of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and its neighbours did not
-follow. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads it to the
-adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) changed a wire by more
-than ``DRIFT`` at 780,000 instants; none was mistaken for drift. Consequently, two neighbours that drift alike
-are not reported, nor is a wire while it is touched.
+follow. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the change to
+the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) changed a wire by
+more than ``DRIFT`` at 780,000 instants; none was mistaken for drift. Consequently, two neighbours that drift
+alike are not reported, nor is a wire while it is touched.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ LEAST_RUN: Final = 5
 WINDOW: Final = 16
 """Number of scans in a window."""
 WINDOWS: Final = 3
-"""Number of consecutive windows in which a wire must be noisy or drift."""
+"""Number of consecutive windows in which a wire must be noisy or drift before it is reported."""
 NOISY: Final = 25.0
-"""Minimum ratio of noise powers: a noisy wire has at least five times the noise amplitude."""
+"""Minimum ratio of a noisy wire's noise power to the median wire's: five times the amplitude."""
 DRIFT: Final = 1e-3
 """Minimum drift as a fraction of R0: a tenth of the change that a light touch causes in the wire pairs below
 it."""
@@ -227,7 +227,7 @@ def _of_wires(
 ) -> NDArray[np.float64]:
     """Reduce each wire's crossings to one number, ignoring NaN (not measured); NaN if all are NaN.
 
-    The branch for patches without a fault takes a tenth of the time of the other branch.
+    The branch for patches without faults is ten times as fast as the other branch.
     """
     if not np.isnan(values).any():
         return np.asarray(plain(values, axis=axis))

@@ -34,14 +34,14 @@ BOOT_DEADLINE_S: Final = 3.0
 """Maximum time until the first response from a node, s; controllers boot and tare within a second."""
 
 HEARTBEATS_WATCHED: Final = 3
-"""Number of host heartbeats that a node may miss before it stops sending, if the host sends heartbeats."""
+"""Number of host heartbeats that a node may miss before it stops sending, when the host sends heartbeats."""
 
 _POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Configurator:
-    """Configuration of the nodes of one bus, one after another or in parallel.
+    """Configuration of the nodes on one bus, one after another or in parallel.
 
     Threads: one thread per node at a time.
     """
@@ -226,7 +226,7 @@ class Configurator:
                 remote.write_checked(index, sub, size, value)
 
     def _check_mapping(self, patch: PatchConfig, profile: PatchProfile, remote: RemoteOd) -> None:
-        """Check that the PDO mapping is that of the node's revision, as the decoder requires."""
+        """Check that the PDO mapping matches the node's revision, as the decoder requires."""
         expected = {item.index: item for item in profile.objects()}
         for index in (od.TPDO1_MAPPING, od.TPDO2_MAPPING):
             count = int(expected[index][0].default or 0)
@@ -308,7 +308,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
     The values differ if the node was reset unnoticed during bring-up, or if another master configured it.
 
     Returns:
-        Whether the values are those that a master writes.
+        Whether the node has the values that a master writes.
 
     Raises:
         NodeError: as raised by :class:`RemoteOd`.
@@ -324,7 +324,7 @@ def is_configured(patch: PatchConfig, hand: HandConfig, remote: RemoteOd) -> boo
 def _open_window(remote: RemoteOd) -> None:
     """Disable the synchronous window (0x1007), because a summary is sent only after its whole scan.
 
-    A node without the object has no window.
+    A node without this object has no window.
     """
     try:
         remote.write_checked(od.SYNC_WINDOW, 0, "u32", 0)

@@ -27,8 +27,8 @@ pause."""
 
 _BRIEF_S: Final = 0.001
 _LONGEST_BRIEF_S: Final = 0.02
-"""First and longest pause, in s, in a loop that serves several subjects: a failed turn must not delay the
-other subjects."""
+"""First and longest pause, in s, in a loop that serves several subjects: the failure of one must not delay
+the others."""
 
 _COMPLAINTS: Final = 64
 """Maximum number of logged messages remembered per subject; when this number is reached, messages may be
@@ -122,7 +122,7 @@ class Defects:
 def keep_on(turn: Callable[[], bool], defects: Defects, doing: str) -> None:
     """Call ``turn`` until it returns False.
 
-    An exception ends only that turn; a pause of 1 to 20 ms follows.
+    An exception ends only the current call; a pause of 1 to 20 ms follows.
     """
     pause = Pause(_BRIEF_S, _LONGEST_BRIEF_S)
     while True:

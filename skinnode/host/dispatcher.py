@@ -26,13 +26,13 @@ Handler = Callable[[bytes, int], None]
 """Called with the data of a frame and the monotonic time at which it was received, ns."""
 
 _MARK_NS: Final = 100_000_000
-"""Interval between sums of the bits, ns."""
+"""Interval at which the bits are summed, ns."""
 _MARKS: Final = 10
 """Number of intervals over which the load is averaged."""
 
 _POLL_NS: Final = 2_000_000
-"""Minimum interval between calls of the pollers, ns. Their timeouts are at least 5 ms, and batches of frames
-arrive a millisecond apart."""
+"""Minimum interval between calls to the pollers, ns. The pollers' timeouts are at least 5 ms, and batches of
+frames arrive a millisecond apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ class Dispatcher:
         self._handlers[cob_id] = handler
 
     def listen(self, listener: Callable[[Sequence[Frame]], None]) -> None:
-        """Pass every batch, with frames of all kinds, to ``listener`` before the handlers. Mainline only."""
+        """Pass each batch, with frames of all kinds, to ``listener`` before any handler. Mainline only."""
         self._listeners = (*self._listeners, listener)
 
     def unlisten(self, listener: Callable[[Sequence[Frame]], None]) -> None:
@@ -189,7 +189,7 @@ class Dispatcher:
             self.contain(None, "counting frames", defect)
 
     def _tally(self, batch: Sequence[Frame], others: Sequence[Frame]) -> None:
-        """Count the frames of a batch; ``others`` are those of types that no handler accepts."""
+        """Count the frames of a batch; ``others`` are the frames of types that no handler accepts."""
         takes_fd = self.config.fd
         if others:
             set_aside = {id(frame) for frame in others}
@@ -218,8 +218,8 @@ class Dispatcher:
     def measure(self, now_ns: int) -> None:
         """Compute the load if an interval has passed.
 
-        The computation takes as long as handling forty frames, so a mainline with several buses calls it for
-        only one bus per turn.
+        The computation takes as long as handling forty frames, so a mainline with several buses calls this
+        method for only one bus per iteration.
         """
         if now_ns >= self._marks[-1][0] + _MARK_NS:
             self._mark(now_ns)

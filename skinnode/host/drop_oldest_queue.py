@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """Last item of a queue: the host has closed, or ``error`` stopped it."""
+    """Last item of a queue, appended when the host has closed or ``error`` has stopped it."""
 
     error: SkinError | None = None
 

@@ -27,7 +27,8 @@ class HandFrame:
     """The fields of all patches for one SYNC."""
 
     scan: int
-    """Number of the SYNC since the host started, without wrapping; also the scan number of every field."""
+    """Number of this SYNC, counted from the start of the host without wrapping; also the scan number of every
+    field."""
     t_sync_ns: int
     """Monotonic time at which SYNC was sent or received on the last bus; 0 if unknown. Each field holds the
     time of its own bus, because SYNC may be staggered (``sync.stagger_ms``)."""
@@ -100,7 +101,7 @@ class HandGatherer:
         return HandFrame(scan, t_sync_ns, fields, {patch: self._reason(patch, scan) for patch in absent})
 
     def next_deadline_ns(self) -> int | None:
-        """Return the latest time at which :meth:`next` returns the oldest frame; None if there is none."""
+        """Return the latest time at which :meth:`next` returns the oldest frame; None without a frame."""
         return self._until_ns[min(self._open)] if self._open else None
 
     def _awaited(self, patch: str, scan: int) -> bool:
@@ -212,7 +213,7 @@ class HandSubscription:
         return frame
 
     def _wait_s(self, end_ns: int | None) -> float | None:
-        """Return the time until the next deadline, s; None if there is none."""
+        """Return the time until the next deadline, s; None if there is no deadline."""
         times = [t_ns for t_ns in (end_ns, self._gatherer.next_deadline_ns()) if t_ns is not None]
         return max(0, min(times) - time.monotonic_ns()) * 1e-9 if times else None
 

@@ -45,7 +45,7 @@ class Condition(enum.StrEnum):
     FROZEN = "frozen"
     """Scans arrive, but always with the same values: see :mod:`skinnode.host.code_watch`."""
     FAULTY = "faulty"
-    """The node's error register is not zero, or the host had a defect while serving the patch:
+    """The node's error register is not zero, or serving the patch raised an exception:
     :attr:`PatchHealth.defect`."""
     REFUSED = "refused"
     """The node answers, but does not match the hand file or does not keep its configuration."""
@@ -68,9 +68,9 @@ class PatchHealth:
     emergencies: int
     """Number of EMCY messages that reported an error since the host started."""
     last_emergency: int | None
-    """Error code of the newest of these messages; None before the first."""
+    """Error code of the newest EMCY message that reported an error; None before the first."""
     emergency_text: str
-    """Description of the newest of these messages; empty before the first."""
+    """Description of the newest EMCY message that reported an error; empty before the first."""
     error_register: int
     rejoins: int = 0
     """Number of times the node came back and was brought up again since the host started."""
@@ -82,8 +82,8 @@ class PatchHealth:
     duplicate_id: bool = False
     """Whether heartbeats arrive more often than a single node would send them."""
     conflicts: int = 0
-    """Number of frames that contradict other frames of their scan: the node's counter is wrong, or two nodes
-    share a node-ID."""
+    """Number of frames that contradict other frames of the same scan: the node's counter is wrong, or two
+    nodes share a node-ID."""
     wires: tuple[WireFault, ...] = ()
     """Wires that are open, shorted, noisy or drifting."""
     defect: str | None = None
@@ -93,7 +93,7 @@ class PatchHealth:
     baselines: int = 0
     """Number of times a changed baseline was read, for example after a tare."""
     complaint: str | None = None
-    """Why the last bring-up failed; None once a bring-up succeeded."""
+    """Why the last bring-up failed; None once a bring-up has succeeded."""
     withheld: bool = False
     """Whether arriving scans cannot be decoded yet because the node is being brought up or its baseline is
     being read."""

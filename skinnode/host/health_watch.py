@@ -44,7 +44,7 @@ _BUS_COUNTERS: Final = {
 
 
 class HealthWatch:
-    """Watch that publishes changes in the health of all patches and buses since the last check.
+    """Watcher that publishes changes in the health of all patches and buses since the previous check.
 
     Threads: a dedicated thread runs the checks, from construction to :meth:`close`.
     """
@@ -68,7 +68,7 @@ class HealthWatch:
         self._thread.start()
 
     def close(self) -> None:
-        """End and join the thread, after a last check."""
+        """Make a final check, then end and join the thread."""
         self._stop.set()
         self._thread.join()
 

@@ -41,10 +41,10 @@ class HostStats:
     nodes: Mapping[str, NodeStats]
     """By patch."""
     other_masters: Mapping[str, OtherMasterStats]
-    """Frames of other masters, by bus."""
+    """Frames from other masters, by bus."""
     sync: SyncStats
     malformed: tuple[CodecError, ...]
-    """The first malformed frame of each bus that had one."""
+    """First malformed frame of each bus; buses without malformed frames are omitted."""
     defects: Mapping[str, DefectStats]
     """Exceptions contained by the host, by patch and by bus; ``host`` holds those that concern neither."""
 
@@ -69,7 +69,7 @@ class Host:
                 ...
 
     Inside the block, all nodes are operational, SYNC is sent, and a node that restarts or comes back is
-    brought up again. At the end of the block, and if bring-up fails, the nodes are pre-operational, every
+    brought up again. After the block, and also if bring-up fails, the nodes are pre-operational, every
     thread has ended and every interface is closed. On a bus that another master runs (``role = "guest"``),
     NMT and SYNC are left to that master.
 
@@ -146,7 +146,7 @@ class Host:
             cancelled: Called repeatedly during bring-up; once it returns True, bring-up ends with
                 BringUpCancelled.
             tap: Records the traffic, bring-up included: a :class:`skinnode.record.Recorder`.
-            open_port: Opens the interface of a bus if it is not one of python-can's.
+            open_port: Opens a bus whose interface is not one of python-can's.
 
         Raises:
             ConfigError: if options, EDS or baseline files contradict the hand, or a layout cannot be solved.

@@ -195,7 +195,7 @@ def _sync(
 
 
 def _logged_already(error: Exception) -> None:
-    """Ignore a defect of a bus: the health watch publishes it."""
+    """Ignore a bus defect: the health watch publishes it."""
 
 
 def _let_scans_end(streams: Sequence[tuple[PatchStream, Ticks]], period_s: float) -> None:

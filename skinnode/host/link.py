@@ -1,4 +1,4 @@
-"""One bus of the hand: its port, and the sending and receiving of frames on it."""
+"""One bus of the hand: opens its port, and sends and receives its frames."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ _REOPEN_S: Final = 0.1
 class BusLink(Dispatcher):
     """An open bus, from construction to :meth:`close` or the end of a ``with`` block.
 
-    If a handler, a poller, a listener or a job raises an exception, that frame or call is lost; after an
-    exception in the mainline's own work, the bus is paused while received frames wait. An interface that
-    fails after opening is reopened until it works.
+    If a handler, a poller, a listener or a job raises an exception, only the current frame or call is lost;
+    after an exception in the mainline's own work, the bus is paused while received frames wait. An interface
+    that fails after opening is reopened until it works.
 
     Threads: :meth:`send`, :meth:`ask_remote`, :meth:`call` and :meth:`stats` may be called from any thread; a
-    :class:`~skinnode.host.mainline.Mainline` calls the rest. A separate thread reopens the interface.
+    :class:`~skinnode.host.mainline.Mainline` calls the other methods. A separate thread reopens the
+    interface.
 
     Args:
         config: The bus.
@@ -186,11 +187,11 @@ class BusLink(Dispatcher):
         self.intake.expect(what, times_ns)
 
     def begin(self, resume: Callable[[], None]) -> None:
-        """Prepare for the first turn; ``resume`` restarts reception on a reopened interface."""
+        """Prepare for the first :meth:`turn`; ``resume`` restarts reception on a reopened interface."""
         self._resume = resume
 
     def turn(self) -> None:
-        """Pass the frames received since the last turn to their handlers."""
+        """Pass the frames received since the previous call to their handlers."""
         if self._rests:
             self._rest()
             return
@@ -216,7 +217,7 @@ class BusLink(Dispatcher):
             self.defects.report("measuring the load", error)
 
     def end(self) -> None:
-        """Stop reopening the interface. Called after the last turn."""
+        """Stop reopening the interface. Called after the last :meth:`turn`."""
         self._stop.set()
         if self._reopening is not None:
             self._reopening.join()
@@ -244,7 +245,7 @@ class BusLink(Dispatcher):
         return bool(batch)
 
     def _rest(self) -> None:
-        """End a pause that is over, or start reopening the interface again if the thread did not start."""
+        """End a pause that is over, or retry starting the thread that reopens the interface."""
         if not self._opening:
             self._rests = time.monotonic() < self._rest_end_s
         elif (

@@ -64,7 +64,7 @@ class LssFailed(BusError):
 class LssMaster:
     """LSS master on one bus. Sends with ``send``; :meth:`on_response` takes the frames with COB-ID 0x7E4.
 
-    Threads: only one thread at a time may use it, but concurrent calls of :meth:`give_node_id` are
+    Threads: only one thread at a time may use it, but concurrent calls to :meth:`give_node_id` are
     serialised; the mainline calls :meth:`on_response`.
     """
 
@@ -110,7 +110,7 @@ class LssMaster:
         """Return whether there is a node without a node-ID.
 
         Sends *identify non-configured remote slave* and the first request of fastscan, because some stacks
-        (CANopenNode) support fastscan only.
+        (CANopenNode) support only fastscan.
         """
         expected = bytes((LssCommand.IDENTIFIED_NOT_CONFIGURED,))
         if any(self._ask(LssCommand.IDENTIFY_NOT_CONFIGURED, expected=expected) for _ in range(_TRIES)):
@@ -118,7 +118,9 @@ class LssMaster:
         return self._scan(0, RESET_SCAN, 0, 0, ANSWER_S) is not None
 
     def find_unconfigured(self) -> LssAddress | None:
-        """Find a node without a node-ID by fastscan; it stays in configuration state until :meth:`release`.
+        """Find a node without a node-ID by fastscan.
+
+        The node stays in configuration state until :meth:`release`.
 
         Returns:
             Its address, or None if no node was found.
@@ -192,7 +194,7 @@ class LssMaster:
         )
 
     def node_id(self) -> int | None:
-        """Return the node-ID of the node in configuration state; None if it has none.
+        """Return the node-ID of the node in configuration state; None if it has no node-ID.
 
         Raises:
             LssFailed: if the node does not answer.
@@ -250,8 +252,8 @@ class LssMaster:
     ) -> bytes | None:
         """Send a request and return the first response that starts with ``expected``.
 
-        ``expected`` is the command by default. Other responses belong to earlier requests. Returns None if no
-        such response arrives in time.
+        ``expected`` is the command by default. Other responses belong to earlier requests and are discarded.
+        Returns None if no such response arrives in time.
         """
         expected = bytes((command,)) if expected is None else expected
         while not self._answers.empty():

@@ -19,7 +19,7 @@ class NodeFacts:
     profile: PatchProfile
     scale: CodeScale
     baseline_ohm: Float
-    """(U, K) resistances at rest with which the node encodes, ohm."""
+    """(U, K) resistances at rest with which the node encodes its scans, ohm."""
     serial: int | None
     """Serial number; None if the host is not allowed to read it."""
     heartbeat_s: float

@@ -76,7 +76,7 @@ class NodeMonitor:
         self.refusal: str | None = None
         self.defect: str | None = None
         self.complaint: str | None = None
-        """Like ``refusal`` and ``defect``, set by the supervisor."""
+        """Set by the supervisor, as are ``refusal`` and ``defect``."""
 
     @property
     def boot_ups(self) -> int:
@@ -172,7 +172,7 @@ class NodeMonitor:
             now_ns: Monotonic time.
             heartbeat_s: Heartbeat period of the node, s.
             scan_s: Scan period, s.
-            conflicts: Number of frames that contradict other frames of their scan.
+            conflicts: Number of frames that contradict other frames of the same scan.
             t_passed_ns: Monotonic time at which the newest scan that was not withheld was received; 0 before
                 the first, None if scans are never withheld.
         """
@@ -241,7 +241,7 @@ class NodeMonitor:
         return restarts[-1] - restarts[0] < LOOP_NS
 
     def _beats_too_often(self, now_ns: int, heartbeat_s: float) -> bool:
-        """Return whether heartbeats arrive as often as if two nodes sent them."""
+        """Return whether heartbeats arrive so often that two nodes must be sending them."""
         beats, period_ns = list(self._beats), heartbeat_s * 1e9
         if len(beats) < BEATS or now_ns - beats[-1] > HEARTBEATS_MISSED * period_ns:
             return False

@@ -20,7 +20,8 @@ from skinnode.text.words import known
 _log = logging.getLogger(__name__)
 
 START_DEADLINE_S: Final = 1.0
-"""Maximum time from the start command to a heartbeat that reports operational, s: four heartbeat periods."""
+"""Maximum time from the start command to a heartbeat that reports the operational state, s: four heartbeat
+periods."""
 
 _PROBE_NS: Final = 250_000_000
 """Interval between requests to an absent node: its boot-up message may have been lost, and a node that sends
@@ -52,7 +53,7 @@ class NodeSupervision:
         if node.upset or (count != node.defects and node.phase in (Phase.STARTING, Phase.RUNNING)):
             self._make_faulty(node, now_ns)
             return
-        if count != node.defects:  # a bring-up is due anyway; exceptions raised by frames must not delay it
+        if count != node.defects:  # a bring-up is due anyway; exceptions in frame handlers must not delay it
             node.defects = count
             node.complaint = node.remote.monitor.defect = node.remote.defects.newest
         match node.phase:
@@ -80,7 +81,7 @@ class NodeSupervision:
             return
         if now_ns >= node.probe_ns:
             node.probe_ns = now_ns + _PROBE_NS
-            with contextlib.suppress(BusError):  # the bus is unavailable or full; a later turn tries again
+            with contextlib.suppress(BusError):  # the bus is unavailable or full; retried later
                 remote.probe()
         search_is_over = node.searching is None or node.searching.done()
         if remote.searchable and search_is_over and now_ns - max(node.search_ns, node.since_ns) > _SEARCH_NS:
@@ -90,7 +91,7 @@ class NodeSupervision:
     def _begin(self, node: Supervised, now_ns: int) -> None:
         """Start configuring the node, unless another job still uses it.
 
-        Such a job is aborted, and the configuration is started on a later turn.
+        Such a job is aborted, and the configuration is started in a later iteration.
         """
         if node.job is not None and not node.job.done():
             node.abandon.set()
@@ -174,7 +175,7 @@ class NodeSupervision:
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty because a defect was reported.
 
-        If this raises an exception, the call is retried on the next turn.
+        If this raises an exception, the call is retried in the next iteration.
         """
         remote = node.remote
         count = remote.defects.count

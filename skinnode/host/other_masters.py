@@ -36,7 +36,7 @@ class OtherMasterStats:
     heartbeats: int
     """Heartbeats with the host's node-ID."""
     last_ns: int | None
-    """Monotonic time of the newest such frame; None before the first."""
+    """Monotonic time of the newest frame from another master; None before the first."""
 
 
 class OtherMasters:

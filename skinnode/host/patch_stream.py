@@ -1,7 +1,7 @@
 """From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
 
 The mainline assembles scans and puts the newest in a box that holds one scan; a worker takes the scan from
-the box and solves it. A scan that is overtaken while the worker is busy is skipped and counted. The stream's
+the box and solves it. A scan overtaken while the worker is busy is skipped and counted. The stream's
 token ensures that at most one worker processes the stream at a time.
 """
 
@@ -66,7 +66,7 @@ class StreamStats:
 
 
 class StreamTap(Protocol):
-    """Recorder of the events other than frames that decide which scans a stream passes on. Mainline only."""
+    """Recorder of events (other than frames) that decide which scans a stream passes on. Mainline only."""
 
     def resumed(self, patch: str, solver: ScanSolver, *, anew: bool) -> None:
         """Record that :meth:`PatchStream.resume` began to pass scans on."""
@@ -78,7 +78,7 @@ class StreamTap(Protocol):
         """Record that :meth:`PatchStream.poll` ended an incomplete scan."""
 
     def overtaken(self, patch: str, scan: int, t_receive_ns: int) -> None:
-        """Record that a newer scan replaced this scan, last received at ``t_receive_ns``, in the box."""
+        """Record that a newer scan replaced this scan, whose last frame arrived at ``t_receive_ns``."""
 
 
 def _ignore(scan: Scan) -> None:

@@ -161,7 +161,7 @@ class Subscription:
         self.close()
 
     def offer(self, item: FieldFrame | End, patch: str) -> None:
-        """Queue an end, or a field of ``patch`` if the patch is subscribed to. Never blocks; any thread."""
+        """Queue an end marker, or a field if ``patch`` is subscribed to. Never blocks; any thread."""
         if patch and patch not in self._subscribed:
             return
         self._dropped[patch] += self._queue.put(item)
@@ -186,7 +186,7 @@ class Publisher:
     An exception while passing a field to a subscriber is reported to ``defects``, and that subscriber loses
     the field.
 
-    Threads: workers publish, one worker per patch at a time; any thread may call the rest.
+    Threads: workers publish, one worker per patch at a time; any thread may call the other methods.
     """
 
     def __init__(self, patches: tuple[str, ...], defects: Defects | None = None) -> None:
@@ -198,7 +198,7 @@ class Publisher:
         self._last: End | None = None
 
     def subscribe(self, capacity: int, timeout_s: float | None, patch: str | None) -> Subscription:
-        """Create a subscription to one patch, or to all.
+        """Create a subscription to one patch, or to all patches.
 
         Raises:
             ValueError: if the capacity is below 1, the timeout is out of range, or there is no such patch.

@@ -1,6 +1,6 @@
 """Connect the handlers of a host to the frames of a bus, by COB-ID.
 
-Nothing here sends, waits or starts a thread, so a replay can use it with recorded frames.
+Nothing in this module sends, waits or starts a thread, so a replay can use the module with recorded frames.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ from skinnode.protocol.command import pack_command
 from skinnode.protocol.profile import PatchProfile
 
 _MAINLINE_S: Final = 1.0
-"""Maximum wait for a short job on the mainline, which runs jobs fifty times a second unless the node's bus is
-unavailable, s."""
+"""Maximum wait, s, for a short job on the mainline, which runs jobs fifty times a second unless the node's
+bus is unavailable."""
 
 _ANSWER_S: Final = 0.05
 """Time to wait for the responses to a single SDO request, s. If no other node has the node-ID, a failed
@@ -171,7 +171,7 @@ class RemoteNode:
         return solver
 
     def renew_register(self) -> None:
-        """Read the error register: the emergency that clears an error may have been lost.
+        """Read the error register, because the emergency that clears an error may have been lost.
 
         Raises:
             NodeError: as raised by :class:`RemoteOd`.
@@ -217,7 +217,7 @@ class RemoteNode:
         """Make the mainline withhold scans.
 
         Returns:
-            The number that :meth:`start` needs.
+            The number to pass to :meth:`start`.
 
         Raises:
             NodeTimeout: if the mainline is delayed, for example while the bus is unavailable.

@@ -2,7 +2,7 @@
 
 canopen's client blocks the requesting thread; the mainline feeds the client the responses through
 :meth:`SkinNetwork.notify`. This module limits the length and duration of a transfer, because canopen's client
-reads as many bytes as a server sends, for as long as it sends: a faulty node could fill the memory or block a
+reads as many bytes as a server sends, however long that takes: a faulty node could fill the memory or block a
 thread forever.
 
 Threads: one thread at a time may use a node; different nodes may be used in parallel.
@@ -132,7 +132,7 @@ class RemoteOd:
             self.abandoned = before
 
     def answers(self) -> bool:
-        """Return whether the node answers at all, even with an abort. One attempt."""
+        """Return whether the node answers at all, even if only with an abort. One attempt."""
         try:
             self._upload(DEVICE_TYPE, 0, _MAX_NUMBER_BYTES)
         except SdoAbortedError:
@@ -208,7 +208,7 @@ class RemoteOd:
         self._transfer(index, subindex, "write", ask)
 
     def write_if_different(self, index: int, subindex: int, kind: str, value: float) -> None:
-        """Write the value and read it back if the node has a different value."""
+        """Write the value and read it back, unless the node already has it."""
         if self.read(index, subindex, kind) != value:
             self.write_checked(index, subindex, kind, value)
 

@@ -41,7 +41,8 @@ _SETTLE_S: Final = 0.1
 """Maximum wait for that silence, s: another SDO client may keep the node busy."""
 
 _RETRANSMISSIONS: Final = 20
-"""Maximum number of retransmitted blocks in one transfer; a node that needs more accepts no block at all."""
+"""Maximum number of retransmitted blocks in one transfer; a node that needs more is assumed to accept no
+block at all."""
 
 
 class Client(SdoClient):
@@ -66,7 +67,7 @@ class Client(SdoClient):
         because a slow node may still be sending frames of the previous transfer.
 
         Raises:
-            SdoError: if there is no response, or it is an abort.
+            SdoError: if there is no response, or the response is an abort.
         """
         begins = sdo_request[0] >> 5 in (1, 2) or (sdo_request[0] >> 5, sdo_request[0] & 1) in (
             (5, 0),
@@ -109,8 +110,8 @@ class BlockUpload(BlockUploadStream):
     """A block upload.
 
     canopen 2.4 requests a late segment twice and drops the first response, so every pause longer than its
-    timeout results in a wrong CRC. It requests an out-of-order segment only once, so this class makes a late
-    segment look out of order.
+    timeout results in a wrong CRC. canopen requests an out-of-order segment only once, so this class makes a
+    late segment look out of order.
     """
 
     def read(self, size: int = -1) -> bytes:
@@ -124,7 +125,7 @@ class BlockUpload(BlockUploadStream):
         return bytes(super().read(size))  # type: ignore[no-untyped-call]  # as all of canopen
 
     def abort(self, abort_code: int) -> None:
-        """Store the code. canopen calls this if the end of the transfer does not arrive."""
+        """Store the code. canopen calls this method if the end of the transfer does not arrive."""
         self._error = True
         self.sdo_client.abort(abort_code)
 
@@ -133,7 +134,7 @@ class Download(WritableStream):
     """An expedited or segmented download."""
 
     def close(self) -> None:
-        """Send nothing: the last segment was marked as the last."""
+        """Send nothing: the final segment has already been marked as the last."""
         io.RawIOBase.close(self)
 
 

@@ -1,4 +1,4 @@
-"""A bus of the hand, with everything that the host does on it other than serving patches."""
+"""A bus of the hand, and the host's tasks on it except serving patches."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ _BRING_UPS: Final = 3
 do, or whose configuration raises an unexpected exception."""
 
 _START_AGAIN_NAPS: Final = 50
-"""Number of polling pauses, a quarter of a second in total, after which an unconfirmed start command, which
-may have been lost, is sent again."""
+"""Number of polling pauses (a quarter of a second in total) after which an unconfirmed start command is sent
+again, because it may have been lost."""
 
 _POLL_S: Final = 0.005
 
@@ -37,7 +37,7 @@ class BringUpCancelled(SkinError):
 
 
 class _Defective(NodeError):
-    """The host had a defect in each attempt to configure the node."""
+    """The last attempt to configure the node raised an unexpected exception."""
 
 
 def go_on_unless(cancelled: Callable[[], bool]) -> None:
@@ -49,7 +49,9 @@ def go_on_unless(cancelled: Callable[[], bool]) -> None:
 def configure_all(
     nodes: Sequence[RemoteNode], missing: Missing, deadline_s: float, cancelled: Callable[[], bool]
 ) -> dict[RemoteNode, ScanSolver]:
-    """Configure all nodes in parallel. The first failure stops the others at their next transfer.
+    """Configure all nodes in parallel.
+
+    The first failure stops the configuration of the other nodes at their next transfer.
 
     Args:
         nodes: The nodes.
@@ -148,13 +150,13 @@ class _Start:
 
 
 def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
-    """Start all nodes whose master is the host, and wait until their heartbeats report operational.
+    """Start all nodes whose master is the host, and wait until their heartbeats show them operational.
 
     The deadline is counted in polling pauses, so that time during which the host's machine is suspended does
     not count.
 
     Raises:
-        NodeTimeout: if a node does not report operational in time.
+        NodeTimeout: if a node does not become operational in time.
     """
     t_start_ns = time.monotonic_ns()
     for node, solver in ready.items():
@@ -177,7 +179,7 @@ def start_all(ready: dict[RemoteNode, ScanSolver]) -> None:
 
 
 def _listen(node: RemoteNode, deadline_s: float, abandoned: Callable[[], bool]) -> None:
-    """Wait for a frame from a node that may not be sent requests; raise NodeTimeout after the deadline."""
+    """Wait for a frame from a node to which nothing may be sent; raise NodeTimeout after the deadline."""
     end_s = time.monotonic() + deadline_s
     while not node.heard:
         if abandoned():

@@ -14,8 +14,7 @@ from skinnode.host.scan_solver import ScanSolver
 from skinnode.model.layout import Float
 
 JOIN_DEADLINE_S: Final = 1.0
-"""Maximum time, s, that a node which has sent any frame may take to send its first SDO response, or to tare
-itself."""
+"""Maximum time, s, for a node that has sent any frame to send its first SDO response or to tare itself."""
 
 LEAST_NS: Final = 300_000_000
 """Minimum time from one bring-up of a node to the next, for nodes that restart in a loop."""
@@ -36,9 +35,9 @@ class NodeStats:
 
     phase: Phase
     rejoins: int
-    """Number of bring-ups after the start that ended with the node running."""
+    """Number of bring-ups after the host's start that ended with the node running."""
     failures: int
-    """Number of bring-ups after the start that failed."""
+    """Number of bring-ups after the host's start that failed."""
     baselines: int
     """Number of times that a new baseline came into use."""
     complaint: str | None
@@ -55,7 +54,7 @@ class Joined:
 
 @dataclass(slots=True)
 class Supervised:
-    """State of one node. Only the supervisor's thread uses it."""
+    """State of one node. Used only by the supervisor's thread."""
 
     remote: RemoteNode
     phase: Phase
@@ -63,7 +62,7 @@ class Supervised:
     read_ns: int
     """Earliest time of the next reading of the node's baseline."""
     job: Future[Joined | None] | None = None
-    """Job that communicates with the node; its result is None if it only reads the error register."""
+    """Job that communicates with the node; its result is None if the job only reads the error register."""
     searching: Future[bool] | None = None
     abandon: threading.Event = field(default_factory=threading.Event)
     """Set to stop the job."""

@@ -129,7 +129,7 @@ class Supervisor:
         for node in self._nodes:
             try:
                 self._supervision.look(node, time.monotonic_ns())
-            except Exception as error:  # the next turn marks the patch as faulty
+            except Exception as error:  # the next iteration marks the patch as faulty
                 node.upset = True
                 node.remote.defects.report("supervision", error)
         self._beat(time.monotonic_ns())

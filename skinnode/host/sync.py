@@ -33,7 +33,7 @@ class SyncStats:
     latest_ns: int
     """Longest delay of a SYNC relative to its due time."""
     received: int = 0
-    """SYNC messages of other producers on buses that another master runs."""
+    """SYNC messages from other producers on buses that another master runs."""
     irregular: int = 0
     """Received SYNC messages whose counter is missing or does not follow the previous counter: a SYNC was
     lost, or there is a second producer."""
@@ -101,7 +101,7 @@ class SyncProducer:
     first; if the thread wakes a whole period late, it skips that period rather than sending two SYNC messages
     in a row. Once a SYNC has been sent on one bus, it is sent on all buses.
 
-    Threads: a dedicated thread sends.
+    Threads: a dedicated thread sends the messages.
 
     Args:
         buses: For each bus, the function that sends frames, and the SYNC counters.

@@ -14,7 +14,7 @@ from skinnode.transport import Frame
 
 
 class HostTap(StreamTap, Protocol):
-    """Recorder of all frames and of the other events that affect how a host decodes them. Never waits."""
+    """Recorder of all frames, and of the events that affect how a host decodes them. Never waits."""
 
     def received(self, bus: str, frames: Sequence[Frame]) -> None:
         """Record a batch that is about to be dispatched. Called on the mainline."""

@@ -1,4 +1,4 @@
-"""Tare a patch: the node takes a new baseline, and the host reads it and uses it to solve scans."""
+"""Tare a patch: the node adopts a new baseline, which the host reads and uses to solve scans."""
 
 from __future__ import annotations
 

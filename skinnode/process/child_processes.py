@@ -29,7 +29,7 @@ def starting_children() -> Iterator[None]:
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         try:
-            resource_tracker.ensure_running()  # unblocks SIGINT in this thread if it starts the tracker
+            resource_tracker.ensure_running()  # starting the tracker unblocks SIGINT in this thread
             signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
             yield
         finally:

@@ -2,7 +2,7 @@ r"""Makes untrusted text printable; only this module decides what may reach a te
 
 Text from a device, a file, a recording or the command line is untrusted. The rules are:
 
-* Text from a bus or a data sheet is made printable, on one line and of limited length, where it is decoded
+* Text from a bus or an EDS is made printable, on one line and of limited length, where it is decoded
   (:func:`printable`). The bytes themselves are preserved in ``od --json``, in a DCF and in comparisons.
 * Names in hand.toml are rejected unless they are printable (``skinnode.config``).
 * The output of every command passes through :class:`PrintableStream`, and rich output through the console of
@@ -55,7 +55,7 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 class PrintableStream:
-    """Text stream wrapper, for stdout for example, that escapes control characters.
+    """Wrapper for a text stream, such as stdout, that escapes control characters.
 
     Output from rich must bypass the wrapper, and does so through the attribute ``rich_proxied_file``.
     """

@@ -26,7 +26,7 @@ def datagram(can_id: int, data: bytes, *, fd: bool = False) -> bytes:
     Args:
         can_id: 0 to 0x7FF.
         data: Up to 8 bytes, or up to 64 bytes if ``fd``.
-        fd: Whether it is a CAN FD frame.
+        fd: Whether to return a CAN FD frame.
     """
     return HEADER.pack(can_id, len(data), 0) + data.ljust(_MTU[fd], b"\0")
 

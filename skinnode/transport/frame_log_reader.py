@@ -50,7 +50,7 @@ class _Container(NamedTuple):
     end: int
     """Offset from which to look for the next container, bytes."""
     objects: bytes | None
-    """Content, as far as it is readable; None if none of it is."""
+    """Content, as far as it is readable; None if nothing is readable."""
     intact: bool = False
 
 
@@ -167,7 +167,7 @@ class FrameLogReader:
     def _whole_objects(self, data: bytes, container: int) -> tuple[bytes, bytes]:
         """Return the complete objects in ``data``, and the beginning of an incomplete object at its end."""
         pieces: list[bytes] = []
-        begin = at = 0  # offsets: begin, objects found since the last gap; at, next object
+        begin = at = 0  # begin: offset of the objects since the last gap; at: offset of the next object
         while True:
             start = data.find(b"LOBJ", at, at + _PADDING_BYTES + 4)
             if start < 0 and len(data) - at <= _PADDING_BYTES:

@@ -74,7 +74,7 @@ def allowed_interfaces(config: BusConfig) -> str:
 
 
 class _Message(can.Message):
-    """CAN message class whose instances are copied five times as fast as python-can's ``Message``.
+    """CAN message class; copying an instance is five times as fast as with python-can's ``Message``.
 
     python-can's virtual bus copies each message once per receiver.
     """
@@ -162,7 +162,7 @@ class CanPort:
         return self._reader is not None
 
     def fileno(self) -> int:
-        """Return the socket's file descriptor if the port :attr:`reads_batches`, -1 while it is closed."""
+        """Return the file descriptor of a port that :attr:`reads_batches`; -1 while the port is closed."""
         return -1 if self._reader is None else self._reader.fileno()
 
     @property
@@ -311,8 +311,8 @@ class CanPort:
     def set_bitrate(self, bitrate_bps: int) -> None:
         """Change the bit rate and reopen the interface.
 
-        On socketcan, ``ip link`` sets the bit rate and needs the capability CAP_NET_ADMIN. The receiving
-        thread must have ended first.
+        On socketcan, ``ip link`` sets the bit rate, which requires the capability CAP_NET_ADMIN. The
+        receiving thread must have ended first.
 
         Raises:
             BusError: if the bit rate is not accepted; the interface is then open at the previous rate.
@@ -347,7 +347,7 @@ class CanPort:
 
 
 def _tune_socket(fileno: int) -> None:
-    """Request a large receive buffer, and frames of this multicast group only."""
+    """Request a large receive buffer, and only frames of this multicast group."""
     duplicate = socket.socket(fileno=os.dup(fileno))
     try:
         try:

@@ -210,7 +210,8 @@ class Receiver:
 
     Args:
         intakes: The queues to fill.
-        on_defect: Called with any other exception, on the thread that raised it; reception continues.
+        on_defect: Called with any exception raised outside the ports, on the thread that raised it; reception
+            continues.
     """
 
     def __init__(
@@ -327,7 +328,7 @@ def _fetch(intakes: Iterable[Intake]) -> bool:
 
 
 def _together(now_ns: int, pause_ns: int) -> int:
-    """Return the end of a pause of about ``pause_ns``, half to one and a half times as long.
+    """Return the end of a pause that lasts 0.5 to 1.5 times ``pause_ns``.
 
     The end is the same instant for all buses, so that one wake-up serves them all.
     """

@@ -68,7 +68,7 @@ class MessageBatch:
         self._got = 0
 
     def receive(self, sock: socket.socket, most: int) -> int:
-        """Receive up to ``most`` messages, but at most ``count``, replacing the last batch; never waits.
+        """Receive up to ``most`` messages, but at most ``count``, replacing the previous batch; never waits.
 
         Returns:
             Number of messages received.

@@ -46,7 +46,7 @@ def check_form(text: str, source: str) -> None:
 
 
 def no_eds(error: Exception, source: str, text: str = "") -> ProfileError:
-    """Return a ProfileError for a parser error on ``text``, with the line or section if known."""
+    """Return a ProfileError for a parser error in ``text``, with the line or section if known."""
     numbers = [getattr(error, "lineno", None), *(line for line, _ in getattr(error, "errors", ()))]
     line = next(filter(None, numbers), None)
     if line is not None:

@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 NOT_CONFIGURED: Final = 0xFF
-"""Node-ID value of a node that has no node-ID."""
+"""Node-ID value that marks a node without a node-ID."""
 
 BIT_RATES_BPS: Final = {
     0: 1_000_000,

@@ -41,7 +41,7 @@ class NmtState(IntEnum):
 
     @property
     def communicates(self) -> bool:
-        """Whether SDO, SYNC, TIME and EMCY are served."""
+        """Whether the SDO, SYNC, TIME and EMCY services are available."""
         return self in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 
 

@@ -35,7 +35,7 @@ class BaselineWatch:
         self._pool = pool
 
     def look(self, node: Supervised, now_ns: int) -> None:
-        """Read the baseline again if the node announced a new one, or may have done so in a lost summary.
+        """Read the baseline again if the node announced a new one, possibly in a lost summary.
 
         After an announcement, scans are withheld until the baseline has been read.
         """
@@ -84,7 +84,7 @@ class BaselineWatch:
         node.read_ns = now_ns + (LEAST_NS if stream.withholding else _DOUBT_NS)
         try:
             read = job.result()
-        except (BusError, ConfigError) as error:  # if the node is gone, missing heartbeats will reveal it
+        except (BusError, ConfigError) as error:  # missing heartbeats will reveal a node that is gone
             stream.doubtful = True
             _log.warning("%s; reading its baseline again", error)
             return

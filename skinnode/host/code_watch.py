@@ -15,13 +15,13 @@ codes flicker while rubber creeps and are constant afterwards, so the converter 
 **Wires.** A wire is open or shorted if all its crossings are open or shorted in a complete scan. Noise and
 drift are evaluated over windows of ``WINDOW`` scans, and their criteria must be met in ``WINDOWS``
 consecutive windows. Taking the second difference of a code over time removes steady movement; a wire is noisy
-if the mean square of this difference exceeds ``NOISY`` times both that of the median wire on its side and
-that of the expected noise. A wire drifts if the resistances of all its crossings changed by the same fraction
-of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and its neighbours did not
-follow. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber spreads the change to
-the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to 60 %) changed a wire by
-more than ``DRIFT`` at 780,000 instants; none was mistaken for drift. Consequently, two neighbours that drift
-alike are not reported, nor is a wire while it is touched.
+if the mean square of this difference exceeds ``NOISY`` times the value of the median wire on its side, and
+``NOISY`` times the value of the expected noise. A wire drifts if the resistances of all its crossings changed
+by the same fraction of R0, by more than ``DRIFT`` relative to both the median wire and the rest state, and
+its neighbours did not follow. A touch, in contrast, changes the crossings of a wire unevenly, and the rubber
+spreads the change to the adjacent wires. Simulated touches (spheres of 2 mm to 0.3 m pressed in by 10 to
+60 %) changed a wire by more than ``DRIFT`` at 780,000 instants; none was mistaken for drift. Consequently,
+two neighbours that drift alike are not reported, nor is a wire while it is touched.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class CodeWatch:
     def _compare(self, codes: Codes, last: Codes, before: Codes) -> None:
         changed = codes != last
         if changed.any():
-            if self._flickers < FLICKERS:  # beyond this, noise is proven
+            if self._flickers < FLICKERS:  # beyond this number, noise is proven
                 self._flickers += bool((changed & (codes == before)).any())
                 self._before = np.where(changed, last, before)
             by_itself = not self.frozen or np.abs(codes.astype(np.int64) - last).max() <= 1
@@ -143,7 +143,7 @@ class CodeWatch:
         self.frozen = self._run >= LEAST_RUN and self._run >= self._needed
 
     def _impossible(self, codes: Codes) -> float:
-        """Return how many consecutive scans cannot all have these codes, given the expected noise."""
+        """Return the number of consecutive scans with the same codes that the expected noise rules out."""
         measured = codes[codes <= self._scale.steps]
         if not measured.size or not self._relative_noise:
             return math.inf
@@ -192,7 +192,7 @@ class CodeWatch:
             spread = _of_wires(off, axis, whole, np.max, np.nanmax)
             quiet = max(expected, _median_of_known(level))
             # The distance from rest also matters: if a touch moved the median wire, the untouched wires
-            # deviate from it.
+            # deviate from the median.
             away = np.minimum(np.abs(gain - _median_of_known(gain)), np.abs(gain - 1.0))
             step = np.concatenate(([np.inf], np.abs(np.diff(gain)), [np.inf]))
             apart = np.fmin(step[:-1], step[1:])

@@ -184,7 +184,7 @@ class Configurator:
         _watch_master(remote, watched)
 
     def _configure_heartbeat(self, remote: RemoteOd, *, master: bool) -> float:
-        """Set the heartbeat period; on another master's bus, only if none is set. Returns the period, s."""
+        """Set the heartbeat period; on another master's bus, only if unset. Returns the period, s."""
         heartbeat_ms = self.hand.bring_up.heartbeat_ms
         if not master:
             present_ms = int(remote.read(od.HEARTBEAT_PRODUCER, 0, "u16"))

@@ -1,7 +1,7 @@
 """Containment of exceptions in the host's threads.
 
 An exception raised while serving one subject (a patch, a bus, a subscriber) is reported to the
-:class:`Defects` of that subject and affects no other; the operation is then retried. The table in
+:class:`Defects` of that subject and affects no other subject; the operation is then retried. The table in
 :mod:`skinnode.host` lists every thread.
 """
 

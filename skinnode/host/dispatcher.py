@@ -1,7 +1,7 @@
 """Count the frames of a bus and dispatch them to handlers by COB-ID. No thread, no clock.
 
-A :class:`~skinnode.host.link.BusLink` feeds the dispatcher the frames of a bus; a replay feeds it a
-recording.
+A :class:`~skinnode.host.link.BusLink` feeds the dispatcher with the frames of a bus, a replay with the frames
+of a recording.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skinnode.transport.bus_state import BusState, bus_state
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[bytes, int], None]
-"""Called with the data of a frame and the monotonic time at which it was received, ns."""
+"""Called with the data of a frame and the monotonic time at which the frame was received, ns."""
 
 _MARK_NS: Final = 100_000_000
 """Interval at which the bits are summed, ns."""
@@ -267,7 +267,7 @@ class Dispatcher:
                 self._bus_offs += state is BusState.OFF and before is not BusState.OFF
 
     def _mark(self, now_ns: int) -> None:
-        """Sum the bits so far. The meter has one owner, so only the mainline may call this."""
+        """Sum the bits so far. The meter has one owner, so only the mainline may call this method."""
         while self._outgoing:
             self._meter.add(*self._outgoing.popleft())
         bits = self._meter.bits

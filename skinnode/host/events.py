@@ -17,7 +17,7 @@ from skinnode.host.publish import check_capacity
 _log = logging.getLogger(__name__)
 
 CAPACITY_EVENTS: Final = 1024
-"""Default number of events by which a subscriber may lag before it loses the oldest."""
+"""Default number of events by which a subscriber may lag before losing the oldest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,10 @@ class HealthEvent:
 
 
 class EventSubscription:
-    """Subscription to a running host's events. Iterate over it until the host closes, or use :meth:`get`.
+    """Subscription to a running host's events.
 
-    When the queue is full, its oldest event is dropped and counted in ``dropped``. Any thread may read.
+    Iterate over the subscription until the host closes, or use :meth:`get`. When the queue is full, its
+    oldest event is dropped and counted in ``dropped``. Any thread may read.
     """
 
     def __init__(self, capacity: int) -> None:

@@ -66,14 +66,14 @@ class PatchHealth:
     scan_age_s: float | None
     boot_ups: int
     emergencies: int
-    """Number of EMCY messages that reported an error since the host started."""
+    """Number of EMCY messages reporting an error since the host started."""
     last_emergency: int | None
     """Error code of the newest EMCY message that reported an error; None before the first."""
     emergency_text: str
     """Description of the newest EMCY message that reported an error; empty before the first."""
     error_register: int
     rejoins: int = 0
-    """Number of times the node came back and was brought up again since the host started."""
+    """Number of times the node has come back and been brought up again since the host started."""
     refusal: str | None = None
     """Why a node that answers is not used: wrong identity or layout, or configuration not kept."""
     restarts_in_a_loop: bool = False

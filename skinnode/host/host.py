@@ -46,7 +46,7 @@ class HostStats:
     malformed: tuple[CodecError, ...]
     """First malformed frame of each bus; buses without malformed frames are omitted."""
     defects: Mapping[str, DefectStats]
-    """Exceptions contained by the host, by patch and by bus; ``host`` holds those that concern neither."""
+    """Exceptions contained by the host, by patch and by bus; ``host`` holds the remaining exceptions."""
 
     @property
     def rivals(self) -> Mapping[str, OtherMasterStats]:
@@ -60,7 +60,7 @@ class HostStats:
 
 
 class Host:
-    """A running hand. Created by :meth:`from_toml` or :meth:`from_config`, which also shut it down.
+    """A running hand. Created and shut down by :meth:`from_toml` or :meth:`from_config`.
 
     Example::
 
@@ -270,7 +270,7 @@ class Host:
         """Subscribe to changes in the health of patches, wires and buses from now until the host closes.
 
         Args:
-            capacity: Number of events by which the subscriber may lag before it loses the oldest.
+            capacity: Number of events by which the subscriber may lag before losing the oldest.
 
         Raises:
             ValueError: if ``capacity`` is below 1.

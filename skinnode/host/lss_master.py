@@ -1,9 +1,9 @@
 """LSS master (CiA 305 v3.0): finds nodes without a node-ID, and sets a node's node-ID and bit rate.
 
 A slave that does not match stays silent, so every negative answer costs a timeout. Responses are not
-numbered: a late response to an earlier request looks like one to the current request. Therefore a node counts
-as found or selected only once it has sent its own address, which is unlike any other response; and after a
-service without a response, the master waits until no late response can arrive.
+numbered: a late response to an earlier request looks like a response to the current request. Therefore a node
+counts as found or selected only once it has sent its own address, which is unlike any other response; and
+after a service without a response, the master waits until no late response can arrive.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ class NodeSupervision:
             remote.defects.report("bring-up", error)
             return
         node.phase, node.since_ns, node.probe_ns = Phase.STARTING, now_ns, now_ns + _PROBE_NS
-        if remote.has_other_master:  # the other master starts it
+        if remote.has_other_master:  # the other master starts the node
             self._running(node, now_ns)
 
     def _starting(self, node: Supervised, now_ns: int) -> None:
@@ -175,7 +175,7 @@ class NodeSupervision:
     def _make_faulty(self, node: Supervised, now_ns: int) -> None:
         """Mark a patch as faulty because a defect was reported.
 
-        If this raises an exception, the call is retried in the next iteration.
+        If this method raises an exception, the call is retried in the next iteration.
         """
         remote = node.remote
         count = remote.defects.count

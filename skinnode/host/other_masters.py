@@ -40,7 +40,7 @@ class OtherMasterStats:
 
 
 class OtherMasters:
-    """Counter of other masters' frames on one bus; logs the first of each kind. Mainline only."""
+    """Counter of other masters' frames on one bus; logs the first frame of each kind. Mainline only."""
 
     def __init__(self, bus: BusConfig) -> None:
         self._bus = bus

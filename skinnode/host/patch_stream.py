@@ -1,4 +1,4 @@
-"""From a chunk on the bus to a field: assemble on the mainline, decode and solve on the worker pool.
+"""Turn chunks on the bus into fields: assemble on the mainline, decode and solve on the worker pool.
 
 The mainline assembles scans and puts the newest in a box that holds one scan; a worker takes the scan from
 the box and solves it. A scan overtaken while the worker is busy is skipped and counted. The stream's
@@ -266,8 +266,8 @@ class PatchStream:
     def leave_out(self, times_ns: Sequence[int], within_ns: int) -> None:
         """Skip the scans that newer scans overtook when the recording was made.
 
-        Scan numbers cannot identify them: after a pause, the two halves of a scan may be two scans with the
-        same number.
+        Scan numbers cannot identify these scans: after a pause, the two halves of one scan may count as two
+        scans with the same number.
 
         Args:
             times_ns: Monotonic times at which the last frames of these scans arrived.
@@ -324,7 +324,7 @@ class PatchStream:
         self._publisher.publish(field, stamp.patch)
 
     def _work_failed(self, error: Exception) -> None:
-        """Handle the exception of a job that could not start."""
+        """Handle the exception raised when a job could not start."""
         self._report(error)
         self._leave()
 

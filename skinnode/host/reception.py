@@ -75,8 +75,8 @@ def receive_patch(
         hand: The hand to which the patch belongs.
         dispatcher: Dispatches the frames of its bus.
         ticks: The SYNC counters of its bus.
-        output: Where scans are solved. Exceptions are reported to its ``defects``; if this is None, they are
-            raised, and the publisher fails.
+        output: Where scans are solved. Exceptions are reported to its ``defects``; if ``defects`` is None,
+            they are raised, and the publisher fails.
     """
     period_ns = hand.sync.period_ms * 1_000_000
     watch = CodeWatch(CodeScale(patch.code_bits), patch.relative_noise)

@@ -244,7 +244,7 @@ class RemoteOd:
                 failure = abort
                 if abort.code not in _OUT_OF_STEP:
                     break
-            except Exception as error:  # bugs in canopen raise AttributeError, struct.error and others
+            except Exception as error:  # bugs in canopen raise AttributeError, struct.error etc.
                 failure = error
                 if not isinstance(error, SdoError):
                     self._on_defect(error)

@@ -64,7 +64,7 @@ def configure_all(
 
     Raises:
         NodeTimeout: if a node is silent and ``missing`` is ``refuse``.
-        BusError: if all nodes of a bus are silent and ``missing`` is ``refuse``, or as raised by
+        BusError: if all nodes on a bus are silent and ``missing`` is ``refuse``, or as raised by
             :meth:`RemoteNode.configure`.
         BringUpCancelled: if ``cancelled`` returned True.
     """
@@ -89,7 +89,7 @@ class _Start:
             try:
                 jobs = {node: pool.submit(self._configure, node) for node in self._nodes}
                 self._wait_for(jobs)
-            finally:  # stop jobs that still run after the first failure or Ctrl-C
+            finally:  # stop jobs still running after the first failure or Ctrl-C
                 self._over.set()
                 pool.shutdown(cancel_futures=True)
         solvers = {node: self._result(node, job) for node, job in jobs.items()}
@@ -198,7 +198,7 @@ def _silence(
 ) -> BusError:
     """Return the error for a silent node.
 
-    If all nodes of a bus are silent, the error concerns the bus, and its cable, supply or bit rate is
+    If all nodes on a bus are silent, the error concerns the bus, and its cable, supply or bit rate is
     suspect.
     """
     bus, patch = node.bus, node.patch

@@ -17,7 +17,7 @@ from skinnode.host.containment import Defects, keep_on
 
 Job = Callable[[], None]
 OnError = Callable[[Exception], object]
-"""Called with the exception of a job, on the thread that ran it; must not raise."""
+"""Called with the exception raised by a job, on the thread that ran the job; must not raise."""
 
 
 class Workers:

@@ -23,8 +23,8 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 def starting_children() -> Iterator[None]:
     """Block the terminal's signals for child processes started in this ``with`` block.
 
-    A signal that arrives in the block is handled at the end of the block, because a child interrupted during
-    its start would print a traceback.
+    A signal that arrives during the block is handled at the end of the block, because a child interrupted
+    during its start would print a traceback.
     """
     with _signals_deferred():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)

@@ -61,7 +61,7 @@ class FrameLog:
         """Number of frames written."""
 
     def write(self, logged: LoggedFrame) -> None:
-        """Write a frame; it is safe only after the next :meth:`flush`."""
+        """Write a frame, which is safe only after the next :meth:`flush`."""
         frame = logged.frame
         if self._writer is None:
             self._writer = self._open()

@@ -135,7 +135,7 @@ class FrameLogReader:
     def _container(self, data: mmap.mmap, at: int) -> _Container:
         """Return the end and the content of the container at ``at``.
 
-        A damaged container ends after its header, because its length may be wrong too.
+        A damaged container is assumed to end after its header, because its length may be wrong too.
         """
         _, _, _, size, _ = _OBJECT.unpack_from(data, at)
         begin, end = at + _CONTAINER_HEAD_BYTES, at + size

@@ -46,7 +46,7 @@ _LATE_NS: Final = 600_000
 _GIVEN_UP_NS: Final = 200_000_000
 """Time after which an overdue frame is no longer awaited."""
 _ANSWER_NS: Final = 20_000_000
-"""Time after a request during which a response may come at any instant."""
+"""Time after a request during which a response may arrive at any instant."""
 _LAG_NS: Final = 50_000
 """Delay from a frame's arrival until it can be read."""
 
@@ -114,7 +114,7 @@ class Intake:
         return frames
 
     def expect(self, what: str, times_ns: tuple[int, ...]) -> None:
-        """Predict when the last frame of ``what`` will arrive; it will then be fetched without delay.
+        """Predict when the last frame of ``what`` will arrive, so that it is fetched without delay.
 
         Args:
             what: Name of the group of frames. A new prediction replaces the previous one of the same name.

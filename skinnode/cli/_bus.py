@@ -21,7 +21,7 @@ class Place(NamedTuple):
         return () if self.hand is None else self.hand.patches_on(self.bus.name)
 
     def patch_name(self, node_id: int) -> str:
-        """Return the name of the patch with that node-ID, or an empty string."""
+        """Return the name of the patch with this node-ID, or an empty string."""
         return next((patch.name for patch in self.patches if patch.node_id == node_id), "")
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNBOUNDED: Final = 10_000
-"""Console width for a pipe, in columns; greater than the length of the longest line printed."""
+"""Console width for output to a pipe, in columns; no printed line is longer."""
 
 
 def print_json(value: Any) -> None:
@@ -34,8 +34,8 @@ def console(*, stderr: bool = False, soft_wrap: bool = False) -> Console:
     """Return the console that all commands use.
 
     The console prints square brackets and colons literally, because names may contain them; styles are passed
-    as arguments of ``print``. The console is as wide as the terminal. Output to a pipe or file is not
-    wrapped, so that programs can read whole lines, unless ``COLUMNS`` sets a width.
+    as arguments to ``print``. The console is as wide as the terminal. Unless ``COLUMNS`` sets a width, output
+    to a pipe or file is not wrapped, so that programs can read whole lines.
 
     Args:
         stderr: Print to stderr instead of stdout.
@@ -99,7 +99,7 @@ def indented(text: str, columns: int = 10) -> Padding:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the current step on one line of stderr, which is erased at the end.
+    """Yield a function that shows the current step on one line of stderr; the line is erased at the end.
 
     Nothing is shown if ``quiet`` is set or stderr is not a terminal.
     """

@@ -1,4 +1,4 @@
-"""Runner for typer applications that reports each error as one line on stderr, with exit status 2."""
+"""Runs a typer application and reports each error as one line on stderr, with exit status 2."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def _wants_help(error: Any) -> bool:
 def usage_line(error: Any) -> str:
     """Return a usage error as one line, such as ``skinnode scan: --bitrate: got 'x', allowed: an integer``.
 
-    Typer's own text is kept, except for missing and invalid values: there, Typer omits the argument's
-    meaning, the value given or the allowed range.
+    Typer's own text is kept except for missing and invalid values, for which it omits the argument's meaning,
+    the value given or the allowed range.
     """
     message = " ".join(error.format_message().split()).rstrip(".")
     param, kind = getattr(error, "param", None), type(error).__name__
@@ -91,7 +91,7 @@ def usage_line(error: Any) -> str:
 
 
 def _name(param: Any) -> str:
-    """Return the name as the user types it: the option, or the argument's name in the help."""
+    """Return the parameter's name as the user knows it: the option, or the argument's name in the help."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper())
@@ -104,7 +104,7 @@ def _meaning(param: Any) -> str:
 
 
 def _values(param: Any) -> str:
-    """Return the allowed numbers or words, which Typer stores in two places; empty for other types."""
+    """Return the allowed numbers or words, which Typer stores in two places; empty if there are none."""
     converter = getattr(param, "type", param)
     described = getattr(getattr(param, "type_descriptor", None), "annotation", None)
     if get_origin(described) is Literal:

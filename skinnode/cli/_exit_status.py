@@ -11,9 +11,9 @@ status  meaning
         reader of its output closed the pipe (SIGPIPE)
 ======  ==============================================================================================
 
-Nothing is printed about a signal, because its sender knows about it; open resources are closed before the
-exit. SIGHUP stays ignored if it was ignored at the start, as it is under nohup. This module imports nothing
-slow, so its handlers are installed before anything else is loaded.
+Nothing is printed when a signal arrives, because its sender knows about it; open resources are closed before
+the process exits. SIGHUP stays ignored if it was ignored at the start, as it is under nohup. This module
+imports nothing slow, so its handlers are installed before anything else is loaded.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def status_of(number: int) -> int:
-    """Return the exit status after signal ``number``, following the shell convention."""
+    """Return the exit status for signal ``number``, following the shell convention."""
     return 128 + number
 
 
@@ -64,7 +64,7 @@ def main_of(module: str, argv: Sequence[str] | None = None) -> NoReturn:
 
 
 def _handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
-    """Install ``handler`` for the signals in the main thread, the only thread in which Python allows it."""
+    """Install ``handler`` for the signals if this is the main thread; Python allows it in no other thread."""
     import threading
 
     if threading.current_thread() is threading.main_thread():
@@ -83,10 +83,10 @@ def _exit_at_once(number: int, _frame: FrameType | None) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Unwind the stack, or exit immediately if an import is running and there is no other thread.
+    """Unwind the stack, or exit immediately if an import is in progress and there is no other thread.
 
     During an import, some of Python's callbacks would swallow the exception or print it. As long as there is
-    only one thread, nothing has been opened.
+    only one thread, no resource has been opened.
     """
     import threading
 

@@ -23,7 +23,7 @@ _OVERRUN_S, _OVERRUN_SYNCS = 1.0, 3
 _POLL_S = 0.01
 
 _FIRST_SCANS = 3
-"""Number of SYNCs after which a patch must have sent a scan."""
+"""Number of SYNCs after which a missing first scan is a fault."""
 
 _EXPLAINED_BY_SLOWNESS: Final = (
     "scans_torn",
@@ -32,11 +32,11 @@ _EXPLAINED_BY_SLOWNESS: Final = (
     "chunks_lost",
     "summaries_lost",
 )
-"""Counters of the missing and late frames that a slow computer can cause; wrong frames remain faults."""
+"""Counters of missing and late frames, which a slow computer can cause; wrong frames remain faults."""
 
 
 def operational_text(running: Host) -> str:
-    """Return how many patches report the operational state, and the conditions of the others."""
+    """Return the number of operational patches, and the condition of each patch that is not operational."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name
@@ -60,11 +60,11 @@ def final_state_text(plan: HandConfig) -> str:
 
 
 def faults_and_notes(running: Host) -> tuple[list[str], list[str]]:
-    """Return the faults of the run, and notes that are not faults, one line each.
+    """Return the faults and the notes of the run, one line each.
 
-    A node that skips scans because its own computer is too slow sends EMCY 0x8110. Its missing and late
-    frames, and that emergency if still active at the end, are then reported as notes. Wrong frames remain
-    faults.
+    A node that skips scans because its own computer is too slow sends EMCY 0x8110. In this case its missing
+    and late frames, and the emergency if it is still active at the end, are reported as notes. Wrong frames
+    remain faults.
     """
     _let_overruns_end(running)
     stats = running.stats()
@@ -124,7 +124,7 @@ def _patch_faults_and_notes(
 
 
 def reason(health: PatchHealth, before: str = "") -> str:
-    """Return ``before`` and the reason why a patch is faulty or refused; empty for other conditions."""
+    """Return ``before`` and the reason why a patch is faulty or refused; empty if it is neither."""
     if health.condition == "refused" and health.refusal:
         return f"{before}{health.refusal}"
     if health.condition == "faulty" and health.defect is not None:
@@ -228,7 +228,7 @@ class Report(Protocol):
 
 
 class TextReport:
-    """Prints one line for the buses and one per patch every second."""
+    """Prints one line for all buses and one line per patch, every second."""
 
     def note(self, text: str) -> None:
         """Print ``text``."""

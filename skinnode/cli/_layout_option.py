@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from skinnode.model.layout import PatchLayout
 
 OPTION = "--layout"
-HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as for layout.file in a hand; or MODULE:NAME."
+HELP = "aligned, symmetric or staggered; FILE.toml or .npz, as in a hand's layout.file; or MODULE:NAME."
 
 
 def import_from_here() -> None:
@@ -24,7 +24,8 @@ def find_layout(text: str) -> PatchLayout:
     """Return the layout that ``text`` names.
 
     Args:
-        text: A preset, a file, or the MODULE:NAME of a PatchLayout or a function that returns one; see HELP.
+        text: A preset, a file, or the MODULE:NAME of a PatchLayout or of a function that returns one; see
+            HELP.
 
     Raises:
         ConfigError: There is no such layout.

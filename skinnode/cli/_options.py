@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 def node_ids(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
     """Return shell completions for a node-ID, each with the name of its patch.
 
-    They are the node-IDs of --hand or, without it, of hand.toml if that file exists; otherwise all node-IDs.
+    The completions are the node-IDs in the --hand file or, by default, in hand.toml; if that file yields
+    none, all node-IDs.
     """
     patches = _patches(ctx)
     offered = [(str(patch.node_id), patch.name) for patch in patches]
@@ -51,7 +52,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 <= value < math.inf:
-        raise typer.BadParameter(f"{text!r} is not a number of seconds, at least 0")
+        raise typer.BadParameter(f"{text!r} is not a number of seconds (0 or more)")
     return value
 
 
@@ -60,10 +61,11 @@ Interface = Annotated[
 ]
 Channel = Annotated[str | None, typer.Option(help="Channel of the interface; default can0.", metavar="NAME")]
 OtherInterface = Annotated[
-    str | None, typer.Option(help="python-can interface to use instead of the file's.", metavar="NAME")
+    str | None,
+    typer.Option(help="python-can interface to use instead of the one in the file.", metavar="NAME"),
 ]
 OtherChannel = Annotated[
-    str | None, typer.Option(help="Channel to use instead of the file's.", metavar="NAME")
+    str | None, typer.Option(help="Channel to use instead of the one in the file.", metavar="NAME")
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bits per second; default 1000000.", metavar="BPS")]
 Fd = Annotated[bool, typer.Option("--fd", help="Send PDOs in CAN FD frames.")]
@@ -82,5 +84,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text."
 JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object per line instead of text.")]
 Seconds = Annotated[
     float | None,
-    typer.Option(parser=_seconds, help="End after this many seconds; default: at Ctrl-C.", metavar="S"),
+    typer.Option(
+        parser=_seconds, help="End after this many seconds; default: run until Ctrl-C.", metavar="S"
+    ),
 ]

@@ -47,7 +47,7 @@ def kernel(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) ->
 
 @app.command()
 def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> None:
-    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres: same F and J, start close to the solution."""
+    """Solve one wire to 1e-9 with skinnode, SciPy and Ceres: same F and J, starting close to the solution."""
     from skinnode.bench import solve as bench
 
     _prepare(json, plot)
@@ -134,7 +134,7 @@ def path(
     plot: PlotFile = None,
     experiments: Annotated[int, typer.Option(min=1, help="Number of random presses per setting.")] = 10,
 ) -> None:
-    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper, next to its printed values."""
+    """Reproduce tables 2, 3 and 4 and figures 8 to 13 of the paper, and show the paper's values alongside."""
     from skinnode.bench import path as bench
     from skinnode.text.json_values import plain
 
@@ -236,7 +236,7 @@ def pipeline(
 @app.command()
 def soak(
     json: JsonFile = None,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak in minutes.")] = 10.0,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the soak test in minutes.")] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the faults; the same seed gives the same rounds.")] = 1,
     own_cache: Annotated[
         bool, typer.Option(hidden=True, help="Run in this process, with the existing kernel cache.")
@@ -264,7 +264,7 @@ def soak(
 
 
 def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
-    """Run the soak in a child process with a damaged copy of the kernel cache, and return its exit status."""
+    """Run the soak test in a child process with a damaged kernel cache; return the child's exit status."""
     import subprocess
     import sys
     import tempfile
@@ -273,7 +273,7 @@ def _soak_on_damaged_cache(json: Path | None, minutes: float, seed: int) -> int:
 
     with tempfile.TemporaryDirectory(prefix="skinnode-soak-") as folder:
         cache.fill(Path(folder))
-        typer.echo("The soak starts with a damaged copy of the kernel cache:")
+        typer.echo("The soak test starts with a damaged copy of the kernel cache:")
         for line in cache.damage(Path(folder), seed):
             typer.echo(f"  {line}")
         command = [sys.executable, "-c", "from skinnode.cli.main import main; main()", "bench", "soak"]

@@ -42,12 +42,12 @@ def conformance(
 ) -> None:
     """Test a node against CiA 301 with raw frames: 127 cases, one line each.
 
-    It RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
-    parameters. It reads the configuration first and restores every change at the end. It sends commands to
-    all nodes and frames that appear to come from other nodes: use a bus without another master, preferably
-    without any other node, on a machine that can be stopped safely.
+    The command RESETS the node many times, starts and stops it, remaps its PDOs, and stores and restores its
+    parameters. The node's configuration is read first and restored at the end. The command addresses some
+    messages to all nodes, and sends frames that appear to come from other nodes: use a bus without another
+    master and preferably without any other node, in a machine that can be stopped safely.
 
-    Exit status 0 if no case failed, 1 if one did, 2 if the tests could not run.
+    Exit status 0 if no case failed, 1 if any failed, 2 if the tests could not run.
     """
     from skinnode.cli._bus import find_bus
     from skinnode.conformance import connect, run_cases, select

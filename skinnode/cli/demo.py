@@ -26,18 +26,19 @@ def demo(
         int, typer.Option(min=0, help="Seed of the scene and the converter noise.", metavar="N")
     ] = 1,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write all figures to this file.", metavar="FILE")
+        Path | None, typer.Option("--json", help="Write all results to this file.", metavar="FILE")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Plot truth, field and error to this file.", metavar="FILE.png")
+        Path | None,
+        typer.Option(help="Write a plot of truth, field and error to this file.", metavar="FILE.png"),
     ] = None,
 ) -> None:
     """Press simulated patches and decode them from real CANopen traffic.
 
     Each patch is a CANopen node on an embedded virtual bus. A spherical indenter presses and slides; the host
     collects the PDOs and solves the scans. Exit status 1 if a scan was torn, a frame was lost, or errors
-    exceed the reported uncertainty: the RMS error over the run is above 1.15 times the reported RMS, or the
-    error of a coordinate is above 6 standard deviations.
+    exceed the reported uncertainty: the RMS error over the run exceeds 1.15 times the reported RMS, or the
+    error of any coordinate exceeds 6 standard deviations.
     """
     import json
 

@@ -36,9 +36,9 @@ def doctor(
 ) -> None:
     """Examine buses, nodes, configuration, wires, noise, baseline, timing and losses.
 
-    The doctor only listens and reads, so a running hand is not disturbed. The skin is judged by its scans,
-    which a hand that is not running sends only with --active. Do not touch the skin while the command runs.
-    Exit status 0 if no fault was found, 1 if one was found, 2 if the examination could not run.
+    The doctor only listens and reads, so a running hand is not disturbed. The skin is judged by its scans; a
+    hand that is not running sends scans only with --active. Do not touch the skin while the command runs.
+    Exit status 0 if no fault was found, 1 if any was found, 2 if the examination could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

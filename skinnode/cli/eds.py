@@ -52,7 +52,7 @@ def eds(
 ) -> None:
     """Print the EDS or the DCF of a patch (CiA 306).
 
-    An EDS depends only on the sizes, the code width and the bus. The EDS files of the reference patches are
+    An EDS depends only on the sizes, the code width and --fd. The EDS files of the reference patches are
     in eds/.
     """
     from skinnode.errors import ConfigError

@@ -1,4 +1,4 @@
-"""``skinnode hand``: checks a hand file, prints its JSON Schema, or creates a new one."""
+"""``skinnode hand``: checks or creates a hand file, or prints the JSON Schema of hand files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skinnode.config import HandConfig
 
 app = typer.Typer(
-    help="Check a hand file and its bus load, print its JSON Schema, or create one.", no_args_is_help=True
+    help="Check or create a hand file, compute its bus load, or print the JSON Schema.", no_args_is_help=True
 )
 
 
@@ -30,8 +30,8 @@ def check(
 
     For each bus the command prints the planned load, once with every frame at its maximum length and once
     with random data; the worst-case time from SYNC to the end of each patch's summary, also as a fraction of
-    the SYNC period; and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if a bus
-    needs more than its max_load, 2 if the file cannot be used.
+    the SYNC period; and the longest wait of each frame in `others`. No bus is opened. Exit status 1 if the
+    load of a bus exceeds its max_load, 2 if the file cannot be used.
     """
     from skinnode.bus_load.plan import plan_of, require_room
     from skinnode.config import load_hand
@@ -160,7 +160,7 @@ def _frame_table(plan: BusPlan) -> Table:
 
 
 def _other_table(plan: BusPlan) -> Table:
-    """Return a table of the longest time that each frame of another device waits to be sent."""
+    """Return a table of the longest time that each frame from another device waits to be sent."""
     table = _table("others", "bytes", "every ms", "queued to sent ms")
     for frame in plan.others:
         worst = "no bound" if frame.response_s is None else f"{frame.response_s * 1e3:.2f}"
@@ -179,7 +179,7 @@ def _remarks(plan: BusPlan) -> list[str]:
 def schema() -> None:
     """Print the JSON Schema of a hand file, for editors that complete and check TOML.
 
-    A hand file refers to it in its first line, `#:schema PATH`; this version's schema is
+    A hand file names its schema in the first line, `#:schema PATH`; this version's schema is
     skinnode/config/hand.schema.json.
     """
     from skinnode.config.schema import schema_text

@@ -94,10 +94,10 @@ def set_node(
     bus: Bus = None,
     as_json: Json = False,
 ) -> None:
-    """Set the node-ID or bit rate of one node, and store them.
+    """Set and store the node-ID, the bit rate or both in one node.
 
-    A node that already has a node-ID is reset so that the new one takes effect. Exit status 0 if everything
-    was done, 1 if the node did not store its settings or did not boot, 2 if nothing could be done.
+    A node that already has a node-ID is reset so that the new one takes effect. Exit status 0 on success, 1
+    if the node did not store its settings or did not boot, 2 if nothing could be done.
     """
     from skinnode.canopen import indices as od
     from skinnode.canopen.lss import BIT_RATES_BPS, LssAddress

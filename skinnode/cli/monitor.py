@@ -1,4 +1,4 @@
-"""``skinnode monitor``: shows a hand on a full screen, or as one line of JSON per second."""
+"""``skinnode monitor``: shows a hand full-screen, or as one line of JSON per second."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def monitor(
         ),
     ] = False,
     output: Annotated[
-        str,  # an empty string is not a folder
+        str,  # an empty string is not a folder name
         typer.Option("--output", "-o", help="Folder for recordings made with the key r.", metavar="FOLDER"),
     ] = ".",
     seconds: Annotated[
@@ -119,7 +119,7 @@ def _require_screen() -> None:
 
 
 def _plan(hand: Path | None, interface: str | None, channel: str | None, simulate: bool) -> HandConfig:
-    """Return the hand to run; its host waits for missing patches."""
+    """Return the hand to run, set up so that its host waits for missing patches."""
     from skinnode.config import load_hand
     from skinnode.demo.hand import demo_hand
 

@@ -17,7 +17,7 @@ _COMMANDS = "start stop pre-operational reset-node reset-communication"
 
 
 def _nodes_or_all(ctx: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    every_node = [("all", "every node of the bus")] if "all".startswith(incomplete) else []
+    every_node = [("all", "every node on the bus")] if "all".startswith(incomplete) else []
     return nodes(ctx, incomplete) + every_node
 
 
@@ -43,7 +43,7 @@ def nmt(
 
     `all` means every node on the bus, or on every bus of --hand.
 
-    Exit status 0 if every node obeyed, 1 if one did not, 2 if the command could not run.
+    Exit status 0 if every node obeyed, 1 if any did not, 2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses, find_node
     from skinnode.cli._console import console, print_json, progress, table

@@ -58,7 +58,7 @@ def node(
     ] = None,
     strict_timing: Annotated[
         bool,
-        typer.Option("--strict-timing", help="Keep time to within 0.2 ms, not 2 ms; uses more CPU time."),
+        typer.Option("--strict-timing", help="Keep time to within 0.2 ms instead of 2 ms; uses more CPU."),
     ] = False,
     seconds: Seconds = None,
     as_json: JsonLines = False,
@@ -162,7 +162,7 @@ def _node_text(node_id: int, given: int | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Progress of the node; its counts start at 0 when it starts."""
+    """Progress of the node; all counts are 0 when the node starts."""
 
     elapsed_s: float
     node_id: int | None

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def record(
     hand: Annotated[Path, typer.Argument(help="The hand to record.", metavar="HAND.toml")],
     output: Annotated[
-        str,  # an empty string is not a folder
+        str,  # an empty string is not a folder name
         typer.Option(
             "--output",
             "-o",
@@ -36,7 +36,7 @@ def record(
         Literal["log", "blf"],
         typer.Option(
             "--format",
-            help="Format of a file in a folder: candump's text or Vector's BLF.",
+            help="Format of a new file in a folder: candump text or Vector BLF.",
             metavar="log|blf",
         ),
     ] = "log",
@@ -51,10 +51,10 @@ def record(
 ) -> None:
     """Run a hand's patches as `skinnode host` does and record every frame, received and sent.
 
-    Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command
-    is killed, the recording can be read up to the last second. A recording made with --listen has no
-    baselines and thus no fields; it is for use with can-utils. Exit status 1 if frames could not be written,
-    or for any fault that `skinnode host` reports; 2 if the hand could not be run.
+    Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command is
+    killed, at most the last second of the recording is lost. A recording made with --listen has no baselines
+    and thus no fields; it is for use with can-utils. Exit status 1 if frames could not be written, or for any
+    fault that `skinnode host` reports; 2 if the hand could not be run.
     """
     from skinnode.config import load_hand
     from skinnode.process.signals import stop_on_signal
@@ -123,7 +123,7 @@ def _follow(
     as_json: bool,
     check: Callable[[], object] = lambda: None,
 ) -> None:
-    """Print a line every second until stopped or until time is up; ``check`` may raise to end this early."""
+    """Print a line every second until stopped or until time is up; ``check`` may raise to end it early."""
     start_s = time.monotonic()
     end_s = float("inf") if seconds is None else start_s + seconds
     due_s = start_s + 1.0

@@ -35,7 +35,7 @@ def replay(
     and shear force with standard deviations, in m, m² and N.
 
     Exit status 1 if the recording is damaged, was not ended properly, lacks frames or contains error frames,
-    or if a scan was torn or missed, or a chunk or summary lost; 2 if it cannot be read at all.
+    or if a scan was torn or missed, or a chunk or summary lost; 2 if the recording cannot be read at all.
     """
     from skinnode.process.signals import stop_on_signal
     from skinnode.record import replay as play
@@ -44,7 +44,7 @@ def replay(
         run = play(recording, speed=None if fast else speed, cancelled=stop.is_set)
         deepest_m = {patch.name: 0.0 for patch in run.hand.patches}
         for field in run:
-            assert field.stamp is not None  # the host stamps every field
+            assert field.stamp is not None  # the host timestamps every field
             if as_json:
                 print(json.dumps(field_table(field)), flush=not fast)
             depth_m = float(-field.displacement_m[..., 2].min())

@@ -24,9 +24,9 @@ def scan(
 ) -> None:
     """Find every node on a bus: by SDO, by heartbeat, and by LSS if it has no node-ID.
 
-    With --hand the command scans every bus of the hand. It changes nothing in any node and takes two seconds
-    per bus. Exit status 0 if nodes were found and none has a fault; 1 if none was found, two share a node-ID,
-    or a node of --hand is missing or is a different device; 2 if the scan could not run.
+    With --hand the command scans every bus of the hand. The command changes nothing in any node and takes two
+    seconds per bus. Exit status 0 if nodes were found and none has a fault; 1 if none was found, two share a
+    node-ID, or a node of --hand is missing or is a different device; 2 if the scan could not run.
     """
     from skinnode.cli._bus import find_buses
     from skinnode.cli._console import print_json, progress

@@ -37,9 +37,9 @@ def tare(
 
     Do not touch the skin while the command runs.
 
-    Taring works by SDO, with or without a host on the bus: a running host reads the new baselines and
-    continues. A patch loses its baseline at power-off unless it is stored (0x1010). A patch whose baseline
-    comes from a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if one was not,
+    Taring uses SDO, with or without a host on the bus: a running host reads the new baselines and
+    continues. A baseline is lost at power-off unless it is stored (0x1010). A patch whose baseline
+    comes from a file named in hand.toml is refused. Exit status 0 if every patch was tared, 1 if any was not,
     2 if the command could not run.
     """
     from skinnode.cli._bus import find_buses, node_among

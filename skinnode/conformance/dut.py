@@ -140,7 +140,7 @@ class Dut:
             raise Failed(f"{STATES[state]} {what}", STATES.get(got, f"state {got}"))
 
     def guard(self, what: str) -> int | None:
-        """Request the state with a remote frame and return the response byte, or None without a response."""
+        """Request the state with a remote frame and return the response byte; None if none arrives."""
         self.bus.pending(self.error_control_id)
         self.bus.send(self.error_control_id, remote=True)
         frame = self.bus.take(self.error_control_id, 4 * QUIET_S)
@@ -175,7 +175,7 @@ class Dut:
             raise NotApplicable(f"{entry} = 0x{capability:08X}: bit 0, {what}, is not set")
 
     def to_defaults(self) -> None:
-        """Restore the node's defaults if the node supports this command, and reset the node."""
+        """Restore the node's defaults, provided that it supports 0x1011, and reset it."""
         with contextlib.suppress(NotApplicable):
             self.need_storage(RESTORE, 1)
             self.restore(1)

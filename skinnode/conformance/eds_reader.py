@@ -25,7 +25,7 @@ SIZES: Final = {
     0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4, 0x08: 4, 0x0C: 6, 0x0D: 6,
     0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
-"""Size of a value in bytes by data type (CiA 301 v4.2.0, table 44); other types have variable length."""
+"""Size of a value in bytes by data type (CiA 301 v4.2.0, table 44); types not listed have variable length."""
 
 _MOST_ENTRIES: Final = 1 << 16
 SIGNED: Final = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
@@ -98,8 +98,8 @@ class EdsEntry:
             node_id: Replaces $NODEID.
 
         Returns:
-            The bytes; a string is transferred as in the file. None if the file gives no default, or one that
-            the type cannot encode.
+            The bytes; a string is transferred as in the file. None if the file gives no default, or a default
+            that the type cannot encode.
 
         Raises:
             ValueError: A number is malformed.

@@ -26,7 +26,7 @@ def check_period(frames: Sequence[Frame], period_ms: float, what: str, *, or_soo
         frames: At least two frames.
         period_ms: Expected period.
         what: Name of the frames, for the message.
-        or_sooner: Whether events may trigger additional frames between periodic ones.
+        or_sooner: Whether events may trigger additional frames between the periodic frames.
     """
     gaps = gaps_ms(frames)
     mean, median = statistics.mean(gaps) / period_ms, statistics.median(gaps) / period_ms

@@ -47,7 +47,7 @@ class Pdo:
 
 
 class Unsupported(Exception):
-    """Raised if the device lacks a sub-index or a transmission type of a PDO; the standard permits both."""
+    """Raised if the device lacks an optional sub-index or transmission type of a PDO."""
 
 
 def rpdos(dut: Dut) -> list[Pdo]:
@@ -145,7 +145,7 @@ Trial = Callable[[Dut, Pdo], None]
 
 
 def each_tpdo(dut: Dut, trial: Trial) -> None:
-    """Run ``trial`` on each TPDO that maps something, with all others disabled; reset the node after each.
+    """Run ``trial`` on each TPDO that maps an object, with all others disabled; reset the node each time.
 
     Raises:
         NotApplicable: No TPDO supports the trial.

@@ -16,7 +16,7 @@ _VERDICT_WIDTH = 15
 
 
 def result_line(result: Result) -> str:
-    """Return ID, verdict and title on one line, followed by the reason if there is one."""
+    """Return the ID, verdict and title on one line, followed by the reason, if any."""
     head = f"{result.case.id:{_ID_WIDTH}} {result.verdict:{_VERDICT_WIDTH}}{result.case.title}"
     return _one_line(f"{head}: {result.why}" if result.why else head)
 

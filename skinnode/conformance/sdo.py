@@ -282,7 +282,7 @@ class SdoClient:
 
 
 def expedited(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request for an expedited download of one to four bytes, which indicates their number."""
+    """Return the request for an expedited download of one to four bytes, with the size indicated."""
     return bytes((0x23 | (4 - len(data)) << 2,)) + mux(index, subindex) + data.ljust(4, b"\0")
 
 

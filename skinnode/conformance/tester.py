@@ -95,7 +95,7 @@ class Tester:
     def take(
         self, can_id: int, within_s: float = ANSWER_S, match: Callable[[Frame], bool] | None = None
     ) -> Frame | None:
-        """Return the first matching frame with ``can_id``, from the inbox or yet to arrive.
+        """Return the first matching frame with ``can_id`` from the inbox or, failing that, from the bus.
 
         Args:
             can_id: CAN-ID of a data frame.

@@ -1,12 +1,12 @@
-"""Work on an open bus: find nodes, read and write their objects, tare, and find out what is wrong.
+"""Operations on an open bus: finding nodes, reading and writing their objects, taring, and diagnosis.
 
 ``bus_connection`` opens a bus and ``bus_listener`` records the messages received on it. The commands of
 :mod:`skinnode.cli` call plain functions that take a connection: ``discovery`` (which nodes are present),
 ``node_info``, ``object_dictionary`` with ``data_sheet``, ``standard_objects`` and ``dcf``,
 ``pdo_parameters``, ``nmt_commands``, ``lss_commissioning``, ``tare``. A function writes to a node only if its
-name indicates this.
+name says so.
 
-``skinnode doctor`` builds on these: ``collect_facts`` (with ``scan_capture``) gathers the facts of a bus,
-:mod:`skinnode.diagnose.checks` derives findings from the facts (with ``noise``), ``root_causes`` groups
+``skinnode doctor`` builds on these modules: ``collect_facts`` (with ``scan_capture``) gathers the facts of a
+bus, :mod:`skinnode.diagnose.checks` derives findings from the facts (with ``noise``), ``root_causes`` groups
 findings by cause, ``html_report`` writes the page.
 """

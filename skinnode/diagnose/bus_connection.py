@@ -28,7 +28,7 @@ _POLL_S: Final = 0.002
 
 
 class State(NamedTuple):
-    """NMT state of a node and how it is known."""
+    """NMT state of a node, and the source of this information."""
 
     state: int | None
     """NMT state; None if unknown."""

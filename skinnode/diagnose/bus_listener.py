@@ -71,7 +71,7 @@ class BusListener:
         return self._nodes.get(node_id) or NodeTraffic()
 
     def newest_beat(self, node_id: int, since_ns: int = 0) -> Beat | None:
-        """Return the newest heartbeat or guarding response after ``since_ns``; None if there is none."""
+        """Return the newest heartbeat or guarding response received after ``since_ns``; None without one."""
         beats = self.node(node_id).beats
         newest = beats[-1] if beats else None
         return newest if newest is not None and newest.t_ns > since_ns else None

@@ -32,7 +32,7 @@ from skinnode.protocol.codes import CodeScale
 from skinnode.protocol.profile import DEFAULT_PERIOD_MS, PatchProfile
 
 SCANS: Final = 50
-"""Number of scans for a noise estimate, which is then accurate to 10 %."""
+"""Number of scans needed for a noise estimate accurate to 10 %."""
 
 LONGEST_S: Final = 15.0
 """Maximum wait for scans, whatever the period."""
@@ -192,7 +192,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
     active: bool,
     progress: Callable[[str], None],
 ) -> tuple[bool, float]:
-    """Capture scans of the running patches; with ``active``, start the others first.
+    """Capture scans of the running patches; with ``active``, start the other patches first.
 
     Returns:
         Whether this program sent SYNC, and the bus load in the busiest second.
@@ -232,7 +232,7 @@ def _listen(  # noqa: PLR0913 - one call, the state of one examination
 
 
 def _scan_s(patch: PatchFacts, profiles: dict[int, PatchProfile]) -> float:
-    """Return the shortest SYNC period, s, for a node that no host has configured; 0 for any other node.
+    """Return the minimum SYNC period, s, for a node that no host has configured; 0 for any other node.
 
     With its default inhibit time, a node needs at least this period to finish each scan before the next SYNC.
     Bring-up sets an inhibit time that fits the hand's period.

@@ -1,7 +1,7 @@
 """Finds the nodes on a bus, by SDO, by heartbeats and by LSS.
 
 The device type of every node-ID is requested while heartbeats are recorded. LSS finds nodes without a
-node-ID. Nothing is written except LSS mode switches, which concern only nodes without a node-ID.
+node-ID. Nothing is written except LSS mode switches, which affect only nodes without a node-ID.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from skinnode.text.printable import printable
 from skinnode.text.words import counted
 
 PACE_S: Final = 0.001
-"""Interval between requests, which limits their load to a sixth of a 1 Mbit/s bus, so PDOs are not
-delayed."""
+"""Interval between requests; at 1 Mbit/s they take up a sixth of the bus, so PDOs are not delayed."""
 
 ANSWER_S: Final = 0.12
 """Time to wait for responses after the last request of a sweep."""
@@ -54,7 +53,7 @@ class FoundNode:
     """Whether the node answers SDO requests; a stopped node does not."""
     state: str
     state_known_by: str
-    """How the state is known, or why it is unknown."""
+    """Source of the state, or why the state is unknown."""
     name: str | None
     """Device name (0x1008)."""
     device_type: int | None
@@ -101,7 +100,7 @@ class Discovery:
     """The nodes found."""
 
     nodes: tuple[FoundNode, ...]
-    """Nodes with a node-ID, in ascending order."""
+    """Nodes with a node-ID, by ascending node-ID."""
     unconfigured: tuple[LssAddress, ...]
     """Nodes without a node-ID."""
     more_unconfigured: bool
@@ -249,7 +248,7 @@ def _only_heard(connection: BusConnection, node_id: int, asked_ns: int) -> Found
 
 
 def _two_serials(connection: BusConnection, node_id: int) -> str:
-    """Return evidence of two nodes; empty if the second response belonged to an earlier request."""
+    """Return evidence of a shared node-ID; empty if the second response belonged to an earlier request."""
     answers = connection.ask_all(node_id, _ASK_SERIAL, ANSWER_S)
     answers = [data for data in answers if data[1:4] == _ASK_SERIAL[1:4]]
     if len(answers) < 2:

@@ -76,7 +76,7 @@ class ScanFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchFacts:
-    """One patch: its configuration and the observations, which are None if unknown."""
+    """Configuration and observations of one patch; an observation is None if unknown."""
 
     name: str
     node_id: int

@@ -129,7 +129,7 @@ def _map(  # noqa: PLR0913 - one image
 
 
 def _timeline(scans: ScanFacts) -> str:
-    """Plot the delay of each scan after its SYNC, and mark incomplete scans."""
+    """Plot each scan's delay after its SYNC, and mark incomplete scans."""
     figure, (axes,) = _figure(1, 1, height_in=2.6)
     late_ms = np.where(scans.complete, 1e3 * scans.latency_s, np.nan)  # an incomplete scan has no last frame
     if np.isfinite(late_ms).any():

@@ -70,7 +70,7 @@ def commission(
     wanted: Commissioning,
     agreed: Callable[[int | None], bool],
 ) -> Commissioned | None:
-    """Set node-ID, bit rate or both.
+    """Set the node-ID, the bit rate or both.
 
     Args:
         connection: The bus.
@@ -97,7 +97,7 @@ def commission(
         if not agreed(before):
             return None
         fault = _configure(connection, wanted)
-    finally:  # a node without a node-ID boots on release
+    finally:  # a node without a node-ID boots when released
         connection.lss.release()
     faults = [fault] if fault else []
     booted = True

@@ -54,7 +54,7 @@ class Change:
     after: str
     followed: bool
     known_by: str
-    """How the new state is known, or why the command is considered to have failed."""
+    """Source of the new state, or why the command is considered to have failed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ class PatchInfo:
     """Wires, counted from 0."""
     self_test: str
     rejected: dict[str, int]
-    """Number of frames that the node ignored, by reason; reasons with a count of 0 are left out."""
+    """Number of frames that the node ignored, by reason; reasons with a count of 0 are omitted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ def read_info(connection: BusConnection, node_id: int, sheet: Eds | None = None)
     remote = connection.od(node_id)
 
     def its_state() -> str:
-        return f" (NMT state by its heartbeat: {connection.state(node_id, None, guarding=False)})"
+        return f" (NMT state according to its heartbeat: {connection.state(node_id, None, guarding=False)})"
 
     connection.require_answer(node_id, its_state)
     read = _Reader(remote)

@@ -3,10 +3,10 @@
 There are two estimates. Second differences of successive scans (variance 6 σ²) are insensitive to slow
 touches. The part of a crossing's signal that the other wires do not explain is insensitive to quick touches:
 the effects of a touch on the crossings of many wires are combinations of a few functions of time, whereas the
-noise of each crossing is independent. Both are upper bounds on the noise, so the smaller value is used. A
-quick, deep and small touch affects both estimates. On touched skin a wire is therefore judged by comparing
-its smallest singular values, which a touch hardly affects, with those of its neighbours; the patch is judged
-by its own singular values.
+noise of each crossing is independent. Both estimates are upper bounds on the noise, so the smaller of the two
+is used. A quick, deep and small touch affects both estimates. On touched skin a wire is therefore judged by
+comparing its smallest singular values, which a touch hardly affects, with those of its neighbours; the patch
+is judged by its own singular values.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MOST_SCANS: Final = 64
 """Maximum number of scans used (the newest); computing time grows with the square of this number."""
 
 _FLOOR: Final = 8
-"""Number of singular values that form the floor of a patch; they give the noise level to within 20 %."""
+"""Number of singular values that form a patch's noise floor; they give the noise level to within 20 %."""
 
 _MOVED: Final = 6.0
 """Minimum motion of a touched crossing, in units of the stated noise."""
@@ -121,10 +121,10 @@ def _roughness(series: Float) -> Float:
 
 
 def _unexplained(moved: Float) -> Float:
-    """Return the (U, K) standard deviations of the motion that the other wires do not explain.
+    """Return the (U, K) standard deviations of the part of the motion that other wires do not explain.
 
-    The leading half of the temporal components of all other upper wires is projected out, then likewise for
-    all other lower wires; the larger residual is used. ``moved`` has mean 0.
+    For each upper wire, the leading half of the temporal components of all other upper wires is projected
+    out; likewise for each lower wire; at each crossing the larger residual is used. ``moved`` has mean 0.
     """
     count = len(moved)
     flat = moved.reshape(count, -1)
@@ -142,7 +142,7 @@ def _unexplained(moved: Float) -> Float:
 
 
 def _of_wires(moved: Float, noise: Float, known: Mask) -> Float:
-    """Return the smaller of floor and median noise for each wire of the first axis; 0 if unknown."""
+    """Return, for each wire of the first axis, the smaller of noise floor and median noise; 0 if unknown."""
     levels = np.zeros(moved.shape[1])
     for wire, there in enumerate(known):
         if there.any():
@@ -168,10 +168,10 @@ def _of_noise(shape: tuple[int, int], values: int) -> float:
 
 
 def _steps(safe: Float) -> tuple[Counts, Float, Mask]:
-    """Return scan and height of each crossing's largest jump, and whether the crossing is otherwise constant.
+    """Return the scan and height of each crossing's largest jump, and whether it is otherwise constant.
 
-    An otherwise constant crossing has medians before and after that differ by the jump, and little other
-    variation.
+    A crossing is otherwise constant if its medians before and after the jump differ by the jump's height, and
+    there is little other variation.
     """
     jumps = np.diff(safe, axis=0)
     at = np.abs(jumps).argmax(axis=0)

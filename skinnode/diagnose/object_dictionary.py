@@ -54,9 +54,9 @@ class Reading:
     data_type: str
     access: str
     value: Value | None
-    """The value; None if the bytes represent no simple value, or the node refused."""
+    """The value; None if the bytes represent no simple value, or if the node refused the request."""
     data: bytes | None
-    """The bytes transferred; None if the node refused."""
+    """The bytes transferred; None if the node refused the request."""
     refused: str
     """Reason for the refusal; empty if there was none."""
     refused_code: int = 0
@@ -64,7 +64,7 @@ class Reading:
 
     @property
     def content(self) -> bytes | None:
-        """Value as bytes; None if the node refused.
+        """Value as bytes; None if the node refused the request.
 
         Many nodes refuse to return an empty string, because it has no data; the value is then ``b""``.
         """
@@ -160,7 +160,7 @@ def encode(entry: EdsEntry, text: str, node_id: int) -> bytes:
 
 
 def read_entry(remote: RemoteOd, entry: EdsEntry) -> Reading:
-    """Read a value; an abort is returned as a reading too. Raises NodeError if the node does not answer."""
+    """Read a value; an abort is also returned as a reading. Raises NodeError if the node does not answer."""
     named = entry.index, entry.subindex, entry.name, type_name(entry), entry.access
     try:
         data = remote.read_bytes(entry.index, entry.subindex, MAX_UPLOAD_BYTES)
@@ -181,7 +181,7 @@ def abort_text(abort: SdoAbort) -> str:
 
 
 def unnamed(eds: Eds, index: int, subindex: int) -> EdsEntry:
-    """Return the entry of an object that neither the EDS nor CiA 301 describes."""
+    """Return an entry for an object that neither the EDS nor CiA 301 describes."""
     why = "not in the EDS" if eds.entries else "named only in its EDS"
     return EdsEntry(index, subindex, why, 0, "", "", None, None, False, 0)
 
@@ -249,7 +249,7 @@ def compare(
         remote: The node.
         eds: The file; each readable value given there is compared, except the node's state.
         node_id: Replaces $NODEID.
-        progress: Called with a description of the progress from time to time.
+        progress: Called from time to time with a description of the progress.
 
     Returns:
         The values that differ.

@@ -2,7 +2,7 @@
 
 For example, an overloaded bus causes torn scans, skipped scans and emergencies at every patch on it. All
 these findings are true, but none of them is the fault to be repaired. A rule names a cause and its possible
-consequences, at the same patch or at every patch of a bus. If the text of a finding is ambiguous, its
+consequences, at the same patch or at every patch on a bus. If the text of a finding is ambiguous, its
 evidence decides: emergencies follow from an overload only if each of their texts reports an overrun.
 """
 
@@ -39,8 +39,8 @@ class Rule:
     cause: str
     follow: tuple[str, ...]
     evidence: Mapping[str, str]
-    """Evidence pattern for each pattern of ``follow``; every part of the evidence must match it for the
-    finding to count as a consequence."""
+    """Evidence pattern for each pattern in ``follow``; a finding counts as a consequence only if every part
+    of its evidence matches."""
 
 
 _HOLES: Final = ("scans with holes", "whole scans are missing")
@@ -147,7 +147,7 @@ RULES: Final = (
 
 
 def grouped(buses: Sequence[BusFacts]) -> list[Group]:
-    """Return all findings of these buses, grouped by root cause.
+    """Return all findings about these buses, grouped by root cause.
 
     Groups are sorted by the certainty of their most certain finding, then by their number of consequences.
     """
@@ -164,7 +164,7 @@ def merged(findings: Sequence[Finding]) -> list[tuple[Finding, tuple[str, ...]]]
 
 
 def _of_bus(bus: str, findings: list[Finding]) -> list[Group]:
-    """Assign each finding to the first rule that fits; a chain of causes ends at its root."""
+    """Assign each finding to the first rule that matches; a chain of causes ends at its root."""
     cause_of: dict[int, int] = {}
     for rule in RULES:
         for at, cause in enumerate(findings):

@@ -26,7 +26,8 @@ _LONGEST_NS: Final = 10_000_000_000
 class ScanCapture:
     """Assembles the scans of several patches and records every SYNC.
 
-    :meth:`on_frames` runs on the receiving thread of a link; read the results once that thread has stopped.
+    :meth:`on_frames` runs on the receiving thread of a link; read the results only after that thread has
+    stopped.
     """
 
     def __init__(self) -> None:
@@ -36,7 +37,7 @@ class ScanCapture:
         self._takers: dict[int, tuple[_Patch, bool]] = {}
 
     def add(self, node_id: int, profile: PatchProfile, overflow: int, period_s: float) -> None:
-        """Start to assemble the scans of a patch.
+        """Start assembling the scans of a patch.
 
         Args:
             node_id: The node.
@@ -109,7 +110,7 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of the latest SYNC before the scan with the scan's counter or without a counter."""
+        """Return the time of the last SYNC before the scan whose counter is the scan's or absent."""
         for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None

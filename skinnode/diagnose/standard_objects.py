@@ -16,14 +16,14 @@ _GROUPS: Final = {1: "all", 2: "communication", 3: "application"}
 
 
 class _Object(NamedTuple):
-    """One object, or a range of objects of the same structure."""
+    """One object, or a range of objects with the same structure."""
 
     name: str
     data_type: int
     access: str
     array: bool = False
     subs: tuple[tuple[str, int], ...] = ()
-    """Name and data type of each sub-index of a record, from 1."""
+    """Name and data type of each sub-index of a record, starting at sub-index 1."""
 
 
 _SDO: Final = (

@@ -1,9 +1,9 @@
-"""Tares patches by SDO, even while a host runs on the bus.
+"""Tares patches by SDO, even while a host is running on the bus.
 
 The node responds to the write to 0x2021:4 only after the measurement, so the response confirms the tare. The
 summary of the next scan reports that the baseline changed, and a running host then reads the baseline. An SDO
-server handles one transfer at a time, so a request from here would abort the host's upload. The baseline is
-therefore read back only when the node's SDO channel is quiet.
+server handles one transfer at a time, so a request from this program would abort the host's upload. The
+baseline is therefore read back only when the node's SDO channel is quiet.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from skinnode.model.layout import Float
 from skinnode.protocol.profile import PatchProfile
 
 QUIET_S: Final = 0.3
-"""Duration of silence on a node's SDO channel after which no other client has a transfer under way."""
+"""Duration of silence on a node's SDO channel that rules out an ongoing transfer by another client."""
 
 HOST_BEGINS_S: Final = 1.0
 """Maximum time, in addition to a SYNC period, from the tare to the host's first SDO request; an idle host
@@ -64,7 +64,7 @@ class Tared:
 
 
 def refusal(patch: PatchConfig, bus: BusConfig) -> str:
-    """Return why the hand file forbids taring this patch; empty if it allows it."""
+    """Return why the hand file forbids taring this patch; empty if taring is allowed."""
     if patch.baseline is not None:
         return f"its baseline is kept in {patch.baseline}, from which a host would restore it"
     if bus.role == "guest" and bus.guest_sends == "nothing":
@@ -135,7 +135,7 @@ def _tare(
 
 
 def _runs(connection: BusConnection, node_id: int) -> bool:
-    """Return whether a host has started the node, as chunks or operational heartbeats show."""
+    """Return whether a host has started the node, as indicated by chunks or operational heartbeats."""
     beat = connection.listener.newest_beat(node_id)
     operational = beat is not None and beat.state == NmtState.OPERATIONAL
     return operational or connection.listener.cob_ids[od.chunk_cob_id(node_id)] > 0

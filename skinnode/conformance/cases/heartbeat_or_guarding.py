@@ -24,7 +24,7 @@ def _both(dut: Dut, heartbeat_ms: int, guard_ms: int) -> None:
 
 
 def _heartbeats(dut: Dut, *, remote: bool) -> None:
-    """Check that only heartbeats arrive, with the set period, even if remote frames are sent in between."""
+    """Check that only heartbeats arrive, at the set period, even if remote frames are sent in between."""
     frames = []
     for _ in range(8):
         frames.append(dut.bus.expect(dut.error_control_id, "a heartbeat"))

@@ -45,10 +45,10 @@ def _none(expected: str, faults: list[str]) -> None:
 
 
 def _compare_defaults(dut: Dut, entries: Iterable[EdsEntry]) -> None:
-    """Compare default values with those in the EDS.
+    """Compare the device's default values with those in the EDS.
 
     0x1010 and 0x1011 return the device's capabilities rather than defaults, so a difference in these objects
-    only causes a warning.
+    causes only a warning.
     """
     faults: list[str] = []
     doubts: list[str] = []
@@ -100,7 +100,7 @@ def write_only(dut: Dut) -> None:
         dut.sdo.aborts(request, entry.index, entry.subindex, WRITE_ONLY, f"read of {entry}")
 
 
-@case("OD-05", "Sub-index 0xFF, if it exists, has the object and data type of the EDS", "7.4.3")
+@case("OD-05", "Sub-index 0xFF, if it exists, holds the object code and data type given in the EDS", "7.4.3")
 def structure(dut: Dut) -> None:
     known = {0x5: 0x05, 0x6: 0x06, 0x7: 0x07}
     found = False
@@ -135,7 +135,7 @@ def limits(dut: Dut) -> None:
                 request = expedited(entry.index, entry.subindex, value)
                 dut.sdo.aborts(request, entry.index, entry.subindex, codes, f"{entry} beyond {limit}")
     if not found:
-        raise NotApplicable("no writable object of the EDS has a limit within its type")
+        raise NotApplicable("no writable object of the EDS has a limit within the range of its type")
 
 
 @case(

@@ -47,7 +47,7 @@ def _compare(dut: Dut, wanted: Mapping[int, bytes], when: str) -> None:
 
 
 def _wrong_signature(dut: Dut, index: int, subindex: int) -> None:
-    """Check that a wrong signature is refused and changes nothing, either immediately or after a reset."""
+    """Check that a wrong signature is refused and changes nothing, even after a reset."""
     dut.need_storage(index, subindex)
     before, after = _change(dut)
     # If the device accepts the signature, its stored parameters must be put back.

@@ -30,13 +30,13 @@ from skinnode.conformance.tester import ANSWER_S, QUIET_S, Failed
 
 _EVENT_MS = 50
 _FIRST_S = 0.4
-"""Maximum wait after a SYNC for the first TPDO of a cycle; a later SYNC may be the one that triggers it."""
+"""Maximum wait for the first TPDO of a cycle after a SYNC; a later SYNC may trigger that TPDO."""
 _SYNC_COUNTER = 0x1019
 _RESERVED_KINDS = range(241, 252)
 
 
 def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
-    """Check the transmission types, and that valid COB-IDs are unique and the first four as pre-defined."""
+    """Check transmission types and COB-IDs: as in the EDS, unique if valid, the first four pre-defined."""
     valid: dict[int, Pdo] = {}
     for pdo in pdos:
         cob_id = dut.sdo.integer(pdo.parameter, 1)
@@ -101,7 +101,7 @@ def _for_remote(dut: Dut, pdo: Pdo) -> tuple[int, int]:
 
 @case(
     "PDO-04",
-    "OPERATIONAL: types 254 and 255 are sent when the event timer elapses, but not before the inhibit time",
+    "OPERATIONAL: TPDOs of types 254 and 255 are sent on the event timer, but not before the inhibit time",
     "7.2.2.2, 7.5.2.37",
 )
 def event_driven(dut: Dut) -> None:
@@ -148,7 +148,7 @@ def event_timer(dut: Dut) -> None:
     each_tpdo(dut, trial)
 
 
-@case("PDO-06", "OPERATIONAL: type 1 is sent after every SYNC, type 3 only after every third",
+@case("PDO-06", "OPERATIONAL: a TPDO of type 1 is sent after every SYNC, of type 3 only after every third",
       "7.2.2.2, 7.5.2.37")  # fmt: skip
 def cyclic(dut: Dut) -> None:
     def trial(dut: Dut, pdo: Pdo) -> None:
@@ -190,7 +190,7 @@ def _after_sync(  # noqa: PLR0913 - one PDO, one SYNC
 
 @case(
     "PDO-07",
-    "OPERATIONAL: type 0 is sent only after a SYNC, at the latest after the third",
+    "OPERATIONAL: a TPDO of type 0 is sent only after a SYNC, at the latest after the third",
     "7.2.2.2, 7.5.2.37",
 )
 def acyclic(dut: Dut) -> None:

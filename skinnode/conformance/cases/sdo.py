@@ -31,7 +31,7 @@ _STRINGS = (0x1008, 0x1009, 0x100A)
 
 
 def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: str) -> EdsEntry:
-    """Return the first entry that fits. Raises NotApplicable, naming ``lack``, if none fits."""
+    """Return the first entry that meets ``fits``. Raises NotApplicable, naming ``lack``, if none does."""
     for entry in entries:
         if fits(entry) and entry.index not in _SPECIAL:
             return entry
@@ -39,7 +39,7 @@ def first(entries: Iterable[EdsEntry], fits: Callable[[EdsEntry], bool], lack: s
 
 
 def long_object(dut: Dut) -> tuple[EdsEntry, bytes]:
-    """Return a readable object of more than four bytes and its value, preferably a name or version."""
+    """Return a readable object of more than four bytes, preferably a name or version, and its value."""
     texts = [dut.eds.find(index) for index in _STRINGS]
     others = (entry for entry in dut.eds.entries.values() if entry.size not in (1, 2, 3, 4))
     for entry in (*texts, *others):
@@ -102,7 +102,7 @@ def no_subindex(dut: Dut) -> None:
     dut.sdo.aborts(b"\x40" + mux(_DEVICE_TYPE, 1), _DEVICE_TYPE, 1, NO_SUBINDEX, "read of 0x1000:01")
 
 
-@case("SDO-06", "Reading and writing an object that does not exist are refused", "7.2.4.3.17")
+@case("SDO-06", "Reads and writes of an object that does not exist are refused", "7.2.4.3.17")
 def no_object(dut: Dut) -> None:
     index = next(i for i in (0x1004, 0x1013, 0x1FFF) if not dut.eds.has(i))
     dut.sdo.aborts(b"\x40" + mux(index, 0), index, 0, NO_OBJECT, f"read of 0x{index:04X}:00")

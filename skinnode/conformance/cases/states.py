@@ -98,7 +98,7 @@ def _timed(dut: Dut) -> dict[int, int]:
 
 
 def _no_pdos(dut: Dut, state: str) -> None:
-    """Check that no TPDO is sent when the event timer elapses or after SYNC."""
+    """Check that no TPDO is sent when the event timer elapses or a SYNC arrives."""
     can_ids = _timed(dut) if state == "PRE-OPERATIONAL" else {}
     sync(dut)
     for can_id in can_ids:

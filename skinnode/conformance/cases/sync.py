@@ -78,7 +78,7 @@ def count(dut: Dut) -> None:
 
 
 def _synchronous(dut: Dut) -> Pdo:
-    """Return a TPDO that is synchronous by default or, failing that, the first TPDO that maps something."""
+    """Return a TPDO that is synchronous by default or, failing that, the first TPDO that maps an object."""
     usable = [pdo for pdo in tpdos(dut) if mapped(dut, pdo)]
     if not usable:
         raise NotApplicable("no TPDO maps anything by default")
@@ -135,7 +135,7 @@ def counter(dut: Dut) -> None:
 
 @case(
     "SYNC-08",
-    "Producer and counter stored through 0x1010:01 start at 1 after a node reset",
+    "A producer stored through 0x1010:01 starts after a node reset, counting from 1",
     "7.5.2.13, 7.5.2.22",
 )
 def counter_stored(dut: Dut) -> None:

@@ -15,8 +15,8 @@ from skinnode.text.words import counted
 
 _SYNCS: Final = 10
 _ASTRAY: Final = 0.25
-"""Maximum fraction of SYNC counters that do not follow their predecessor. With two producers, half of the
-counters do not follow; with lost SYNCs, only a few do not."""
+"""Maximum fraction of SYNC counters that do not follow their predecessor. With two producers the fraction is
+a half; with lost SYNCs it is much smaller."""
 
 _BEATS: Final = 4
 _TOO_OFTEN: Final = 0.7
@@ -24,7 +24,7 @@ _TOO_OFTEN: Final = 0.7
 
 
 def check_bus(bus: BusFacts) -> Iterator[Finding]:
-    """Check interface, controller, load, unknown frames and nodes without a node-ID."""
+    """Check the interface, its controller, the load, unknown frames, and nodes without a node-ID."""
 
     def found(what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("bus", bus.name, what, sure, evidence, advice)

@@ -11,7 +11,7 @@ from skinnode.protocol.profile import PatchProfile
 
 
 def check_configuration(bus: BusFacts) -> Iterator[Finding]:
-    """Check sizes, layout, EDS, PDOs, inhibit time and heartbeat."""
+    """Check the sizes, layout, EDS, PDOs, inhibit time and heartbeat of each patch."""
     for patch in bus.patches:
         if patch.info is None or patch.info.patch is None:
             continue

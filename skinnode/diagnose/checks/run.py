@@ -16,7 +16,7 @@ _SURENESS: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 
 def run_checks(facts: BusFacts) -> list[Finding]:
-    """Return all findings of a bus, with the most certain findings of each area first."""
+    """Return all findings about a bus; within each area, the most certain findings come first."""
     checks: tuple[Callable[[BusFacts], Iterator[Finding]], ...] = (
         bus.check_bus,
         bus.check_masters,
@@ -36,7 +36,7 @@ def run_checks(facts: BusFacts) -> list[Finding]:
 
 
 def others(facts: BusFacts) -> list[str]:
-    """Describe each device that is neither a patch nor in the hand file, in one line.
+    """Describe, in one line each, the devices that are neither patches nor in the hand file.
 
     The lines identify the devices; they do not report faults.
     """

@@ -1,6 +1,6 @@
 """Checks of the skin, made on captured scans: wires, noise, frozen values, jumps, baseline.
 
-Touched skin is not a defect: a finding that a touch can explain is not reported.
+A touch is not a defect: a finding that a touch can explain is not reported.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skinnode.protocol.device_time import TIME_WRAP_US
 from skinnode.text.words import counted
 
 NOISY: Final = 5.0
-"""Minimum ratio of a noisy crossing's noise to the stated noise; 20 scans do not reach it by chance."""
+"""Minimum ratio of a noisy crossing's noise to the stated noise; 20 scans do not exceed it by chance."""
 
 _DRIFT: Final = 0.003
 """Minimum |R/R0 − 1| at rest that justifies a tare: 100 times the noise of a good converter, or
@@ -198,7 +198,7 @@ def _check_frozen(patch: PatchFacts, scans: ScanFacts) -> Iterator[Finding]:
 
 
 def may_be_frozen(scans: ScanFacts) -> bool:
-    """Return whether all codes are constant, which proves no defect because the stated noise is too small."""
+    """Return whether all codes are constant but the stated noise is too small for this to prove a defect."""
     known, still = _still(scans)
     return scans.scans >= LEAST_SCANS and not _shows(scans) and bool(known.any() and (still == known).all())
 
@@ -257,7 +257,7 @@ def check_baseline(bus: BusFacts) -> Iterator[Finding]:
 
 
 def is_touched(scans: ScanFacts) -> bool:
-    """Return whether something touched the skin, which prevents some of the checks."""
+    """Return whether something touched the skin; a touch rules out some of the checks."""
     return scans.scans >= LEAST_SCANS and analyse_noise(scans).is_touched
 
 

@@ -53,7 +53,7 @@ def check_timing(bus: BusFacts) -> Iterator[Finding]:
 
 
 def _check_sync(bus: BusFacts) -> Iterator[Finding]:
-    """Check period, losses and jitter of SYNC."""
+    """Check the period, losses and jitter of SYNC."""
 
     def found(where: str, what: str, sure: Sure, evidence: str, advice: str) -> Finding:
         return Finding("timing", where, what, sure, evidence, advice)

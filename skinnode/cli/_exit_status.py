@@ -12,7 +12,7 @@ status  meaning
 ======  ==============================================================================================
 
 Nothing is printed when a signal arrives, because its sender knows about it; open resources are closed before
-the process exits. SIGHUP stays ignored if it was ignored at the start, as it is under nohup. This module
+the process exits. SIGHUP remains ignored if it was ignored at the start, as under nohup. This module
 imports nothing slow, so its handlers are installed before anything else is loaded.
 """
 

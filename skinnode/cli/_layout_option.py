@@ -1,4 +1,4 @@
-"""Option ``--layout``: the geometry of a patch, given by preset, file or Python name."""
+"""Option ``--layout``: the geometry of a patch, given as a preset, a file or a Python name."""
 
 from __future__ import annotations
 

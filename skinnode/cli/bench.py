@@ -71,7 +71,7 @@ def solve(json: JsonFile = None, plot: PlotFile = None, rounds: Rounds = 31) -> 
 def stability(
     json: JsonFile = None,
     plot: PlotFile = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of streams for each hard case.")] = 50,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for each hard case.")] = 50,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes that solve cases in parallel.")] = 1,
 ) -> None:
     """Solve every hard case with many seeds; report error, standard deviation, status and verdict.

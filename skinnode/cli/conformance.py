@@ -1,4 +1,4 @@
-"""``skinnode conformance``: test a CANopen node against CiA 301, case by case."""
+"""``skinnode conformance``: tests a CANopen node for conformance to CiA 301, case by case."""
 
 from __future__ import annotations
 

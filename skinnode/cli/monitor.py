@@ -177,7 +177,7 @@ def _recording(stack: ExitStack, path: Path, speed: float) -> Source:
 
 
 def _show(source: Source, stop: threading.Event, seconds: float | None, output: Path) -> list[str]:
-    """Run the screen and return the faults. Raises the SkinError that ended the source."""
+    """Run the screen and return the faults. Raises the SkinError that stopped the source."""
     from skinnode.monitor.app import MonitorApp, terminal_colours
 
     app = MonitorApp(
@@ -194,7 +194,7 @@ def _show(source: Source, stop: threading.Event, seconds: float | None, output: 
 
 
 def _print(source: Source, stop: threading.Event, seconds: float | None) -> list[str]:
-    """Print one line of JSON per second and return the faults. Raises the SkinError that ended the source."""
+    """Print one JSON line per second and return the faults. Raises the SkinError that stopped the source."""
     from skinnode.monitor.report import FaultBook, watch
     from skinnode.text.json_values import plain
 

@@ -176,7 +176,7 @@ def _sheet_if_any(remote: RemoteOd, eds: Path | None) -> DataSheet:
 
 
 def _read(remote: RemoteOd, entries: list[EdsEntry]) -> list[Reading]:
-    """Read the objects. Refusal of a single object raises SdoAbort; otherwise refusals are listed."""
+    """Read the objects. A refusal raises SdoAbort if there is only one object, and is listed otherwise."""
     from skinnode.diagnose.object_dictionary import read_entry
 
     if len(entries) == 1 and entries[0].access != "wo":

@@ -49,7 +49,7 @@ def record(
     seconds: Seconds = None,
     as_json: JsonLines = False,
 ) -> None:
-    """Run a hand's patches as `skinnode host` does and record every frame, received and sent.
+    """Run a hand's patches as `skinnode host` does, and record every frame received or sent.
 
     Play the recording with `skinnode replay`; can-utils and python-can can read it too. If the command is
     killed, at most the last second of the recording is lost. A recording made with --listen has no baselines

@@ -311,7 +311,7 @@ def _add(
 
 
 def _listed(sections: Mapping[str, Mapping[str, str]], described: set[int]) -> Iterator[str]:
-    """Yield a line per object that is only listed or only described, and per list with a wrong count."""
+    """Yield a line per object that is only listed or only described, and a line per wrong count of a list."""
     listed: set[int] = set()
     for name in ("mandatoryobjects", "optionalobjects", "manufacturerobjects"):
         options = sections.get(name, {})

@@ -79,7 +79,7 @@ def mapped(dut: Dut, pdo: Pdo) -> list[int]:
 
 
 def payload_bytes(entries: list[int]) -> int:
-    """Return the length in bytes of a PDO with these mapping entries."""
+    """Return the length, in bytes, of a PDO with these mapping entries."""
     return sum(entry & 0xFF for entry in entries) // 8
 
 
@@ -100,7 +100,7 @@ class PdoSetup:
 def set_up(dut: Dut, pdo: Pdo, parameters: PdoSetup) -> int:
     """Disable the PDO, write its parameters and enable it.
 
-    Discards the frames that the PDO has already sent, for example because the node starts by itself.
+    Discards frames of this PDO that have already arrived, for example because the node starts by itself.
 
     Args:
         dut: The device.

@@ -15,7 +15,7 @@ CONSUMER: Final = 0x1016
 
 
 def emcy_code(frame: Frame) -> int:
-    """Return the error code of an emergency message. Raises Failed unless it has 8 bytes."""
+    """Return the error code of an emergency message. Raises Failed unless the message has 8 bytes."""
     if len(frame.data) != 8:
         raise Failed("an emergency message of 8 bytes", describe(frame))
     return int.from_bytes(frame.data[:2], "little")

@@ -127,7 +127,7 @@ def _is_configuration(reading: Reading) -> bool:
 def _standard_form(reading: Reading, data: bytes) -> str | None:
     """Return the value in CiA 306 notation; None if no such notation preserves its bytes.
 
-    Numbers are hexadecimal and reals are bit patterns, as conforming tools expect.
+    Integers are hexadecimal and reals are bit patterns, as conforming tools expect.
     """
     if reading.data_type in _STRINGS:
         return _plain(data, _STRINGS[reading.data_type])

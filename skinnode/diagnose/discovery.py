@@ -159,7 +159,7 @@ def _sdo_frames(connection: BusConnection) -> int:
 
 
 def find_unconfigured(connection: BusConnection) -> tuple[tuple[LssAddress, ...], bool]:
-    """Return the nodes without a node-ID, and whether more exist that were not found in time.
+    """Return the nodes without a node-ID, and whether there are more that were not found in time.
 
     The nodes return to LSS waiting mode.
     """

@@ -106,7 +106,7 @@ class BusFacts:
     channel: str
     bitrate_bps: int
     failure: str = ""
-    """Why the bus could not be opened, or failed; empty if it works."""
+    """Why the bus could not be opened or why it failed; empty if it works."""
     link_state: str | None = None
     """State of the CAN controller according to the kernel (ERROR-ACTIVE …)."""
     link_bitrate_bps: int | None = None

@@ -83,7 +83,7 @@ def commission(
         The result; None if ``agreed`` returned False.
 
     Raises:
-        ConfigError: Another node has the node-ID, or no node has the address.
+        ConfigError: Another node has the new node-ID, or no node has the LSS address.
         LssFailed: The node refuses.
     """
     node_id = wanted.node_id

@@ -36,7 +36,7 @@ _EXPLAINED: Final = 2.0
 """Minimum ratio of the motion of a touched crossing to its unexplained residual. Noise with 25 degrees of
 freedom exceeds this ratio once in a million crossings."""
 _TOUCHED: Final = 2
-"""Minimum number of crossings that move together on touched skin; a loose contact moves only one."""
+"""Minimum number of crossings that move together on touched skin; a loose contact affects only one."""
 _STEP: Final = 20.0
 """Minimum height of a jump, in units of the stated noise."""
 _STAYS: Final = 0.3

@@ -232,7 +232,7 @@ def _standard(remote: RemoteOd, index: int) -> Iterator[Reading]:
 
 
 def dump(remote: RemoteOd, eds: Eds, progress: Callable[[str], None] = lambda _: None) -> Iterator[Reading]:
-    """Read every readable value of the EDS."""
+    """Read every value that the EDS lists as readable."""
     readable = [entry for entry in eds.entries.values() if entry.readable]
     for done, entry in enumerate(readable):
         if done % 20 == 0:

@@ -110,7 +110,7 @@ class ScanCapture:
         )
 
     def _sync_ns(self, scan: Scan) -> int | None:
-        """Return the time of the last SYNC before the scan whose counter is the scan's or absent."""
+        """Return the time of the last SYNC before ``scan`` with the same counter, or with no counter."""
         for t_ns, number in reversed(list(self.syncs)):  # another thread may append
             if scan.t_first_ns - t_ns > _LONGEST_NS:
                 return None

@@ -74,7 +74,7 @@ def read_communication(dut: Dut) -> None:
     _read_all(dut, dut.eds.between(*_COMMUNICATION))
 
 
-@case("OD-02", "Objects from 0x1000 to 0x1FFF have the defaults of the EDS", "7.5.1; CiA 306-1")
+@case("OD-02", "Objects from 0x1000 to 0x1FFF have the defaults in the EDS", "7.5.1; CiA 306-1")
 def communication_defaults(dut: Dut) -> None:
     dut.to_defaults()
     _compare_defaults(dut, dut.eds.between(*_COMMUNICATION))
@@ -121,7 +121,7 @@ def structure(dut: Dut) -> None:
         raise NotApplicable("no object answers at sub-index 0xFF, which is optional")
 
 
-@case("OD-06", "Values beyond the limits of the EDS are refused", "7.2.4.3.17")
+@case("OD-06", "Values beyond the limits in the EDS are refused", "7.2.4.3.17")
 def limits(dut: Dut) -> None:
     found = False
     for entry in dut.eds.entries.values():
@@ -149,7 +149,7 @@ def read_rest(dut: Dut) -> None:
 
 
 @case(
-    "OD-08", "Objects from 0x2000 to 0x9FFF have the defaults of the EDS (ObjFlags bit 1 clear)", "CiA 306-1"
+    "OD-08", "Objects from 0x2000 to 0x9FFF have the defaults in the EDS (ObjFlags bit 1 clear)", "CiA 306-1"
 )
 def rest_defaults(dut: Dut) -> None:
     entries = [e for e in dut.eds.between(*_REST) if e.default and not e.flags & _REFUSE_READ]

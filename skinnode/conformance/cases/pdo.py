@@ -56,7 +56,11 @@ def _scan(dut: Dut, pdos: list[Pdo], base: int) -> None:
             raise Failed(f"{pdo} with a transmission type that is not reserved", str(kind))
 
 
-@case("PDO-01", "RPDOs have the COB-IDs of the EDS and of the pre-defined connection set", "7.5.2.35; 7.3.3")
+@case(
+    "PDO-01",
+    "RPDOs have the COB-IDs given in the EDS and by the pre-defined connection set",
+    "7.5.2.35; 7.3.3",
+)
 def scan_rpdos(dut: Dut) -> None:
     pdos = rpdos(dut)
     if not pdos:
@@ -64,7 +68,11 @@ def scan_rpdos(dut: Dut) -> None:
     _scan(dut, pdos, 0x200)
 
 
-@case("PDO-02", "TPDOs have the COB-IDs of the EDS and of the pre-defined connection set", "7.5.2.37; 7.3.3")
+@case(
+    "PDO-02",
+    "TPDOs have the COB-IDs given in the EDS and by the pre-defined connection set",
+    "7.5.2.37; 7.3.3",
+)
 def scan_tpdos(dut: Dut) -> None:
     pdos = tpdos(dut)
     if not pdos:

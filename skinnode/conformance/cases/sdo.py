@@ -172,7 +172,7 @@ def limited(entry: EdsEntry, limit: int | None, beyond: int) -> bytes | None:
         return None
 
 
-@case("SDO-10", "A value above the high limit of the EDS is refused; the old value is kept", "7.2.4.3.17")
+@case("SDO-10", "A value above the high limit in the EDS is refused; the old value is kept", "7.2.4.3.17")
 def too_high(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),
@@ -186,7 +186,7 @@ def too_high(dut: Dut) -> None:
     _unchanged(dut, entry, before)
 
 
-@case("SDO-11", "A value below the low limit of the EDS is refused; the old value is kept", "7.2.4.3.17")
+@case("SDO-11", "A value below the low limit in the EDS is refused; the old value is kept", "7.2.4.3.17")
 def too_low(dut: Dut) -> None:
     entry = first(
         dut.eds.entries.values(),

@@ -85,7 +85,7 @@ def pre_operational(dut: Dut) -> None:
 
 
 def _timed(dut: Dut) -> dict[int, int]:
-    """Set TPDOs up to be sent every 20 ms in OPERATIONAL; return their lengths, keyed by CAN-ID."""
+    """Set up TPDOs for transmission every 20 ms in OPERATIONAL; return their lengths, keyed by CAN-ID."""
     found = {}
     for pdo in tpdos(dut):
         if not mapped(dut, pdo):

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A bus, and the hand to which it belongs."""
+    """A bus and the hand to which it belongs."""
 
     bus: BusConfig
     hand: HandConfig | None

@@ -36,7 +36,7 @@ _EXPLAINED_BY_SLOWNESS: Final = (
 
 
 def operational_text(running: Host) -> str:
-    """Return the number of operational patches, and the condition of each patch that is not operational."""
+    """Return the number of operational patches and, for every other patch, its condition."""
     from skinnode.canopen.nmt import NmtState
 
     patches, name = running.hand.patches, running.hand.name

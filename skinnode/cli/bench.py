@@ -15,10 +15,10 @@ from skinnode.errors import ConfigError
 app = typer.Typer(help="Measure solver, node and host on this machine.", no_args_is_help=True)
 
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures to FILE.")
+    Path | None, typer.Option("--json", metavar="FILE", help="Also write the results to FILE.")
 ]
 PlotFile = Annotated[
-    Path | None, typer.Option("--plot", metavar="FILE", help="Plot the figures to FILE (needs matplotlib).")
+    Path | None, typer.Option("--plot", metavar="FILE", help="Plot the results to FILE (needs matplotlib).")
 ]
 Rounds = Annotated[int, typer.Option(min=1, help="Number of measurements per candidate.")]
 
@@ -111,7 +111,7 @@ def accuracy(
 ) -> None:
     """Measure error versus time, noise and code width; the coverage of intervals; and the time per frame.
 
-    Exit status 1 if a requirement is not met; times, which depend on the machine, do not count.
+    Exit status 1 if a requirement is not met; times are excluded, because they depend on the machine.
     """
     from skinnode.bench import accuracy as bench
 

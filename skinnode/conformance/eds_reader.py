@@ -168,7 +168,7 @@ def number(text: str, node_id: int = 0) -> int:
 
 
 def _hex(text: str) -> bytes | None:
-    """Return the bytes of hexadecimal text (CiA 306 form of an OCTET_STRING); None for other text."""
+    """Return the bytes of hexadecimal text (CiA 306 form of an OCTET_STRING); None for any other text."""
     try:
         return bytes.fromhex(text)
     except ValueError:

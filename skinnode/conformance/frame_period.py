@@ -1,7 +1,7 @@
 """Checks frame intervals against a period.
 
 A busy machine delays individual frames, so both mean and median are checked. A delayed frame lengthens one
-interval and shortens the next, which hardly changes the mean, and a few late frames do not change the median.
+interval and shortens the next, which hardly changes the mean; a few late frames do not change the median.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class BusConnection:
         return self._remotes[node_id]
 
     def abandon(self) -> None:
-        """Abort the transfers of all threads, which then raise Abandoned."""
+        """Abort the transfers of all threads; each transfer then raises Abandoned."""
         self._abandoned.set()
 
     def wait_until(self, condition: Callable[[], object], within_s: float) -> bool:

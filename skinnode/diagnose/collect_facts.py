@@ -35,7 +35,7 @@ SCANS: Final = 50
 """Number of scans needed for a noise estimate accurate to 10 %."""
 
 LONGEST_S: Final = 15.0
-"""Maximum wait for scans, whatever the period."""
+"""Maximum wait for scans, regardless of the SYNC period."""
 
 DEFAULT_NOISE: Final = 3e-6
 """Relative noise assumed for the converter if there is no hand file."""
@@ -287,9 +287,9 @@ def _commands_of_others(heard: BusListener, node_ids: Collection[int]) -> int:
 def _foreign(heard: BusListener, node_ids: Collection[int], bus: BusConfig) -> dict[int, int]:
     """Count, by COB-ID, the frames that no service, node or entry of ``others`` in the hand file explains.
 
-    COB-IDs in the pre-defined connection set of a node that was found are attributed to that node,
-    whatever the device. Frames with the COB-IDs of a patch that does not answer are attributed to a host that
-    polls the patch.
+    COB-IDs in the pre-defined connection set of a detected node are attributed to that node, whatever the
+    device. Frames with the COB-IDs of a patch that does not answer are attributed to a host that polls the
+    patch.
     """
     explained = _KNOWN_TO_ALL.union(*map(od.predefined_cob_ids, node_ids))
     explained |= {other.can_id for other in bus.others}

@@ -26,7 +26,7 @@ class Sure(StrEnum):
     CERTAIN = "certain"
     """A node or a counter reports the fault."""
     LIKELY = "likely"
-    """The figures can hardly have any other cause."""
+    """The evidence leaves hardly any other cause."""
     POSSIBLE = "possible"
     """The condition may be intended; a person must decide."""
 
@@ -53,7 +53,7 @@ class ScanFacts:
     n_open: Counts
     n_short: Counts
     n_over: Counts
-    """(U, K) number of scans in which a crossing was open, shorted or out of range, respectively."""
+    """(U, K) numbers of scans in which each crossing was open, shorted or out of range, respectively."""
     t_s: Float
     """(T,) time from the end of the first scan to the end of each scan, s."""
     latency_s: Float
@@ -86,7 +86,7 @@ class PatchFacts:
     inhibit_100us: int | None = None
     """Inhibit time that the host sets; None if the host does not configure the nodes of this bus."""
     eds_problem: str = ""
-    """Why the EDS in the hand file does not match the patch; empty if it matches or none is given."""
+    """Why the EDS in the hand file does not match the patch; empty if it matches or no EDS is given."""
     found: FoundNode | None = None
     info: NodeInfo | None = None
     failure: str = ""

@@ -1,4 +1,4 @@
-"""Writes the doctor's report as one self-contained HTML file: findings, figures, and plots as inline SVG."""
+"""Writes the doctor's report as one self-contained HTML file: findings, values, and plots as inline SVG."""
 
 from __future__ import annotations
 

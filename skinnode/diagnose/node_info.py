@@ -273,7 +273,7 @@ def _spread(values: Float) -> tuple[float, float, float]:
 
 
 def read_baseline(remote: RemoteOd, profile: PatchProfile) -> Float:
-    """Return the (U, K) baseline R0, ohm; 0 if there is none. Raises NodeError."""
+    """Return the (U, K) baseline R0, ohm; 0 for a crossing without a baseline. Raises NodeError."""
     data = remote.read_large(od.BASELINE_DOMAIN)
     if len(data) != 4 * profile.n_codes:
         raise NodeError(

@@ -61,13 +61,13 @@ class NoiseAnalysis:
     level: Float
     """Median R/R0."""
     touched: Mask
-    """Whether the crossing moved together with others."""
+    """Whether the crossing moved together with other crossings."""
     steps: Mask
     """Whether the crossing was constant except for one jump of its own."""
     step_at: Counts
     step_by: Float
     upper: Float
-    """(U,) noise of each upper wire divided by the stated noise; the effect of touch is removed as far as
+    """(U,) noise of each upper wire divided by the stated noise; the effect of a touch is removed as far as
     possible."""
     lower: Float
     """(K,) noise of each lower wire, as for ``upper``."""

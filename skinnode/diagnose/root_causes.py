@@ -21,7 +21,7 @@ _RANK: Final = {sure: rank for rank, sure in enumerate(Sure)}
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A finding that no other finding causes, with its consequences."""
+    """A finding not caused by any other finding, with its consequences."""
 
     cause: Finding
     consequences: tuple[Finding, ...] = ()

@@ -140,7 +140,7 @@ def entry_without_procedure(dut: Dut) -> None:
         dut.sdo.aborts(request, pdo.mapping, 1, OUT_OF_ORDER, what)
         _still(dut, pdo, words)
     if not tried:
-        raise NotApplicable("no PDO maps anything by default")
+        raise NotApplicable("no PDO maps an object by default")
 
 
 @case("PDO-24", "The mapping of a valid PDO cannot be written", "7.5.2.36, 7.5.2.38")

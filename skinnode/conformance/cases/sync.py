@@ -81,7 +81,7 @@ def _synchronous(dut: Dut) -> Pdo:
     """Return a TPDO that is synchronous by default or, failing that, the first TPDO that maps an object."""
     usable = [pdo for pdo in tpdos(dut) if mapped(dut, pdo)]
     if not usable:
-        raise NotApplicable("no TPDO maps anything by default")
+        raise NotApplicable("no TPDO maps an object by default")
     return next((pdo for pdo in usable if dut.sdo.integer(pdo.parameter, 2) <= 240), usable[0])
 
 

@@ -141,8 +141,7 @@ def discover(connection: BusConnection, progress: Callable[[str], None] = lambda
 
 
 def _let_others_finish(connection: BusConnection) -> None:
-    """Wait until other clients' SDO transfers have ended, because a request from this program would abort
-    them.
+    """Wait until other clients' SDO transfers have ended, because a new request would abort them.
 
     A host makes SDO transfers during bring-up, but normally not afterwards.
     """

@@ -1,8 +1,8 @@
 """Tables that pass many arrays and numbers to a kernel in one argument, with access by name.
 
-Numba checks and unpacks every argument of every call. For the fifty arrays of a patch this takes 4 µs with
-warm caches and, with cold caches, 40 µs: as long as solving four wires. An :class:`ArrayTable` is one array
-of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
+Numba checks and unpacks every argument of every call. For the fifty arrays of a patch, this takes 4 µs with
+warm caches; with cold caches it takes 40 µs, as long as solving four wires. An :class:`ArrayTable` is one
+array of addresses and shapes. A subclass declares the fields once, for Python and for kernels:
 
     class Scan(ArrayTable):
         ohm: Annotated[NDArray[np.float64], "U K"]     # element type and axes
@@ -41,7 +41,7 @@ from numba.extending import register_model as typed_register_model
 from numba.np import arrayobj as typed_arrayobj
 from numpy.typing import NDArray
 
-cgutils: Any = typed_cgutils  # numba's own type hints do not fit here
+cgutils: Any = typed_cgutils  # numba's own type hints do not match this use
 errors: Any = typed_errors
 imputils: Any = typed_imputils
 types: Any = typed_types
@@ -98,7 +98,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Group:
-    """Fields of a NamedTuple; kernels read them as one such tuple."""
+    """Fields of a NamedTuple, which kernels read as one tuple."""
 
     name: str
     made_of: type
@@ -180,7 +180,7 @@ class ArrayTable:
         vars(self).update(values, table=table)  # keeps the arrays alive
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name in self._names and value is not getattr(self, name):  # x += 1 assigns x itself
+        if name in self._names and value is not getattr(self, name):  # x += 1 assigns the same object
             raise AttributeError(
                 f"{type(self).__name__}.{name}: kernels use its address; write to it in place"
             )
@@ -216,7 +216,7 @@ class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def reader(made_of: type[_T]) -> Callable[[NDArray[np.int64]], _T]:
-    """Return a kernel function that converts the table of a ``made_of`` to an object with its fields.
+    """Return a kernel function that turns a ``made_of`` table into an object with the declared fields.
 
     Only compiled code can call the function. Each use of a field name reads the table again, so read fields
     before loops. In kernels, bool arrays are uint8. The kernel raises TypeError if the table has a

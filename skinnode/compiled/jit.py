@@ -1,8 +1,8 @@
 """Compilation of kernels: ``@njit`` with a cache that cannot go stale.
 
-A plain file cache notices edits to the file of a function, but not edits to functions called from other
-files. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest of every
-file that contains kernels: an edit to any of these files recompiles all kernels. The folder is created below
+A plain file cache notices edits to the file that defines a function, but not to functions in other files that
+it calls. Therefore the cache folder (:mod:`skinnode.compiled.kernel_cache`) is named after a digest of every
+file that contains kernels: an edit to any of these files recompiles all kernels. The folder is created under
 ``$SKINNODE_CACHE_DIR``, the user's cache folder or the system's temporary folder, whichever is writable
 first. If no folder is writable, nothing is cached.
 
@@ -106,7 +106,7 @@ def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
     Use this for kernels that take about a microsecond: if the lock were released, another thread could hold
-    it for longer than it takes to compute the rest of the field.
+    it for longer than the rest of the field takes.
     """
     return _kept(function, nogil=False)
 

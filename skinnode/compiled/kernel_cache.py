@@ -2,8 +2,8 @@
 
 Numba's own file cache unpickles any file it finds: a truncated file raises an exception in the first call of
 a kernel, on every run, and machine code with a flipped bit is executed. All signatures of a function share
-one index, so two processes that compile different signatures at once can store the code of one under the name
-of the other.
+one index, so two processes that compile different signatures at the same time can store the code of one under
+the name of the other.
 
 Here each compiled signature has its own file, with a magic number, the SHA-256 of the payload, and the
 payload. The file name contains a digest of everything that the code depends on, so no index is needed. Files
@@ -90,7 +90,7 @@ class KernelCache:
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Write ``compiled`` to the cache if possible."""
-        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache skips these too
+        if compiled.lifted or compiled.library.has_dynamic_globals:  # numba's own cache skips such code too
             return
         path = self._path(signature, compiled.codegen)
         try:
@@ -140,7 +140,7 @@ def _write(path: Path, payload: bytes) -> None:
 def _heal(folder: Path) -> None:
     """Remove all damaged files in ``folder`` together, so that one log line reports them.
 
-    If several processes find the damage, the first process removes and reports the files.
+    If several processes find the damage, only the first removes and reports the files.
     """
     with _locked(folder):
         files = list(folder.glob(f"*{SUFFIX}"))
@@ -189,7 +189,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _report(folder: Path, what: str) -> None:
-    """Log ``what`` once per process and folder, so that forty kernels on a full disk cause only one line."""
+    """Log ``what`` once per process and folder: forty kernels on a full disk then produce one line."""
     kind = f"{folder} {what[:1].isdigit()}"
     if kind not in _reported:
         _reported.add(kind)

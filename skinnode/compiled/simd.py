@@ -1,10 +1,10 @@
 """Explicit vectors of doubles for kernels in which automatic vectorisation is not good enough.
 
-LLVM prefers 256-bit vectors where 512-bit vectors are twice as fast, does not vectorise unless it can prove
-that rows do not overlap, and may keep sums in memory. A kernel that calls ``load``, ``fma`` and ``store``
-gets exactly these instructions, and each lane accumulates its own sum in the order written. The result is
-therefore the same for any number of threads and any split of the columns. On processors with narrower
-vectors, each operation is split.
+LLVM prefers 256-bit vectors even where 512-bit vectors are twice as fast, does not vectorise unless it can
+prove that rows do not overlap, and may keep sums in memory. A kernel that calls ``load``, ``fma`` and
+``store`` gets exactly these instructions, and each lane accumulates its own sum in the order written. The
+result is therefore the same for any number of threads and any split of the columns. On processors with
+narrower vectors, each operation is split.
 
 Vectors support +, − and *; a double in such an expression is broadcast to a vector.
 """
@@ -24,7 +24,7 @@ from numba.core.typing import templates as typed_templates
 
 from skinnode.compiled.jit import numba
 
-extending: Any = typed_extending  # numba's own type hints do not fit here
+extending: Any = typed_extending  # numba's own type hints do not match this use
 types: Any = typed_types
 templates: Any = typed_templates
 signature: Any = templates.signature
@@ -37,7 +37,7 @@ def _lanes() -> int:
         return 8 if "+avx512f" in (chosen or "") else 4
     try:
         return 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4
-    except RuntimeError:  # the features are unknown on this platform
+    except RuntimeError:  # the CPU features are unknown on this platform
         return 4
 
 

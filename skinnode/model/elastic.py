@@ -155,7 +155,7 @@ def _compliance(  # noqa: PLR0913 - the six functions in the matrix
 
 @dataclass(frozen=True)
 class HertzContact:
-    """Contact with a rigid sphere that presses on the rubber and slides over it, under Hertz's pressure.
+    """Hertzian contact with a rigid sphere that presses on the rubber and slides over it.
 
     The traction on the rubber is p (t_x, t_y, −1) with p = p₀ √(1 − r²/a²) inside the contact circle. The
     surface displacement has a closed form everywhere: p is radially symmetric, so all integrals of the matrix

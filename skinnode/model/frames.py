@@ -78,7 +78,7 @@ class Contact:
     centroid_std_m: Float
     """(3,) standard deviation of the centre, metres."""
     area_m2: float
-    """Area of the contact, assuming a smooth body (Hertz), m²; one cell's area if too small to resolve."""
+    """Contact area, assuming a smooth body (Hertz), m²; one cell's area if it is too small to resolve."""
     area_std_m2: float
     normal_force_n: float
     """Normal force, N; positive for a press."""
@@ -116,7 +116,7 @@ class FieldFrame:
     in a posterior field, wires without equations. For these wires ``trusted`` may rest on the prior alone."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first, if ``method`` is ``posterior``. Exact fields have no contacts, and ``auto``
-    computes exact fields if noise and layout allow it. Select the posterior if contacts are needed
+    computes exact fields if the noise and the layout permit. Select the posterior if contacts are needed
     (``solver.method`` in hand.toml, ``method`` of Tracker)."""
     gain: Float | None = None
     """(U,) estimated gain error of each wire's resistances, as a fraction; None if no drift is estimated."""

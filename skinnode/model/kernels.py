@@ -1,8 +1,8 @@
 """Compiled forward model of one wire, with arrays in structure-of-arrays layout.
 
 Lower electrodes are stored as (3, M, K) and the Jacobian as its transpose (3N, K), so vectors of neighbouring
-lower wires k are contiguous in memory and their sums stay in registers. Distances are the main cost: a square
-root and a division per pair would saturate one slow unit of the processor, so 1/√ is computed from
+lower wires k are contiguous in memory and their sums stay in registers. Computing distances is the main cost:
+a square root and a division per pair would saturate one slow unit of the processor, so 1/√ is computed from
 multiplications instead. Lengths may be in any unit; F has the inverse unit.
 """
 
@@ -20,12 +20,12 @@ _T = TypeVar("_T", float, Float)
 
 
 def lower_rows(lower: Float) -> Float:
-    """Return lower electrodes (K, M, 3) as the rows (3, M, K) that the kernels expect."""
+    """Return lower electrodes (K, M, 3) in the axis order (3, M, K) that the kernels expect."""
     return np.ascontiguousarray(lower.transpose(2, 1, 0))
 
 
 def relative_residual(a: _T, f: _T) -> _T:
-    """Return a F − 1 for numbers or arrays: the relative deviation of a resistance from the predicted one."""
+    """Return a F − 1 for numbers or arrays: the relative deviation of a resistance from its prediction."""
     return a * f - 1.0
 
 
@@ -35,7 +35,7 @@ relative_residual_part = njit_body(relative_residual)
 
 @njit_part
 def _inverse_root(square: Lanes) -> Lanes:
-    """Return 1 / √``square`` to 1.5 ulp from 1e-307 to 1e307; NaN for subnormal numbers and inf.
+    """Return 1 / √``square`` to within 1.5 ulp from 1e-307 to 1e307; NaN for subnormal numbers and inf.
 
     With e = 1 − square y² the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). Two iterations of this
     series without the e⁴ term reduce e from 0.07 to 1e-5 and then below the last bit.

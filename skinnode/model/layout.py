@@ -25,8 +25,8 @@ MOST_ELECTRODES: Final = 1024
 coordinates takes 75 MB, and the posterior stores several."""
 
 MOST_PAIRS: Final = 1 << 22
-"""Maximum number of pairs of an upper and a lower electrode. Their distances take 100 MB, and each evaluation
-of all wires computes all of them."""
+"""Maximum number of pairs of an upper and a lower electrode. Storing their distances takes 100 MB, and each
+evaluation of all wires computes every distance."""
 
 _HASH_RESOLUTION_M: Final = 1e-9
 """Resolution of coordinates in the hash, m; layouts that agree to within a nanometre count as equal."""
@@ -42,7 +42,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
         finite: Whether every number must be finite.
 
     Raises:
-        ValueError: If the value cannot be converted. The message names the argument, its value and the
+        ValueError: If the value cannot be converted. The message gives the argument, its value and the
             requirement.
     """
     if (  # fast path: a host passes such an array with every frame
@@ -95,7 +95,7 @@ class PatchLayout:
         upper_m: (U, N, 3) electrodes of the U upper wires, metres; they move with the surface.
         lower_m: (K, M, 3) electrodes of the K lower wires, metres; they do not move.
         resistivity_ohm_per_m: Resistance of the rubber per metre between two electrodes, the paper's g.
-        name: Name of the layout, either a preset or any other name.
+        name: Name of the layout; need not be a preset's.
 
     Raises:
         ValueError: If a shape is wrong, a coordinate is NaN, the resistivity is not positive, an upper

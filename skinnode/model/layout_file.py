@@ -45,7 +45,7 @@ def read_npz(path: Path) -> PatchLayout:
             table = {key: file[key] for key in file.files}
     except ConfigError:
         raise
-    except Exception as error:  # zipfile, its decompressors and NumPy raise about fifteen types
+    except Exception as error:  # zipfile, its decompressors and NumPy raise about fifteen types of error
         what = " ".join(str(error).split())[:80] or type(error).__name__
         raise ConfigError("layout file", str(path), f"an NPZ file ({what})") from None
     return from_electrodes(table, path)
@@ -55,8 +55,8 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
     """Check the headers of an NPZ file before unpacking: a few megabytes can unpack to gigabytes.
 
     Raises:
-        ConfigError: If a member is unknown, duplicate, too large or uses another compression method. zipfile
-            and NumPy raise their own errors if the file is not an NPZ file.
+        ConfigError: If a member is unknown, duplicate or too large, or is neither stored nor deflated.
+            zipfile and NumPy raise their own errors if the file is not an NPZ file.
     """
     with zipfile.ZipFile(data) as members:
         seen: set[str] = set()
@@ -69,7 +69,7 @@ def _require_sizes(data: io.BytesIO, path: Path) -> None:
             if member.compress_type not in (
                 zipfile.ZIP_STORED,
                 zipfile.ZIP_DEFLATED,
-            ):  # other methods unpack all data at once
+            ):  # all other methods unpack a whole member at once
                 got = Shown(f"compression method {member.compress_type}")
                 raise ConfigError(key, got, "stored or deflated, as NumPy writes it", where=str(path))
             most_bytes = _MOST_VALUES[key] * _MOST_ITEM_BYTES
@@ -95,7 +95,7 @@ def has_electrodes(table: Mapping[str, Any]) -> bool:
 
 
 def from_electrodes(table: Mapping[str, Any], path: Path) -> PatchLayout:
-    """Return the layout given by a table with the keys of :func:`read_npz`.
+    """Return the layout given by a table with the keys that :func:`read_npz` expects.
 
     Raises:
         ConfigError: If a key is missing or unknown, or a value is invalid; the error names ``path``.

@@ -27,7 +27,7 @@ class CodeMap:
     steps: int
     """Largest valid code."""
     rounding_ohm: Float
-    """(U, K) standard deviation of the error from rounding to a code, ohm."""
+    """(U, K) standard deviation of the error due to rounding to a code, ohm."""
     relative_noise: float
     """Relative standard deviation of the signal before the converter."""
     gain: Float | None = None

@@ -3,17 +3,16 @@
 With ``normal_only``, x and y of every electrode stay at rest. With ``active_only``, electrodes that no
 contact moves stay at rest: a wire starts with all electrodes at rest; while χ² rejects the fit, the electrode
 that explains most of the residual joins the unknowns together with its neighbours; once more than half have
-joined, all of them join. All electrodes return to rest when the rest position explains the frame. The
-standard deviation of an omitted coordinate is the smallest movement that χ² would detect if no other
-electrode moved, to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J
-outside the range of the unknowns and of the electrode's other columns‖.
+joined, all join. All electrodes return to rest when the rest position explains the frame. The standard
+deviation of an omitted coordinate is the smallest movement that χ² would detect if no other electrode moved,
+to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J outside the range
+of the unknowns and of the electrode's other columns‖.
 
-Both options are assumptions about the skin, and the standard deviations of the unknowns are valid only if the
-assumption is. χ² is a good test of the assumption behind active_only, but a weaker test of the one behind
-normal_only, because a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a
-strong Hertzian press with a shear of 30 % of its depth is rejected; a weaker press is accepted with errors in
-z of up to 16 times its small standard deviation, or 0.2 % of h. Allowing for this would cost more than
-solving for the shear.
+Each option assumes something about the skin, and the standard deviations of the unknowns are valid only if
+its assumption holds. χ² tests the assumption of active_only well, and that of normal_only less well, because
+a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong Hertzian
+press with a shear of 30 % of its depth is rejected; a weaker press is accepted, with errors in z of up to 16
+standard deviations, which is only 0.2 % of h. Allowing for this would cost more than solving for the shear.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ class LeftOut:
             solver.still_std[:] = sigma * self._unnoticed
 
     def widen(self, frame: Frame, turns: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Add electrodes to the unknowns of processed wires whose residual is unexplained; return them (U,).
+        """Add unknowns to the processed wires with an unexplained residual; return these wires (U,).
 
         Sets ``turns`` (U,) to False for wires reached after the deadline.
         """
@@ -109,7 +108,7 @@ class LeftOut:
         solver, arrays, problem = self._stream.solver, self._stream.arrays, self._stream.problem
         solver.set_electrodes(u, electrodes)
         arrays.predictable[u] = len(electrodes) == 0
-        if arrays.predictable[u]:  # then the solution is the rest position, without noise
+        if arrays.predictable[u]:  # no unknowns: the solution is the rest position, without noise
             arrays.x[u], arrays.a_solved[u] = problem.rest[u], problem.a_rest[u]
             solver.a_solved[u], solver.noise[u] = arrays.a_solved[u], 0.0
 

@@ -21,7 +21,7 @@ from skinnode.solve.wires.arrays import solve_options
 from skinnode.solve.wires.stages import DEADLINE
 
 BRIDGES: Final = (3, 5, 10)
-"""Number of substeps of successive bridges. On the staggered layout, h = 0.5, from rest, 3 substeps solve
+"""Numbers of substeps of successive bridges. On the staggered layout, h = 0.5, from rest, 3 substeps solve
 every wire if a 50 % press occurs between two frames, and 5 solve 23 of 24 wires at 70 %. Adaptive steps
 restricted to the trusted branch do worse, because the straight line crosses singular points that the press
 avoids."""
@@ -30,7 +30,7 @@ BRIDGE_TOLERANCE: Final = 1e-6
 BRIDGE_STEPS: Final = 20
 """Maximum steps per substep."""
 RECOVERY_STEPS: Final = 300
-"""Maximum total steps of all bridges of a frame, about 15 ms; a corrupt frame must not stall the stream."""
+"""Maximum total steps of all bridges in a frame, about 15 ms; a corrupt frame must not stall the stream."""
 # Levenberg-Marquardt is the most robust operator for gaps, regardless of the stream's operator.
 _ACROSS: Final = solve_options(op.LEVENBERG_MARQUARDT, 0, BRIDGE_TOLERANCE, BRIDGE_TOLERANCE, BRIDGE_STEPS)
 _LAST: Final = solve_options(op.LEVENBERG_MARQUARDT, TASKS, TOLERANCE, TOLERANCE, BRIDGE_STEPS)
@@ -59,7 +59,7 @@ def recover_lost(
         ended = int(solver.report[u, wires.STATUS])
         status[u] = op.ILL_CONDITIONED if ended == op.CONVERGED and not good[u] else ended
     solver.std[~good] = np.inf
-    arrays.predictable &= ~(lost | exhausted)  # other wires keep their inverse
+    arrays.predictable &= ~(lost | exhausted)  # all other wires keep their inverse
 
 
 def recover(stream: StreamState, u: int, frame: Frame) -> bool:
@@ -87,7 +87,7 @@ def _bridge(  # noqa: PLR0913 - both ends of the bridge
     """Solve wire u along a straight line from its resistances ``a_from`` (K,) to those of the frame.
 
     Only the last point counts: the line is not a deformation of rubber, so intermediate points may lie on any
-    branch. The outcome is in the solver's report of the wire. Returns False if the deadline interrupts the
+    branch. The outcome is in the solver's report on the wire. Returns False if the deadline interrupts the
     bridge.
     """
     todo, a_to = stream.only(u), stream.arrays.a[u]

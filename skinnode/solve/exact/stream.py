@@ -27,7 +27,7 @@ from skinnode.solve.wires.problem import PatchProblem
 
 TOLERANCE: Final = 1e-9
 """Tolerance of r and, in pitches, of x: four orders of magnitude below the noise of a 24-bit converter, and
-one Newton step from 1e-5."""
+one Newton step away from 1e-5."""
 FRAME_STEPS: Final = 12
 """Maximum steps per solve; quadratic convergence from within the trust region takes 3 to 6."""
 TASKS: Final = wires.COVARIANCE | wires.REUSE
@@ -102,8 +102,8 @@ class StreamState:
         Args:
             todo: (U,) LEAVE, SOLVE, PREDICT or HOLD.
             frame: Frame with σ and the order of the wires.
-            a: (U, K) resistances; the default is those of the frame.
-            options: Solver options; the default is those of the stream.
+            a: (U, K) resistances; by default those of the frame.
+            options: Solver options; by default those of the stream.
             units: As in :meth:`PatchSolver.solve`.
         """
         self.solver.solve(

@@ -55,8 +55,8 @@ class ExactTracker:
         stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, fields contain forces.
         hold: Whether to keep the position of a wire whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one solve of a wire. Wires not
-            processed by then have the status DEADLINE and an infinite standard deviation; they come first in
-            the next frame.
+            processed by then have the status DEADLINE and an infinite standard deviation; they are processed
+            first in the next frame.
         normal_only: Whether only z is unknown.
         active_only: Whether to solve only for electrodes that contacts move.
         codes: Mapping from the codes passed to :meth:`update_codes` to resistances.
@@ -252,7 +252,7 @@ class ExactTracker:
         arrays.predictable[wires_] = False
 
     def _solve(self, frame: Frame) -> None:
-        """Solve the wires that need it, but at least one, so that the stream always makes progress."""
+        """Solve as many wires as time allows, but at least one, so that the stream always makes progress."""
         units = math.inf
         if frame.until < math.inf:
             units = max(WIRE_UNITS, (frame.until - perf_counter()) / UNIT_S)

@@ -1,4 +1,4 @@
-"""Newton step −J⁺ r, which Gauss-Newton takes in full, as in the paper, and the other operators shorten.
+"""Newton step −J⁺ r: taken in full by Gauss-Newton, as in the paper, and shortened by the other operators.
 
 The correction −J⁺ r₊ with the current factors is also the error estimate (Deuflhard, Newton methods for
 nonlinear problems, 2004). Source: Xu et al. 2018, eq. 8.
@@ -108,7 +108,7 @@ def rounding(w: Work, x: Float) -> float:
 
 @njit_part
 def estimate_error(w: Work, inverse: Float) -> float:
-    """Write J⁺ of the last factors into ``inverse`` (n, m); return the error estimate of a converged solve.
+    """Write J⁺ from the last factors into ``inverse`` (n, m); return the error estimate of a converged solve.
 
     The estimate is the remaining correction plus the effect of rounding x, amplified by the condition
     number of J, relative to max(1, ‖x‖∞); inf if J is singular.

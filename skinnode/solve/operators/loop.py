@@ -2,8 +2,8 @@
 
     begin      start from x, r and J in the workspace
     propose    factor J; unless x is a root, make the Newton step the next ``trial``
-    shorten    if the Newton step leaves the trust region, replace the trial by one inside it
-    assess     given r at ``trial`` in ``r_trial``, accept the step or not and update the radius
+    shorten    if the Newton step leaves the trust region, replace the trial with one inside it
+    assess     given r at ``trial`` in ``r_trial``, accept or reject the step, and update the radius
 
 The same compiled steps therefore serve the compiled solver of a skin wire and any pair of Python callables.
 Gauss-Newton accepts every step in full; Levenberg-Marquardt and dogleg accept a step only if it reduces r.

@@ -112,7 +112,7 @@ def _resize(w: Work, norm: float, gain: float, slope: float, ratio: float) -> No
 
 @njit_part
 def assess_decrease(w: Work, norm: float) -> int:
-    """Compare the decrease in ‖r‖, to ``norm`` at the trial, with the prediction; update the radius.
+    """Compare the decrease in ‖r‖ (to ``norm`` at the trial) with its prediction; update the radius.
 
     Returns ACCEPTED, REJECTED or a Status.
     """

@@ -44,7 +44,7 @@ class Work(NamedTuple):
     down: Annotated[Float, "n"]
     """β of the reflectors of the bidiagonal form, as in ``across``."""
     inverse: Annotated[Float, "n"]
-    """1 / diagonal of the damped form; ``ru`` is its superdiagonal."""
+    """Reciprocal diagonal of the damped form; ``ru`` is the superdiagonal."""
     ru: Annotated[Float, "n"]
     r: Annotated[Float, "m"]
     r_trial: Annotated[Float, "m"]
@@ -55,7 +55,7 @@ class Work(NamedTuple):
     jt: Annotated[Float, "n m"]
     """Jᵀ at x."""
     lu: Annotated[Float, "n+3 lanes_n"]
-    """LU factors of Jᵀ if the system is square; rows are whole lanes."""
+    """LU factors of Jᵀ if the system is square; rows are padded to whole lanes."""
     qr: Annotated[Float, "m n"]
     """QR factors of J if it is tall."""
     right: Annotated[Float, "n+3 lanes_m"]
@@ -63,7 +63,7 @@ class Work(NamedTuple):
     left: Annotated[Float, "n lanes_n+3"]
     """Reflectors of the bidiagonal form from the left."""
     wide: Annotated[Float, "lanes_m"]
-    """Scratch as long as a row of ``right``."""
+    """Scratch of the same length as a row of ``right``."""
     pivot: Annotated[Index, "n"]
     s: Annotated[Float, "scalars"]
     flag: Annotated[Index, "flags"]

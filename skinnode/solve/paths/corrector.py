@@ -91,7 +91,7 @@ class Corrector:
         return np.asarray(self._knots[sample + 1])
 
     def log_start(self, wires_: NDArray[np.bool_], evaluations: Index) -> None:
-        """Log the ``evaluations`` (U,) used to find starting points of these wires (U,)."""
+        """Log the ``evaluations`` (U,) used to find starting points for these wires (U,)."""
         nothing = np.full(len(evaluations), math.nan)
         self._rows.append((np.where(wires_, self.last, nothing), evaluations, evaluations, nothing))
 

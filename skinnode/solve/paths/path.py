@@ -37,7 +37,7 @@ SELECTION: Final = Accuracy(tolerance=1e-12, max_steps=100)
 """Accuracy of a solve started from the posterior: the paper's final tolerance, with its maximum number of
 steps for an intermediate sample."""
 STARTS: Final = 12
-"""Number of random starting points in the search for other roots if a layout has folds. They are drawn from
+"""Number of random starting points in the search for other roots on a layout with folds. They are drawn from
 the posterior with a fixed seed."""
 
 

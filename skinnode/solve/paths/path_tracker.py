@@ -77,7 +77,7 @@ class PathTracker:
         cycle: Number of samples from one solve to the next, if step control found or was given a cycle.
         searched: Number of leading log rows spent on the search for the cycle.
         second_tries: Whether a wire may move away from the end of its path; if not, only its status changes.
-        stumbled: (U,) wires with at least one undone step.
+        stumbled: (U,) wires on which at least one step was undone.
     """
 
     def __init__(self, problem: PatchProblem, a: Float, operator: int) -> None:
@@ -164,7 +164,7 @@ class PathTracker:
         """Predict and correct the wires in ``todo`` (U,) to their ``position`` (U,).
 
         Returns:
-            (U,) wires that reached a root on the branch of the rest position. The others do not move.
+            (U,) wires that reached a root on the branch of the rest position. The other wires do not move.
         """
         solver = self.solver
         before = solver.x.copy(), solver.inverse.copy(), solver.a_solved.copy()

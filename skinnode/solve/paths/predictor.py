@@ -36,7 +36,7 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
 ) -> None:
     """Predict positions along the secant through the last two solved points.
 
-    The previous move is scaled by the projection of the next relative change in ``a`` onto the previous
+    The previous step is scaled by the projection of the next relative change in ``a`` onto the previous
     change. A wire whose prediction is not finite stays at ``x``.
 
     Args:
@@ -45,7 +45,7 @@ def secant(  # noqa: PLR0913 - a kernel: two points, the next resistances, the l
         x: (U, n) position at the last point, pitches.
         a: (U, K) R · gain at ``x``.
         a_next: (U, K) R · gain at the next point.
-        reach: Largest allowed move of a coordinate, pitches.
+        reach: Largest allowed change in a coordinate, pitches.
         out: (U, n) predicted positions, pitches.
     """
     for u in range(x.shape[0]):

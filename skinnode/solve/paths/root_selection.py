@@ -23,10 +23,10 @@ from skinnode.solve.starts import guided_start, near_twin
 from skinnode.solve.wires import arrays as wires
 
 GUIDED_STEPS: Final = 100
-"""Maximum steps from a guided start: a solve that starts near a root takes 1 to 20 steps; others never
-converge."""
+"""Maximum steps from a guided start: a solve that starts near a root takes 1 to 20 steps; one that starts
+elsewhere never converges."""
 TWIN: Final = Accuracy(tolerance=1e-9, max_steps=30)
-"""Accuracy of a root that is only compared with another root: distinct roots differ by far more."""
+"""Accuracy of a root that is only compared with another: distinct roots differ by far more than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,15 +44,15 @@ class PatchEstimate:
 
 
 def doubtful(tracker: PathTracker) -> Mask:
-    """Return the wires (U,) that have no root, a root too rough to be a press, or an undone step."""
+    """Return the wires (U,) that have no root, a root too rough to be a press, or a step that was undone."""
     return np.asarray(~tracker.end.converged | _rough(tracker) | tracker.stumbled)
 
 
 def guide(tracker: PathTracker, todo: Mask, accuracy: Accuracy) -> None:
     """Solve the last sample again from the smoothest displacement that explains it; keep the smoother root.
 
-    If that leads to a root across a fold, the function solves for the twin of that root on the near side. A
-    wire for which neither solve finds a root is not CONVERGED afterwards.
+    If the new root lies across a fold, the function solves for its twin on the near side. A wire for which
+    neither solve finds a root is not CONVERGED afterwards.
 
     Args:
         tracker: Tracker at the end of its path.

@@ -45,7 +45,7 @@ class Schedule(Protocol):
 class Uniform:
     """Schedule that solves ``steps`` evenly spaced samples, always including the last.
 
-    The other defaults follow the paper's protocol (section 4).
+    The default tolerances and step limits follow the paper's protocol (section 4).
 
     Args:
         steps: Number of samples to solve; by default, or if there are fewer samples, all are solved.
@@ -53,8 +53,8 @@ class Uniform:
             each wire at the outcome of the last sample. Otherwise each sample starts on the secant through
             the last two solutions, and a wire with no root or a rough root is solved again from the smoothest
             displacement that explains the last sample. On the staggered layout, h = 1, with 10 samples of
-            each of 21 presses of 50 %, starting on the secant by itself reduces the lost wires from 7 of 197
-            to none, and the evaluations per sample from 4 to 2.9.
+            each of 21 presses of 50 %, starting on the secant by itself reduces the number of lost wires from
+            7 of 197 to none, and the evaluations per sample from 4 to 2.9.
         intermediate_tolerance: Tolerance of r, and of x in pitches, at all samples except the last.
         final_tolerance: Tolerance at the last sample.
         intermediate_steps: Maximum operator steps at all samples except the last.
@@ -153,7 +153,7 @@ class Periodic:
             solved = [tracker.solve(sample, accuracy) > 0 for sample in range(tracker.samples - 1)]
             cycle = shortest_cycle(np.array(solved).reshape(-1, tracker.wires))
             if cycle is None:
-                break  # a looser tolerance still leaves the whole path in one cycle
+                break  # a looser tolerance would show no second cycle either
             if cycle > 1:
                 return cycle, tolerance
         return None, RELAXED_TOLERANCES[0]
@@ -187,8 +187,8 @@ class Adaptive:
     A straight line in R is not a deformation of rubber and can meet a fold that the press itself does not
     meet. If a wire gets stuck at such a fold, or its root is too rough to be a press, it is solved again by
     Levenberg-Marquardt, whatever the operator. That solve starts from the smoothest displacement that
-    explains the last sample (:func:`skinnode.solve.starts.guided_start`). If there are then two roots, the
-    smoother one is kept.
+    explains the last sample (:func:`skinnode.solve.starts.guided_start`). If this yields a second root, the
+    smoother root is kept.
 
     Two samples are enough: the patch at rest and the frame to solve.
 
@@ -210,7 +210,7 @@ class Adaptive:
         _require(self, "final_tolerance", "final_steps")
 
     def follow(self, tracker: PathTracker) -> None:
-        """Predict, correct and choose step lengths; then finish wires that arrived and guide the others."""
+        """Predict, correct and choose step lengths; then finish the wires that arrived and guide the rest."""
         end = tracker.samples - 1.0
         reach = tracker.problem.step_limit
         position = np.full(tracker.wires, REST)
@@ -253,7 +253,7 @@ def _require_count(name: str, value: int) -> None:
 
 
 def _require(options: object, *names: str) -> None:
-    """Raise ValueError unless the tolerances are positive and the numbers of steps at least 1."""
+    """Raise ValueError unless the tolerances are positive and the numbers of steps are at least 1."""
     for name in names:
         value = getattr(options, name)
         if name.endswith("steps"):

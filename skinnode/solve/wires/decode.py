@@ -22,8 +22,8 @@ A_MAX: Final = 1e12
 def decode(frame: FrameArrays) -> int:
     """Write ``ohm``, ``noise`` and ``valid`` from ``codes``; NaN for an invalid code.
 
-    The noise combines the noise of the front end with the error from rounding to codes. Returns the number of
-    invalid codes.
+    The noise combines the noise of the front end with the error due to rounding to codes. Returns the number
+    of invalid codes.
     """
     codes, baseline, gain = frame.codes, frame.baseline_ohm, frame.code_gain
     rounding, code_map = frame.rounding_ohm, frame.code_map

@@ -6,10 +6,10 @@ one index, so two processes that compile different signatures at the same time c
 the name of the other.
 
 Here each compiled signature has its own file, with a magic number, the SHA-256 of the payload, and the
-payload. The file name contains a digest of everything that the code depends on, so no index is needed. Files
-are written under a temporary name and renamed. If a file fails verification, it is removed, the kernel is
-recompiled, and one line is logged. One line is also logged if a kernel cannot be cached. Cache errors never
-reach the caller.
+payload itself. The file name contains a digest of everything that the code depends on, so no index is needed.
+Files are written under a temporary name and renamed. If a file fails verification, it is removed, the kernel
+is recompiled, and one line is logged. One line is also logged if a kernel cannot be cached. Cache errors
+never reach the caller.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from skinnode.model.layout import Float, require_array
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """A linear elastic, isotropic material.
+    """Linear elastic, isotropic material.
 
     Args:
         young_pa: Young's modulus, Pa. The default is typical of a soft silicone, about 20 Shore A.

@@ -113,7 +113,8 @@ class FieldFrame:
     """``exact`` if each wire was inverted; ``posterior`` if the patch was estimated as a whole."""
     by_prior: NDArray[np.bool_] | None = None
     """(U,) wires whose own equations were not sufficient: in an exact field, wires estimated with the prior;
-    in a posterior field, wires without equations. For these wires ``trusted`` may rest on the prior alone."""
+    in a posterior field, wires without equations. For these wires, ``trusted`` may rest on the prior
+    alone."""
     contacts: tuple[Contact, ...] = ()
     """Contacts, strongest first, if ``method`` is ``posterior``. Exact fields have no contacts, and ``auto``
     computes exact fields if the noise and the layout permit. Select the posterior if contacts are needed

@@ -30,14 +30,14 @@ class EstimateOptions:
         rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
             on it.
         estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
-        drift: Gain errors to estimate: ``patch`` for one common gain of all resistances, ``wire`` for one
+        drift: Gain errors to estimate: ``patch`` for one gain common to all resistances, ``wire`` for one
             gain per upper wire, or ``none``.
         drift_std: Prior standard deviation of a gain error, as a fraction.
         model_error: Standard error of the forward model, as a fraction of the change in each resistance
             (from thickness, electrode size and conductivity under strain): the full value for an error common
             to all resistances, and 0.7 of it for an independent error of each resistance.
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.
-        hold: Whether to keep the last solution of wires that changed no more than their noise.
+        hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
             then have the status DEADLINE.
 

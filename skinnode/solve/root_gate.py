@@ -28,15 +28,15 @@ from skinnode.solve.wires.problem import PatchProblem
 from skinnode.solve.wires.root_check import SOME_ROUGH, SOME_SUSPECT, RootCheck, check_roots
 
 PAUSE: Final = 16
-"""Number of frames without a posterior solve after the posterior missed a deadline; a futile solve in every
-frame would delay other patches on the same thread by 2 ms."""
+"""Number of frames without a posterior solve after the posterior has missed a deadline; a futile solve in
+every frame would delay other patches on the same thread by 2 ms."""
 APART: Final = 3.0
 """Factor applied to the distance between a root near a fold and the posterior estimate that confirms it. The
-product is added to the standard deviation, because two roots may be too close for the posterior to
-distinguish."""
+product is added in quadrature to the standard deviation, because two roots may be too close for the posterior
+to distinguish."""
 NEAR_FOLD: Final = 2.0
-"""Factor applied, for the same reason, to the standard deviation of a root near a fold that the posterior
-replaced."""
+"""Factor applied, for the same reason as :data:`APART`, to the standard deviation of a posterior estimate
+that replaces a root near a fold."""
 
 Mask = NDArray[np.bool_]
 

@@ -53,7 +53,7 @@ Mask = NDArray[np.bool_]
 FOLDED: Final = 250.0
 """RMS of ∂x/∂(ln R) at rest, in clearances, above which presses run into folds. The value is 70 for the
 staggered layout at h = 0.5, where none of 6000 wires ran into a fold, and at least 1200 for staggered layouts
-from h = 1 and for aligned and symmetric layouts, where one wire in 30 ends at a wrong root."""
+with h ≥ 1 and for aligned and symmetric layouts, where one wire in 30 ends at a wrong root."""
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
 while R changes only in its seventh digit. Wires on a symmetry line of the layout are blind, because each of
@@ -61,7 +61,7 @@ their roots has a mirror image. The only other blind wires are those 1.5 pitches
 wires."""
 NEARLY_BLIND: Final = 1e5
 """RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; aligned
-layouts exceed it from h = 1."""
+layouts exceed it at h ≥ 1."""
 NONLINEAR: Final = 0.003
 """Standard deviation of the exact inverse, in clearances, above which F is not linear within the noise; roots
 are then as doubtful as near a fold."""
@@ -86,24 +86,25 @@ STILL_CONFIRMED: Final = 0.2
 # -- two roots of one wire ----------------------------------------------------------------------------------
 
 SAME_ROOT: Final = 1e-3
-"""Distance between two solutions, relative to the displacement, up to which they are the same root."""
+"""Distance between two solutions, relative to the displacement, up to which they count as the same root."""
 TWIN_REACH: Final = 2.0
-"""Largest distance to a twin root that is worth solving for, relative to the largest displacement of the
-wire. Twins farther away were at least 1.3 times as rough on the staggered layout, h = 0.3 to 1."""
+"""Largest distance at which a twin root is worth solving for, relative to the wire's largest displacement.
+Twins farther away were at least 1.3 times as rough on the staggered layout, h = 0.3 to 1."""
 TWIN_ROUGHNESS: Final = 1.05
 """Ratio between the roughnesses of two roots at a fold above which the smoother root is accepted. Over 82
 random presses of 50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as
 rough. Of 100 correct roots, 4 have a twin within the ratio and lose the status CONVERGED. In 60 further
-presses of each depth and height (6710 wires, h = 0.3 to 1) no wrong root was reported as CONVERGED; in 40
-others (4510 wires) one was."""
+presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was reported as CONVERGED; in
+another 40 (4510 wires), one was."""
 UNLIKELY: Final = 4.0
-"""Energy margin by which other roots must be less likely. In 1530 pairs of roots from presses of 30 to 70 %
-on the staggered layout, h = 1, and the aligned layout, h = 0.5, the wrong root was likelier in 19 pairs, by
-at most 1.4; in a second set of the same size, it was likelier by at most 2.6. A root at the end of a path is
-no safer: with paths of 5 samples, the wrong root was likelier by up to 2.5 as well."""
+"""Energy margin by which all other roots must be less likely than the accepted root. In 1530 pairs of roots
+from presses of 30 to 70 % on the staggered layout, h = 1, and the aligned layout, h = 0.5, the wrong root was
+likelier in 19 pairs, by at most 1.4; in a second set of the same size, it was likelier by at most 2.6. A root
+at the end of a path is no safer: with paths of 5 samples, the wrong root was likelier by up to 2.5 as
+well."""
 UNLIKELY_BLIND: Final = 16.0
-"""Energy margin by which other roots must be less likely on nearly blind wires, which may have undiscovered
-roots."""
+"""Energy margin by which all other roots must be less likely on nearly blind wires, which may have
+undiscovered roots."""
 
 # -- the posterior of the patch -----------------------------------------------------------------------------
 
@@ -113,14 +114,14 @@ onto a root of F = b."""
 AGREE: Final = 6.0
 """Number of standard deviations within which the posterior confirms a root."""
 NEAR: Final = 0.25
-"""Largest first correction of an electrode, in clearances; after a larger one, annealing is used instead."""
+"""Largest first correction of an electrode, in clearances; after a larger correction, annealing is used."""
 FAR: Final = 0.1
 """Movement of an electrode, in clearances, after which the estimate is compared with one annealed from rest.
 Without the comparison, presses of 0.3 or more crossed folds unnoticed, one frame at a time."""
 LIKELIER: Final = 4.0
-"""Energy margin by which an estimate from a second annealing must be likelier to replace the first. A smaller
-gain indicates the same maximum, shifted towards the loads found; the wrong maximum observed was worse by
-23."""
+"""Energy margin by which an estimate from a second annealing must be likelier to replace the first estimate.
+A smaller gain indicates the same maximum, shifted towards the loads found; the wrong maximum observed was
+worse by 23."""
 SUSPICIOUS: Final = 3.0
 """Value of a nuisance, in prior standard deviations, above which the estimate is compared with an annealed
 estimate and never held. A drift or model error can mimic a displacement, and a stream would not recover."""
@@ -130,7 +131,8 @@ IMPOSSIBLE_CHANCE: Final = 1e-9
 """Probability per frame that the χ² test reports a wire that obeys the model as INCONSISTENT."""
 Z_REFUSE: Final = 5.998
 """Normal quantile of 1 − 1e-9; its χ² is the limit above which a tall system is INCONSISTENT. At 100
-frames/s, noise alone exceeds the limit once in four months. Wrong roots and wrong values cause larger χ²."""
+frames/s, noise alone exceeds the limit once in four months. Wrong roots and wrong values cause a larger
+χ²."""
 
 
 def folded_wires(layout: PatchLayout, normal_only: bool = False) -> Mask:

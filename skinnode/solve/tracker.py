@@ -22,13 +22,13 @@ from skinnode.solve.posterior.posterior import Posterior
 from skinnode.solve.root_gate import RootGate
 
 EXACT_STD: Final = 0.0025
-"""Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses it: 2.5 % of a
-press that indents the layer by a tenth. With 16-bit codes, the standard deviation is 0.0005 on the staggered
-layout, h = 0.5, and 0.05 on the aligned layout."""
+"""Standard deviation of the exact inverse at rest, in clearances, up to which ``auto`` chooses it: 2.5 % of
+the depth of a press that indents the layer by a tenth. With 16-bit codes, the standard deviation is 0.0005 on
+the staggered layout, h = 0.5, and 0.05 on the aligned layout."""
 
 
 class Tracker:
-    """Tracker of one patch through a stream of frames.
+    """Tracker that follows one patch through a stream of frames.
 
     Do not share an instance between owners. Compiled code releases the GIL. The constructor compiles the
     kernels.

@@ -43,7 +43,7 @@ WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
 
 
 class ExactTracker:
-    """Tracker of one patch by the exact inverse of each wire.
+    """Tracker for one patch, using the exact inverse of each wire.
 
     Do not share an instance between owners. Compiled code releases the GIL.
 

@@ -17,7 +17,7 @@ from skinnode.model.layout import Float
 def bidiagonalise(  # noqa: C901, PLR0913 - four rows at a time; every result of the decomposition
     a: Float, left: Float, diagonal: Float, upper: Float, across: Float, down: Float, w: Float
 ) -> None:
-    """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with orthogonal P and Q and B upper bidiagonal (n, n).
+    """Decompose A (n, m), n ≤ m, as P Bᵀ Qᵀ with P and Q orthogonal and B (n, n) upper bidiagonal.
 
     ``a`` (n + 3, whole lanes of m) is A padded with zeros, so that loops over four rows and whole vectors
     need no special cases. Writes B to ``diagonal`` (n,) and ``upper`` (n,), whose last element is 0; the

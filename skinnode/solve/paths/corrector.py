@@ -52,7 +52,7 @@ class PathLog:
 
 
 class Corrector:
-    """Solver of one patch's wires at positions on its path. Do not share an instance between owners.
+    """Solver for one patch's wires at positions on its path. Do not share an instance between owners.
 
     Args:
         problem: The patch.

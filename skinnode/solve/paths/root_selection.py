@@ -128,7 +128,7 @@ def keep_likeliest(
     unlikely: Float,
     accuracy: Accuracy,
 ) -> None:
-    """Search for other roots from the twins and from ``starts``, and keep the likeliest root.
+    """Search for other roots, starting from the twins and from ``starts``; keep the likeliest root.
 
     A root is CONVERGED only if no other root comes within ``unlikely`` of its energy.
 

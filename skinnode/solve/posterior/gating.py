@@ -1,6 +1,6 @@
 """Gating: χ² tests for wires that moved and for wires whose resistances no deformation explains.
 
-Each wire is tested by the χ² of its residuals and also by each of its coordinates separately, because χ²
+Each wire is tested by the χ² of its residuals and by the apparent movement of each coordinate, because χ²
 alone overlooks an electrode that moved by 7 standard deviations.
 """
 
@@ -37,7 +37,7 @@ class Fit(NamedTuple):
 
 
 class Gate:
-    """χ² tests of one patch, with the list of wires kept in the estimate.
+    """χ² tests for one patch, with the list of wires kept in the estimate.
 
     Args:
         wires: Number of upper wires.
@@ -81,7 +81,7 @@ class Gate:
         Args:
             fit: Misfit of the rest position.
             count: (U,) usable resistances of each wire.
-            members: Wires of the last estimate, to which a lower limit applies.
+            members: Wires in the last estimate; a lower limit applies to them.
         """
         touched = self.moved(fit, count)
         stay = np.zeros(len(touched), bool)

@@ -20,8 +20,8 @@ LOCAL_SIGNIFICANT: Final = 4.0
 LOCAL_CERTAIN: Final = 100.0
 """Squared significance at which a press is certain, in standard deviations squared. At 25, with high noise,
 the first locations found are unreliable and errors are 1 % larger. At 1000 and above, on layouts with low
-sensitivity (`aligned`), half of a press is still expected over the whole patch, which increases errors by
-14 %."""
+sensitivity (`aligned`), half of the expected load is still spread over the whole patch, which increases
+errors by 14 %."""
 
 
 class LoadPosterior:

@@ -26,8 +26,8 @@ from skinnode.solve.posterior.prior import SLACK, ElasticPrior
 
 LOCAL_SPREAD: Final = 0.7
 """Standard deviation, in cells, of the Gaussian that spreads the squared loads found over neighbouring cells.
-A smaller value relies on single cells, which is better for contacts on rubber that matches the prior but
-overconfident for others; a value of 1 loses a quarter of the improvement."""
+A smaller value relies on single cells, which is better if the rubber matches the prior but overconfident if
+it does not; a value of 1 loses a quarter of the improvement."""
 LOCAL_FLOOR: Final = 0.05
 """Mean square load expected in cells without a load found, relative to the mean over the patch; allows for
 light touches near a press."""
@@ -42,7 +42,7 @@ slow presses need a factorisation in as many frames as without the limit."""
 
 
 class LoadPrior:
-    """Prior u ~ N(0, s² C) of the free coordinates of a patch, caused by loads of unequal variance.
+    """Prior u ~ N(0, s² C) of a patch's free coordinates, displaced by loads of unequal variance.
 
     Args:
         elastic: Elasticity of the patch.
@@ -100,7 +100,7 @@ class LoadPrior:
         """Return the variances (Q,), pitch², implied by the loads found; at least ``least``.
 
         The variances move halfway from their current values to the implied values, because with full steps
-        neighbouring cells would alternate. If a press is certain and equal loads were expected all over the
+        neighbouring cells would alternate. If a press is certain and equal loads were expected over the whole
         patch, the full step is taken.
 
         Args:

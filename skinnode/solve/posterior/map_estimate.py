@@ -51,12 +51,12 @@ PRIOR_DOUBT: Final = 3.0
 """Factor applied, in the standard deviation, to the part of σ² that only the prior determines, because the
 load to expect at a location is known only roughly. At 1, the hidden part of a first touch is 5 to 7 standard
 deviations off on one wire in 20 000, and so are dents that a half-space cannot form. At 2, one coordinate in
-12 000 of such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
+12 000 in such dents is 5.6 standard deviations off, and no coordinate of the hard cases exceeds 5."""
 SMOOTH_SHARE: Final = 0.25
-"""Factor applied to the same part in the 95 % interval. Independent loads on cells are rougher than real
-bodies: the measured errors contain 0.0 to 0.13 of that variance for spheres and 0.02 to 0.5 for Gaussian
-dents. The tail of the error distribution determines the standard deviation, and its centre determines the
-interval."""
+"""Factor applied, in the 95 % interval, to the part of σ² that only the prior determines. Independent loads
+on cells are rougher than real bodies: the measured errors contain 0.0 to 0.13 of that variance for spheres
+and 0.02 to 0.5 for Gaussian dents. The tail of the error distribution determines the standard deviation, and
+its centre determines the interval."""
 
 
 class MapEstimator:
@@ -208,7 +208,7 @@ class MapEstimator:
     def objective(
         self, observation: Observation, moved: Float | None = None, g: Float | None = None
     ) -> float:
-        """Return −2 log posterior of the current or another field; its constant depends on the factors."""
+        """Return −2 log posterior of the current or another field, up to a constant set by the factors."""
         moved, g = (self.moved if moved is None else moved), (self.g if g is None else g)
         square = self._square(observation, self.members, moved, g)
         prior = self.roughness(moved) / self.load_prior.scale2
@@ -265,7 +265,7 @@ class MapEstimator:
         return self._gamma
 
     def evidence_scale(self, weight: float, scale2: float) -> float:
-        """Return the next s², pitch², of MacKay's fixed point (Neural Computation 4, 415, 1992).
+        """Return the next s², pitch², of MacKay's fixed-point iteration (Neural Computation 4, 415, 1992).
 
         Args:
             weight: Weight of the prior of s², in directions.
@@ -366,7 +366,7 @@ class MapEstimator:
         self._enough = SETTLED * math.sqrt(float(np.mean(self.core**2)))
 
     def _settle(self, observation: Observation) -> bool:
-        """Take chord steps to the maximum; if they do not settle, keep the better field, old or new."""
+        """Take chord steps to the maximum; without convergence, keep the better of the old and new fields."""
         moved, g = self.moved.copy(), self.g.copy()
         if self._chord(observation):
             return True

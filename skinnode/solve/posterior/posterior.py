@@ -36,9 +36,9 @@ from skinnode.solve.wires.decode import A_MAX, A_MIN
 from skinnode.solve.wires.problem import PatchProblem
 
 NOISE_LEAST: Final = 1e-6
-"""Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. A smaller noise
-forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this happens even at
-up to ten times this noise."""
+"""Smallest relative noise, a fifth of a 16-bit code; the forward model is no more accurate. Lower noise
+forces the field onto a root of F = b, which can be a wrong root. On layouts with folds, this happens even
+with up to ten times as much noise."""
 LEFT_OUT: Final = 3
 """Maximum number of wires to leave out, one after another, before the whole frame is INCONSISTENT."""
 LEAST_STEPS: Final = 3.0
@@ -111,7 +111,7 @@ class Posterior:
         seconds, self._seconds = self._seconds, math.inf  # with a deadline, some kernels might not run
         self.update(1.0 / (potential * self._problem.gain), relative_noise=1e-4)
         self._seconds = seconds
-        self._estimator.gamma()  # compiles it now, not on the first frame without a touch
+        self._estimator.gamma()  # compile gamma now, not in the first untouched frame
         if self._contacts is not None:
             self._contacts.warm_up(self._hyper.loads)
 
@@ -284,7 +284,7 @@ class Posterior:
         return self._give_up(Status.INCONSISTENT)
 
     def _joining(self, fit: Fit, observation: Observation, wanted: Index) -> Index:
-        """Return and keep the wires outside ``wanted`` that contradict the field of the other wires."""
+        """Find the wires outside ``wanted`` that contradict the other wires' field; keep and return them."""
         moved = self._gate.moved(fit, observation.count)
         moved[wanted] = False
         joining = np.flatnonzero(moved)

@@ -1,4 +1,4 @@
-"""Elastic prior: the displacement of the rubber that is expected before any resistance is read.
+"""Elastic prior: the displacement of the rubber that is expected before any resistance is measured.
 
 Each electrode site lies in a cell one pitch wide. Independent surface loads on the cells displace the
 electrodes by the response G of an elastic half-space (Boussinesq, Cerruti;

@@ -215,4 +215,4 @@ class FrameArrays(ArrayTable):
 
 
 read_options, read_solver, read_frame = reader(SolveOptions), reader(SolverArrays), reader(FrameArrays)
-"""Functions by which kernels read the fields of a table."""
+"""Functions with which kernels read the fields of a table."""

@@ -1,9 +1,9 @@
 """Compiled corrector: brings one wire to a root of r = w (a F − 1) with an operator.
 
 A wire is solved for all coordinates of its electrodes or for fewer: some electrodes may stay at rest, and z
-may be the only unknown (``normal_only``). With fewer unknowns than equations, the system is tall, and χ² =
-Σ (ρ_k/σ_k)² at its minimum tests the fit. Above the 1 − 1e-9 quantile no position explains the frame, and the
-wire is ILL_CONDITIONED; above the 95 % quantile the standard deviations are multiplied by √(χ²/dof) (Birge,
+may be the only unknown (``normal_only``). With fewer unknowns than equations, the system is tall, and χ² = Σ
+(ρ_k/σ_k)² at its minimum tests the fit. Above the 1 − 1e-9 quantile, no position explains the frame, and the
+wire is ILL_CONDITIONED; above the 95 % quantile, the standard deviations are multiplied by √(χ²/dof) (Birge,
 Phys. Rev. 40, 207, 1932). This test replaces the sign of det J, which only a square system has.
 """
 
@@ -168,7 +168,7 @@ def report_correction(  # noqa: C901, PLR0913 - one wire of a call; its results 
     x_u, electrodes, measure = solver.x[u], solver.electrodes[u], solver.measure[u]
     for j in range(unknowns):
         value = w.x[j]
-        if status == CONVERGED and not skipped:  # the correction that proved convergence costs nothing more
+        if status == CONVERGED and not skipped:  # the correction that proved convergence is free
             value += w.newton[j]
         x_u[coordinate(electrodes, j, each)] = value
     measure[RESIDUAL] = math.sqrt(dot(w.r, w.r) / count)

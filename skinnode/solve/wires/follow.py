@@ -54,10 +54,10 @@ def follow(  # noqa: PLR0913 - arrays of one wire
 ) -> tuple[int, int, float]:  # fmt: skip
     """Take simplified Newton steps of a square system whose unknowns are all coordinates ``x`` (3N,).
 
-    ``moved`` is the size of the prediction that led to ``x``. Returns the number of evaluations of F,
-    negative if no root was found, the number of steps added to ``x``, and the size of the first step relative
-    to the prediction. If a root was found, it is ``x`` + ``step``, and ``rho`` (K,) is the residual at ``x``;
-    otherwise ``x`` is the best iterate.
+    ``moved`` is the size of the prediction that led to ``x``. Returns the number of evaluations of F
+    (negative if no root was found), the number of steps added to ``x``, and the size of the first step
+    relative to the prediction. If a root was found, it is ``x`` + ``step``, and ``rho`` (K,) is the residual
+    at ``x``; otherwise ``x`` is the best iterate.
     """
     before, first = moved, math.inf
     for evaluations in range(1, FOLLOW_STEPS + 1):

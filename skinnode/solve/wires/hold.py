@@ -55,7 +55,7 @@ def within_noise(  # noqa: PLR0913 - arrays of one wire
 
     ``noise`` (K,) is the noise variance of the frame that x was solved from; ``rho``, ``variance`` and
     ``before`` (K,) are scratch. The variance of a held coordinate is the largest of three values: the
-    variance due to that noise, the variance due to the noise of the current frame, and the excess of its
+    variance due to ``noise``, the variance due to the noise of the current frame, and the excess of its
     squared correction over both.
     """
     count, square, weighted, ratios, squares = 0, 0.0, 0.0, 0.0, 0.0

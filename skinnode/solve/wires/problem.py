@@ -72,8 +72,8 @@ class PatchProblem:
     def out_of_reach(self, x: Float) -> NDArray[np.bool_]:
         """Return the wires (U,) with an electrode farther from rest than its clearance at rest.
 
-        F does not change if electrodes are mirrored at the lower layer or if two electrodes swap places. Such
-        roots lie out of reach, because rubber pressed from outside does not move by more than its own
+        F does not change if electrodes are reflected in the lower layer, or if two electrodes swap places.
+        Such roots lie out of reach, because rubber pressed from outside does not move by more than its own
         thickness.
         """
         moved = (x - self.rest).reshape(self.layout.upper_m.shape)

@@ -105,8 +105,8 @@ def njit(function: _F) -> _F:
 def njit_brief(function: _F) -> _F:
     """Compile ``function`` as :func:`njit` does, but hold the interpreter lock while it runs.
 
-    Use this for kernels that take about a microsecond: if the lock were released, another thread could hold
-    it for longer than the rest of the field takes.
+    Use this decorator for kernels that take about a microsecond: if the lock were released, another thread
+    could hold it for longer than the rest of the field takes.
     """
     return _kept(function, nogil=False)
 

@@ -9,7 +9,7 @@ Mechanics, 1985, eqs. 3.18 and 3.75 at z = 0, in our axes)
     ⎢ u_y ⎥  =  ───  ⎢ ν x y/r³             (1−ν)/r + ν y²/r³     (½−ν) y/r² ⎥ ⎢ f_y ⎥
     ⎣ u_z ⎦     2πG  ⎣ −(½−ν) x/r²          −(½−ν) y/r²           (1−ν)/r    ⎦ ⎣ f_z ⎦
 
-This module evaluates this matrix at a point (:func:`point_compliance`), integrated over a rectangle of
+This module evaluates the matrix at a point (:func:`point_compliance`), and integrates it over a rectangle of
 uniform traction (:func:`rectangle_compliance`) or over the pressure under a sphere (:class:`HertzContact`).
 
 The model neglects the finite thickness of the rubber (a bonded layer is stiffer and its displacement decays
@@ -34,9 +34,8 @@ class Rubber:
 
     Args:
         young_pa: Young's modulus, Pa. The default is typical of a soft silicone, about 20 Shore A.
-        poisson: Poisson's ratio. Rubber is nearly incompressible, so the default is 0.5. Normal and
-            tangential loads then do not couple at the surface, and Hertz's theory remains exact under
-            friction.
+        poisson: Poisson's ratio. Rubber is nearly incompressible, so the default is 0.5. At 0.5, normal and
+            tangential loads do not couple at the surface, and Hertz's theory remains exact under friction.
 
     Raises:
         ValueError: If the modulus is not positive and finite or the ratio is outside 0 … 0.5.

@@ -37,7 +37,7 @@ relative_residual_part = njit_body(relative_residual)
 def _inverse_root(square: Lanes) -> Lanes:
     """Return 1 / √``square`` to within 1.5 ulp from 1e-307 to 1e307; NaN for subnormal numbers and inf.
 
-    With e = 1 − square y² the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). Two iterations of this
+    With e = 1 − square y², the result is y (1 + e/2 + 3/8 e² + 5/16 e³ + 35/128 e⁴ …). Two iterations of this
     series without the e⁴ term reduce e from 0.07 to 1e-5 and then below the last bit.
     """
     y = rough_inverse_root(square)

@@ -37,7 +37,7 @@ def require_array(name: str, value: ArrayLike, shape: tuple[int | str, ...], *, 
 
     Args:
         name: Name of the argument, for error messages.
-        value: The value; not copied if it already is such an array.
+        value: The value; not copied if it is already such an array.
         shape: Required shape; a letter stands for any length of at least 1.
         finite: Whether every number must be finite.
 
@@ -233,7 +233,7 @@ class PatchLayout:
 
     @functools.cached_property
     def layout_hash(self) -> int:
-        """CRC-32 of the sizes and all coordinates in nanometres; nodes store it in 0x2000, hosts check it."""
+        """CRC-32 of the sizes and of all coordinates in nm; nodes store it in 0x2000, and hosts check it."""
         sizes = np.array([*self.upper_m.shape, *self.lower_m.shape], dtype="<i8")
         parts = [np.rint(a / _HASH_RESOLUTION_M).astype("<i8") for a in (self.upper_m, self.lower_m)]
         return zlib.crc32(b"".join(a.tobytes() for a in (sizes, *parts)))

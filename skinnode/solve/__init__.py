@@ -1,7 +1,7 @@
 """Solvers that compute displacements from resistances, without buses or threads.
 
-``tracker`` solves a live stream with the method that suits the patch: ``exact`` inverts each wire
-separately, ``posterior`` estimates the whole patch. ``root_gate`` checks doubtful wires of the exact inverse
-with the posterior, using the rules and thresholds in ``roots``. ``paths`` follows a recorded press. All of
-these use ``operators``, ``linalg`` and ``wires``.
+``tracker`` solves a live stream with the method that suits the patch: ``exact`` inverts each wire separately,
+``posterior`` estimates the whole patch. ``root_gate`` checks doubtful wires of the exact inverse with the
+posterior, using the rules and thresholds in ``roots``. ``paths`` follows a recorded press. All these modules
+use ``operators``, ``linalg`` and ``wires``.
 """

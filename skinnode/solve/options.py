@@ -26,7 +26,7 @@ class EstimateOptions:
 
     Args:
         relative_noise: Relative standard deviation of R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
+        baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
         rubber: Material of the skin. Forces are proportional to its modulus; the displacement does not depend
             on it.
         estimate_noise: Whether to estimate a scale factor for ``relative_noise`` from the data.
@@ -39,7 +39,7 @@ class EstimateOptions:
         normal_only: Whether only z is unknown, which leaves a third of the unknowns.
         hold: Whether to keep the last solution of wires whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one step. Wires not solved by
-            then have the status DEADLINE.
+            the deadline have the status DEADLINE.
 
     Raises:
         ValueError: If an option is out of range.

@@ -1,9 +1,9 @@
 """Gate of the exact inverse: finds its doubtful wires and checks them with the posterior.
 
 A wire is doubtful if it has no root, if it jumped, or if its displacement is too rough to be a press. If a
-layout has folds within the reach of a press, every solved wire is doubtful, because F = b then has roots
-nearby that the inverse alone cannot tell apart. The posterior, which uses the neighbouring wires, confirms
-the root of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds are in
+layout has folds within the reach of a press, every solved wire is doubtful, because F = b has nearby roots
+that the inverse alone cannot tell apart. The posterior, which uses the neighbouring wires, confirms the root
+of a doubtful wire, replaces it, or leaves the wire without a root. The thresholds are in
 :mod:`skinnode.solve.roots`.
 """
 

@@ -57,7 +57,7 @@ with h ≥ 1 and for aligned and symmetric layouts, where one wire in 30 ends at
 BLIND: Final = 1e7
 """RMS of ∂x/∂(ln R), in clearances, above which a root is meaningless: electrodes can cross the whole layer
 while R changes only in its seventh digit. Wires on a symmetry line of the layout are blind, because each of
-their roots has a mirror image. The only other blind wires are those 1.5 pitches or more above aligned lower
+their roots has a mirror image. The only other blind wires are those at least 1.5 pitches above aligned lower
 wires."""
 NEARLY_BLIND: Final = 1e5
 """RMS of ∂x/∂(ln R), in clearances, above which a root must be clearly likelier than any other; aligned
@@ -116,8 +116,8 @@ AGREE: Final = 6.0
 NEAR: Final = 0.25
 """Largest first correction of an electrode, in clearances; after a larger correction, annealing is used."""
 FAR: Final = 0.1
-"""Movement of an electrode, in clearances, after which the estimate is compared with one annealed from rest.
-Without the comparison, presses of 0.3 or more crossed folds unnoticed, one frame at a time."""
+"""Movement of an electrode, in clearances, after which the estimate is compared with an estimate annealed
+from rest. Without the comparison, presses of 0.3 or more crossed folds unnoticed, one frame at a time."""
 LIKELIER: Final = 4.0
 """Energy margin by which an estimate from a second annealing must be likelier to replace the first estimate.
 A smaller gain indicates the same maximum, shifted towards the loads found; the wrong maximum observed was
@@ -153,7 +153,7 @@ def nonlinear_in_noise(layout: PatchLayout, relative_noise: ArrayLike, normal_on
 def on_rest_branch(status: Index, branch: Index, rest_branch: Index, out_of_reach: Mask) -> Mask:
     """Return the wires (U,) whose solve reached a root on the branch of the rest position, within reach.
 
-    On this branch the determinant of J has the same sign as at rest. A system with more equations than
+    On this branch, the determinant of J has the same sign as at rest. A system with more equations than
     unknowns has no determinant; the sign is then 0. A root is within reach if no electrode moves farther than
     its clearance from the lower layer (:meth:`skinnode.solve.wires.problem.PatchProblem.out_of_reach`).
 

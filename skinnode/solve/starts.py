@@ -69,7 +69,7 @@ def _follow_noise(  # noqa: PLR0913, C901 - a kernel: arrays and scratch by name
     inner: Float,
     pivot: Index,
 ) -> int:
-    """Take one Gauss-Newton step per noise level in place: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
+    """Take one Gauss-Newton step per noise level, in place: x = rest + C Jᵀ (J C Jᵀ + σ²)⁻¹ y.
 
     Here y = J (x − rest) − r. All arguments after ``noises`` are scratch; ``inner`` is padded with zeros for
     :func:`lu_factor`. Returns the number of evaluations.

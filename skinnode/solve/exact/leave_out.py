@@ -8,11 +8,11 @@ deviation of an omitted coordinate is the smallest movement that χ² would dete
 to first order at rest: √(quantile − degrees of freedom) σ / ‖the coordinate's column of J outside the range
 of the unknowns and of the electrode's other columns‖.
 
-Each option assumes something about the skin, and the standard deviations of the unknowns are valid only if
-its assumption holds. χ² tests the assumption of active_only well, and that of normal_only less well, because
+Each option makes an assumption about the skin, and the standard deviations of the unknowns are valid only if
+the assumption holds. χ² tests the assumption of active_only well, and that of normal_only less well, because
 a smooth shear resembles a gradient of z. On the staggered layout, h = 0.5, noise 1e-5, a strong Hertzian
 press with a shear of 30 % of its depth is rejected; a weaker press is accepted, with errors in z of up to 16
-standard deviations, which is only 0.2 % of h. Allowing for this would cost more than solving for the shear.
+standard deviations (only 0.2 % of h). Allowing for these errors would cost more than solving for the shear.
 """
 
 from __future__ import annotations

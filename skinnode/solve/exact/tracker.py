@@ -35,7 +35,7 @@ from skinnode.solve.wires.solve_wires import COVARIANCE_UNITS
 from skinnode.solve.wires.stages import DEADLINE
 
 UNIT_S: Final = 10e-6
-"""Maximum time of one evaluation of F and J with its step, s. Each call solves as many wires as are certain
+"""Maximum time for one evaluation of F and J with its step, s. Each call solves as many wires as are certain
 to fit into the remaining time, because splitting one call into ten takes as much extra time as solving ten
 wires."""
 WIRE_UNITS: Final = FRAME_STEPS + 1 + COVARIANCE_UNITS
@@ -51,12 +51,12 @@ class ExactTracker:
         layout: The patch, with K ≥ 3N, or K ≥ N if ``normal_only``.
         operator: ``levenberg_marquardt``, ``dogleg`` or ``gauss_newton``.
         relative_noise: Relative standard deviation of R, a number or (U, K).
-        baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
+        baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
         stiffness_n_per_m: Stiffness k of the paper's law F = k Δs, N/m; if given, fields contain forces.
         hold: Whether to keep the position of a wire whose resistances changed no more than their noise.
         deadline_us: Time limit of an update, µs; the update may exceed it by one solve of a wire. Wires not
-            processed by then have the status DEADLINE and an infinite standard deviation; they are processed
-            first in the next frame.
+            processed by the deadline have the status DEADLINE and an infinite standard deviation; they are
+            processed first in the next frame.
         normal_only: Whether only z is unknown.
         active_only: Whether to solve only for electrodes that contacts move.
         codes: Mapping from the codes passed to :meth:`update_codes` to resistances.

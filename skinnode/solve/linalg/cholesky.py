@@ -4,8 +4,8 @@ LAPACK is not used because the last bits of OpenBLAS results depend on its numbe
 must give equal fields. Here each element of a result is a single sum in index order, which neither the number
 of threads nor a split of the columns changes.
 
-All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs,
-which takes 8 loads per 12 multiply-adds (Goto & van de Geijn, Anatomy of high-performance matrix
+All kernels share one loop: a tile of 6 rows and 2 vectors of the result stays in registers while k runs, so
+that 12 multiply-adds need only 8 loads (Goto & van de Geijn, Anatomy of high-performance matrix
 multiplication, 2008). Arrays are C-ordered float64; buffers may be larger than the problem, in which case the
 leading n rows and columns are used. Nothing is allocated.
 """

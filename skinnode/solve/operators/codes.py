@@ -32,7 +32,7 @@ ROOT_SHARE: Final = EPS ** (1 / 2)
 MINIMUM_SHARE: Final = EPS ** (1 / 3)
 """Maximum error estimate of a minimum, relative to max(1, ‖x‖∞): ‖r‖² determines x no better than to √eps."""
 STATIONARY: Final = 1e-6
-"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that counts as zero: r² is then flat to within rounding, about
-√eps."""
+"""Maximum gradient, relative to ‖J_j‖ ‖r‖, that counts as zero: below it, r² is flat to within rounding,
+about √eps."""
 STALL_LIMIT: Final = 30
 """Maximum number of steps that a tall system may take to settle x while ‖r‖² changes only by rounding."""

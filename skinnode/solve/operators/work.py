@@ -57,7 +57,7 @@ class Work(NamedTuple):
     lu: Annotated[Float, "n+3 lanes_n"]
     """LU factors of Jᵀ if the system is square; rows are padded to whole lanes."""
     qr: Annotated[Float, "m n"]
-    """QR factors of J if it is tall."""
+    """QR factors of J if the system is tall."""
     right: Annotated[Float, "n+3 lanes_m"]
     """Reflectors of the bidiagonal form from the right."""
     left: Annotated[Float, "n lanes_n+3"]

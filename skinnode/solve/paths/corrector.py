@@ -1,6 +1,6 @@
 """Corrector of a path tracker: solves wires at positions on a path and logs the cost of each call.
 
-Positions count samples from 0; the rest position is −1. Between two samples ``a`` is interpolated linearly.
+Positions count samples from 0; the rest position is −1. Between two samples, ``a`` is interpolated linearly.
 (Interpolating 1/a or log a makes no difference: with layers 0.3 to 1 pitch apart and presses of up to 70 %,
 the numbers of lost wires differ by no more than their scatter.)
 """

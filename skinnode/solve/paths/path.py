@@ -96,7 +96,7 @@ def solve_path(
         samples_ohm: (T, U, K) resistances, ohm, in time order; the last sample is the frame to solve.
         operator: ``dogleg``, ``levenberg_marquardt`` or ``gauss_newton``.
         schedule: Step control: ``Uniform()`` by default, ``Periodic()`` or ``Adaptive()``.
-        baseline_ohm: (U, K) resistances measured at rest, ohm; resistivity and gain then cancel.
+        baseline_ohm: (U, K) resistances measured at rest, ohm; if given, resistivity and gain cancel.
 
     Returns:
         Positions at the last sample, a status for each wire, and the cost.

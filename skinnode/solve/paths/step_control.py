@@ -29,8 +29,8 @@ GROW: Final = 4.0
 SHORTEST: Final = 1 / 64
 """Shortest step as a fraction of the path; at a fold, halving would otherwise never end."""
 ADAPTIVE_POINT: Final = Accuracy(tolerance=1e-9, max_steps=6)
-"""Accuracy of an intermediate point: below √eps a root is accurate enough to keep its ∂X/∂R, and Newton's
-method takes 5 steps from a contraction ratio of 1/2 to 1e-9."""
+"""Accuracy of an intermediate point: below √eps, a root is accurate enough for its ∂X/∂R to be kept, and
+Newton's method takes 5 steps from a contraction ratio of 1/2 to 1e-9."""
 
 
 class Schedule(Protocol):
@@ -92,7 +92,7 @@ class Uniform:
 class Periodic:
     """Schedule that solves one sample per cycle T (section 5.2).
 
-    Between two solves the tracked point stays within the relaxed tolerance, so the skipped samples add no
+    Between two solves, the tracked point stays within the relaxed tolerance, so the skipped samples add no
     information.
 
     The cycle is determined from the samples themselves. The samples are followed from the rest position with

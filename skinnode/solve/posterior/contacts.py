@@ -28,7 +28,8 @@ SIGNIFICANT: Final = 5.0
 """Significance, in standard deviations, above which a sum is part of a contact; with 200 sums per frame,
 noise reaches it about once in ten thousand frames."""
 RELEVANT: Final = 0.25
-"""Fraction of the largest sum that another sum must exceed; ringing next to a contact reaches a tenth."""
+"""Fraction of the largest sum that another sum must exceed; ringing next to a contact reaches a tenth of the
+largest sum."""
 HERTZ_SPREAD: Final = 2.5
 """Ratio of a² to the mean of r² under Hertz's pressure √(1 − r²/a²)."""
 

@@ -55,7 +55,7 @@ class Gate:
         self._kept[:] = 0
 
     def next_frame(self) -> None:
-        """Count one frame for the kept wires."""
+        """Count down the frames left for the kept wires."""
         self._kept -= self._kept > 0
 
     def keep(self, wires: Index) -> None:
@@ -81,7 +81,7 @@ class Gate:
         Args:
             fit: Misfit of the rest position.
             count: (U,) usable resistances of each wire.
-            members: Wires in the last estimate; a lower limit applies to them.
+            members: Wires in the last estimate; a lower threshold applies to them.
         """
         touched = self.moved(fit, count)
         stay = np.zeros(len(touched), bool)
@@ -97,7 +97,7 @@ class Gate:
 
 
 def chi_squared_limits(most: int, chance: float) -> Float:
-    """Return the χ² (most + 1,) that 0, 1, … degrees of freedom exceed with probability ``chance``."""
+    """Return the χ² (most + 1,) exceeded with probability ``chance`` at 0, 1, … degrees of freedom."""
     from scipy.special import chdtri
 
     return np.concatenate([[1e-300], chdtri(np.arange(1.0, most + 1.0), chance)])

@@ -1,6 +1,6 @@
 """Hyperparameters of the posterior: scale s of the prior, expected load locations, and noise.
 
-All are set from the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
+All hyperparameters are set from the evidence of the frames (MacKay, Neural Computation 4, 415, 1992).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Prior of the loads on a patch and of the displacement caused by them.
 
 At first, equal loads are expected over the whole patch, at one scale s². Once loads are found, the prior
-expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin next to a contact
-moves only as far as the loads of the contact require. Compared with one scale for the whole patch, this
+expects loads there and hardly any elsewhere (:meth:`LoadPrior.localise`), so the skin next to a contact moves
+only as far as the loads of the contact require. Compared with one scale for the whole patch, localisation
 reduces the error by a factor of two to three, and the error of a narrow contact no longer exceeds the
 reported standard deviation.
 """

@@ -4,9 +4,9 @@ chord     starts at the last field with the factors of an older frame; typically
           and J
 newton    refactorises at the current field, then takes chord steps
 anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
-          its true value. At high noise the posterior has a single maximum, near that of the prior, and
-          following it as the noise decreases leads to the correct maximum. Annealing solves presses of 70 %
-          of the layer between two frames, on layouts where the exact inverse fails even if it follows the
+          its true value. At high noise, the posterior has a single maximum, near that of the prior; following
+          this maximum as the noise decreases leads to the correct one. Annealing solves presses of 70 % of
+          the layer between two frames, on layouts where the exact inverse fails even if it follows the
           samples of the press.
 """
 
@@ -43,8 +43,8 @@ CHORD_RATE: Final = 0.35
 """Contraction ratio of chord steps above which refactorising is cheaper; a factorisation costs as much as ten
 chord steps."""
 NEWTONS: Final = 12
-"""Maximum number of factorisations of a solve that starts near the maximum; it typically needs one or two, or
-more if full steps would cycle."""
+"""Maximum number of factorisations of a solve that starts near the maximum; such a solve typically needs one
+or two, but more if full steps would cycle."""
 HALVINGS: Final = 6
 """Maximum number of halvings of a Gauss-Newton step."""
 PRIOR_DOUBT: Final = 3.0

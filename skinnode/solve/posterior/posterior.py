@@ -181,7 +181,7 @@ class Posterior:
         self._until = until
 
     def covariance_m2(self) -> Float:
-        """Return the covariance of the last frame's displacement, from its factors.
+        """Return the covariance of the last frame's displacement, from that frame's factors.
 
         The covariance does not include the allowance for errors of the prior (``PRIOR_DOUBT``).
 

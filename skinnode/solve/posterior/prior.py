@@ -32,9 +32,9 @@ MARGIN: Final = 2
 Hertz presses, on the patch or half outside it, by less than 1 in 800."""
 SHEAR_SHARE: Final = 0.4
 """Ratio of the standard deviations of shear and normal loads; a contact that slides with a friction
-coefficient of 0.6 is at 1.5 standard deviations. The evidence changes by 2 % between ratios of 0.25 and 0.4.
-With smaller ratios, layouts that are insensitive to shear (`aligned`) report standard deviations that are too
-small."""
+coefficient of 0.6 has a shear of 1.5 standard deviations. The evidence changes by 2 % between ratios of 0.25
+and 0.4. With smaller ratios, layouts that are insensitive to shear (`aligned`) report standard deviations
+that are too small."""
 SLACK: Final = 0.005
 """Ratio of ε to the standard deviation of the normal displacement; keeps C regular. Values from 0.001 to 0.02
 give the same results."""

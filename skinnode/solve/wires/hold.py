@@ -1,15 +1,15 @@
 """Compiled test of whether a wire can be held because its resistances changed no more than their noise.
 
 The residual ρ_k = a_k F_k(x) − 1 at the last position is known from the last solve, without evaluating F
-again. It is within noise if Σ (ρ_k/σ_k)² is below its 99 % quantile. ρ contains the noise of the new frame,
-with variance σ², and the error of x, which is due to the noise of the frame that x was solved from, with
-variance s², and lies in the n directions of the range of J. With t = s²/σ², the sum has the mean K + n t, and
-half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, t = 0). The quantile is that
-of the c χ²_ν with the same mean and variance (Satterthwaite 1946).
+again. The residual is within noise if Σ (ρ_k/σ_k)² is below its 99 % quantile. ρ contains the noise of the
+new frame, with variance σ², and the error of x, which is due to the noise of the frame that x was solved
+from, with variance s², and lies in the n directions of the range of J. With t = s²/σ², the sum has the mean K
++ n t, and half its variance is K + 2 n t + n t² (2 χ²_K for a square system, χ²_K at rest, where t = 0). The
+quantile is that of a scaled distribution c χ²_ν with the same mean and variance (Satterthwaite 1946).
 
 A slow movement may go unnoticed in this sum, especially along the worst-determined of the K directions of a
 wire. The variance of a held coordinate allows for such a movement: its correction c = Σ_k (∂x_j/∂r_k) ρ_k
-contains the movement and the noise of both frames, and the excess of c² over that noise is a lower limit of
+contains the movement and the noise of both frames, and the excess of c² over that noise is a lower bound on
 the variance. Measured coverage of the 95 % intervals (staggered layout, h = 0.5, noise 1e-5): 98 % for
 unmoved wires (99 % of the frames held), 97 % for a press that grows by 5 % of h in 100 to 1600 frames, and 96
 % for a movement by 40 standard deviations along the worst-determined direction in 200 or 800 frames (86 %

@@ -1,8 +1,8 @@
 """Buffers of one patch, and the single compiled call that reads and writes them.
 
-Each frame needs work before and after its solve (see ``decode`` and ``stages``). One call does all of it,
-because a call from Python, with arguments to check and unpack, costs more than any of these steps, especially
-with cold caches.
+Each frame needs work before and after its solve (see ``decode`` and ``stages``). One call does all this work,
+because a call from Python, whose arguments must be checked and unpacked, costs more than any of these steps,
+especially with cold caches.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Lengths are in pitches, and residuals are relative: r_k = w_k (a_k F_k − 1) with a_k = R_k / (R₀ F₀)_k. A
 residual is therefore a fraction of a resistance, regardless of the rubber and the size of the patch. If the
 rest resistances R₀ were measured, the resistivity and the gain of the front end cancel; otherwise R₀ F₀ is
-the layout's resistivity. The weights w_k = σ_min / σ_k account for noise that differs between equations
-(solving a tall system then minimises χ²); a weight of 0 drops an equation.
+the layout's resistivity. The weights w_k = σ_min / σ_k account for noise that differs between equations (so
+that solving a tall system minimises χ²); a weight of 0 drops an equation.
 """
 
 from __future__ import annotations

@@ -201,8 +201,8 @@ def solve_wires(  # noqa: PLR0913 - what changes from call to call
         units: Time allowed, in evaluations of F and J with their step. The call ends before the first wire
             that may need more than the remaining time.
 
-    Returns the estimated time spent, in the same units. A wire with fewer equations than unknowns keeps its x
-    and is ILL_CONDITIONED, or NON_FINITE if a weight was set to 0.
+    Returns the estimated time spent, in the same unit as ``units``. A wire with fewer equations than unknowns
+    keeps its x and is ILL_CONDITIONED, or NON_FINITE if a weight was set to 0.
     """
     spent, worst = 0.0, options.max_steps + 1 + COVARIANCE_UNITS
     for u in order:

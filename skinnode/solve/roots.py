@@ -89,13 +89,13 @@ SAME_ROOT: Final = 1e-3
 """Distance between two solutions, relative to the displacement, up to which they count as the same root."""
 TWIN_REACH: Final = 2.0
 """Largest distance at which a twin root is worth solving for, relative to the wire's largest displacement.
-Twins farther away were at least 1.3 times as rough on the staggered layout, h = 0.3 to 1."""
+Twins farther away were at least 1.3 times as rough as the root on the staggered layout, h = 0.3 to 1."""
 TWIN_ROUGHNESS: Final = 1.05
 """Ratio between the roughnesses of two roots at a fold above which the smoother root is accepted. Over 82
 random presses of 50 % on the staggered layout, h = 1, the twins of wrong roots were at most 1.044 times as
-rough. Of 100 correct roots, 4 have a twin within the ratio and lose the status CONVERGED. In 60 further
-presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was reported as CONVERGED; in
-another 40 (4510 wires), one was."""
+rough as those roots. Of 100 correct roots, 4 have a twin within the ratio and lose the status CONVERGED. In
+60 further presses of each depth and height (6710 wires, h = 0.3 to 1), no wrong root was reported as
+CONVERGED; in another 40 (4510 wires), one was."""
 UNLIKELY: Final = 4.0
 """Energy margin by which all other roots must be less likely than the accepted root. In 1530 pairs of roots
 from presses of 30 to 70 % on the staggered layout, h = 1, and the aligned layout, h = 0.5, the wrong root was

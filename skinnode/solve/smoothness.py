@@ -1,9 +1,9 @@
 """Gaussian covariance of the displacement of one upper wire, a model of the smoothness of rubber.
 
 C_ij = s² exp(−d_ij² / 2ℓ²) for each coordinate, where d is the distance between two electrodes at rest. This
-assumption is weaker than elasticity of the patch and needs no material constant. It provides starting points
-for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the smaller roughness
-√(uᵀ C⁻¹ u) is likelier.
+assumption is weaker than elasticity of the patch and needs no material constant. The covariance provides
+starting points for solves (:mod:`skinnode.solve.starts`) and ranks two roots of one wire: the root with the
+smaller roughness √(uᵀ C⁻¹ u) is likelier.
 """
 
 from __future__ import annotations

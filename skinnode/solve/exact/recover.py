@@ -3,7 +3,7 @@
 bridge     interpolates R from the last trusted frame to the new frame and solves each substep
 restart    bridges from the rest position
 give up    keeps the last trusted position of a wire that still fails, with an infinite standard deviation and
-           a status
+           a status other than CONVERGED
 """
 
 from __future__ import annotations

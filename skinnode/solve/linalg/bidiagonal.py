@@ -1,7 +1,7 @@
-"""Bidiagonal form of a small matrix, in which damped steps are cheap for any damping.
+"""Bidiagonal form of a small matrix, in which damped steps are cheap for any damping parameter.
 
-Levenberg-Marquardt tries several dampings per Jacobian. Each damping costs O(n) operations here, but O(n³)
-with J itself.
+Levenberg-Marquardt tries several damping parameters per Jacobian. Each trial costs O(n) operations here, but
+O(n³) with J itself.
 """
 
 from __future__ import annotations

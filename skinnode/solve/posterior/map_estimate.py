@@ -6,8 +6,8 @@ newton    refactorises at the current field, then takes chord steps
 anneal    starts at the rest position with an assumed noise of 3 %, which is divided by four until it reaches
           its true value. At high noise, the posterior has a single maximum, near that of the prior; following
           this maximum as the noise decreases leads to the correct one. Annealing solves presses of 70 % of
-          the layer between two frames, on layouts where the exact inverse fails even if it follows the
-          samples of the press.
+          the layer between two frames, on layouts where the exact inverse fails even when it follows the
+          press sample by sample.
 """
 
 from __future__ import annotations

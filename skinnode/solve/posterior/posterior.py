@@ -320,7 +320,7 @@ class Posterior:
         estimator.moved[:] = self._trusted
         estimator.g[:] = self._trusted_g
         self._annealed = False
-        hurry = self._seconds < math.inf  # annealing takes as long as several frames
+        hurry = self._seconds < math.inf  # annealing takes as long as solving several frames
         if (self._known or hurry) and estimator.track(observation, members):
             gone = float(np.abs(estimator.moved - self._compared).max())
             far = gone >= self._far or self._beyond_prior(observation, roots.SUSPICIOUS)

@@ -3,5 +3,5 @@
 ``problem`` scales a patch to dimensionless systems, ``arrays`` declares the arrays that kernels read and
 write, ``decode`` converts the codes of a frame, ``solve_wires`` solves the wires one by one with ``hold``,
 ``follow`` and ``correct``, ``stages`` does the remaining work on a frame, and ``patch_solver`` combines all
-of this in one call. ``root_check`` finds roots that may be wrong.
+these steps in one call. ``root_check`` finds roots that may be wrong.
 """

@@ -22,7 +22,7 @@ A_MAX: Final = 1e12
 def decode(frame: FrameArrays) -> int:
     """Write ``ohm``, ``noise`` and ``valid`` from ``codes``; NaN for an invalid code.
 
-    The noise combines the noise of the front end with the error due to rounding to codes. Returns the number
+    ``noise`` combines the noise of the front end with the error due to rounding to codes. Returns the number
     of invalid codes.
     """
     codes, baseline, gain = frame.codes, frame.baseline_ohm, frame.code_gain

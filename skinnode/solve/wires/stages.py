@@ -104,7 +104,7 @@ def store(solver: SolverArrays, frame: FrameArrays) -> bool:
     """Store position, a and weights of the solved wires; write the outcome of all wires.
 
     The outcome is the displacement, its standard deviation and whether the wire was held. Returns whether a
-    solved wire had an equation without weight, whose ``a`` is therefore still unknown.
+    solved wire had an equation of zero weight, whose ``a`` is therefore still unknown.
     """
     report, good = solver.report, frame.good
     solved_x, solved_a, solved_std = solver.x, solver.a_solved, solver.std

@@ -5,7 +5,7 @@
     SkinError
      ├ ConfigError(ValueError)     names the key, the value found and the values allowed
      │  ├ ProfileError             an EDS contradicts itself or the profile
-     │  └ BusLoadError             a plan needs more bus load than available
+     │  └ BusLoadError             a plan needs more bus load than is available
      ├ BusError                    a CAN interface fails to open, send or receive
      │  └ NodeError                a node misbehaves
      │     ├ NodeTimeout(TimeoutError)
@@ -37,7 +37,7 @@ class Shown(str):
 
 
 NOTHING: Final = Shown("nothing")
-"""Value shown in a message if the key is missing."""
+"""Value shown in a message when the key is missing."""
 
 _MOST_SHOWN: Final = 240
 
@@ -76,7 +76,7 @@ class BusLoadError(ConfigError):
 
 
 class BusError(SkinError):
-    """Failure of a CAN interface to open, send or receive; raised ``from`` the python-can error."""
+    """Failure to open a CAN interface, or to send or receive on it; raised ``from`` the python-can error."""
 
 
 class NodeError(BusError):

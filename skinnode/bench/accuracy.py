@@ -15,15 +15,14 @@ from skinnode.text.json_values import plain
 RATIO_LIMIT: Final = 1.15
 COVERAGE_LIMITS: Final = (0.90, 0.98)
 ERROR_LIMITS: Final = {"staggered": 0.03, "aligned": 0.10}
-"""Maximum error of the posterior by layout, for a press 0.1 heights deep at h = 0.5 and a relative noise of
-1e-5."""
+"""Maximum error of the posterior on each layout, for a 10 % press at h = 0.5 and a relative noise of 1e-5."""
 SCENES_A_CELL: Final = 25
-"""Divisor of the number of scenes for a cell of the noise and code tables; a cell has at least 3 scenes. The
-RMS of each scene already covers 300 coordinates."""
+"""Number of scenes per coverage row divided by that per cell of the noise and code tables (at least 3). The
+RMS over a single scene already covers 300 coordinates."""
 
 
 def run(scenes: int, rounds: int) -> dict[str, Any]:
-    """Return the figures of the benchmark.
+    """Run the benchmark and return its figures.
 
     Args:
         scenes: Number of random scenes for each row of the coverage table.
@@ -48,9 +47,9 @@ def run(scenes: int, rounds: int) -> dict[str, Any]:
 
 
 def requirements(figures: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each requirement: its name, the figure, the limit as text, and whether it is met.
+    """Return a row for each requirement: name, figure, limit as text, and whether the figure meets the limit.
 
-    A time requirement is ``absolute``: it depends on the machine, so missing it is not a failure.
+    A time requirement is ``absolute``: it depends on the machine, so failing to meet it is not an error.
     """
     found = []
     for row in figures["noise"]:
@@ -99,7 +98,7 @@ def print_all(figures: dict[str, Any], echo: Callable[[str], object]) -> None:
 
 
 def _text(value: float | None) -> str:
-    """Return a fraction as a percentage, whatever its size, to use the same unit throughout a column."""
+    """Return a fraction as a percentage, whatever its size, so that a whole column has one unit."""
     return "-" if value is None else f"{100.0 * value:.3g}%"
 
 
@@ -118,7 +117,7 @@ def _print_front(panels: list[dict[str, Any]], echo: Callable[[str], object]) ->
 
 
 def best_of_each(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each solver's fastest row that reaches the accuracy, or its most accurate row; fastest first."""
+    """Return each solver's fastest row that reaches the accuracy or, if none does, its most accurate row."""
 
     def rank(row: dict[str, Any]) -> tuple[bool, float]:
         error = float("inf") if row["error"] is None else row["error"]

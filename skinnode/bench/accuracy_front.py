@@ -1,9 +1,9 @@
 """Error against time for a few wires: our solvers next to their peers on the same compiled F and J.
 
 The most deeply pressed wires of the patch are used; the samples of the press contain no noise. Every solver
-starts from rest. It solves either the last sample alone or all samples in turn, each from the solution of the
-previous sample, as in the paper. Each solver runs at several tolerances and gives one point per tolerance.
-The time of ``solve_path`` includes steps that the bare operators omit: setting up the patch, following the
+starts from rest. It solves either the last sample alone or, as in the paper, all samples in turn, each from
+the solution of the previous sample. Each solver runs at several tolerances and gives one point per tolerance.
+The time of ``solve_path`` includes work that the bare operators omit: setting up the patch, following the
 branch, estimating the error.
 """
 
@@ -33,11 +33,11 @@ intermediate samples, and the paper's own layout."""
 TOLERANCES: Final = (1e-4, 1e-7, 1e-10, 1e-13)
 SAMPLES: Final = (1, 5, 10, 20)
 SOLVED: Final = 0.01
-"""Maximum error, relative to the displacement, at which a result counts as solved and is drawn."""
+"""Maximum error, relative to the displacement, of a result that counts as solved and is drawn."""
 ROUNDING: Final = 1e-11
 """Error below which results count as equal: rounding error in F, amplified by the condition number of J."""
 LOOSE: Final = 1e-6
-"""Tolerance at all samples before the last, as in the paper."""
+"""Tolerance for all samples before the last, as in the paper."""
 REPEATS: Final = 7
 LONG_S: Final = 0.1
 
@@ -76,7 +76,7 @@ def scene_of(name: str, height: float, depth: float) -> Scene:
 
 
 def _timed_us(call: Callable[[], object]) -> float:
-    """Return the shortest time of a few calls (fewer if calls are slow): other programs can only add time."""
+    """Return the shortest of a few call times (fewer if calls are slow): other programs can only add time."""
     times: list[float] = []
     while len(times) < REPEATS and sum(times) < LONG_S:
         start = time.perf_counter()
@@ -115,7 +115,7 @@ def _bare(scene: Scene, solve: Solve, samples: int, tolerance: float) -> tuple[f
 
 
 def pareto(rows: list[dict[str, Any]]) -> list[int]:
-    """Return the indices of the solved rows that no other row beats in both time and error, fastest first."""
+    """Return the indices of the solved rows on the Pareto front of time and error, fastest first."""
     front: list[int] = []
     best = SOLVED
     for index in sorted(range(len(rows)), key=lambda i: (rows[i]["us"], rows[i]["error"])):
@@ -127,7 +127,7 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 
 def run() -> list[dict[str, Any]]:
-    """Return the rows of one scatter plot per scene, with time, error, and whether each is on the front."""
+    """Return the rows of one scatter plot per scene: time, error, and whether the row is on the front."""
     panels = []
     for setting in SCENES:
         scene = scene_of(*setting)

@@ -45,7 +45,7 @@ PROTOTYPE: Final = {
     ("aligned", 0.5): {"exact": {1e-5: 2.71}, "posterior": {4e-6: 0.05, 1e-5: 0.06, 1e-4: 0.20, 1e-3: 0.38}},
     ("aligned", 1.0): {"exact": {1e-5: 73.0}, "posterior": {4e-6: 0.14, 1e-5: 0.18, 1e-4: 0.24, 1e-3: 0.38}},
 }
-"""RMS errors of the prototype in a 10 % press with shear by one Hertz-like indenter."""
+"""RMS errors of the prototype for a 10 % press with shear by a single Hertz-like indenter."""
 
 
 @dataclass
@@ -229,7 +229,7 @@ class Follower:
 
 
 def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
-    """Yield presses to a tenth of the height, the same for all converters and for layouts of equal height."""
+    """Yield streams of 10 % presses: the same presses for all converters and layouts of equal height."""
     for seed in range(scenes):
         rng = np.random.default_rng([seed, 10])
         press = pad_press(rng, case.skin.layout, 0.1)
@@ -237,9 +237,9 @@ def _streams(case: Case, converter: Converter, scenes: int) -> Iterable[Stream]:
 
 
 def pad_press(rng: np.random.Generator, layout: PatchLayout, depth: float) -> Press:
-    """Return a press by a fingertip-sized body, with a contact radius of 1.5 to 2.5 pitches at full depth.
+    """Return a press by a body the size of a fingertip: contact radius 1.5 to 2.5 pitches at full depth.
 
-    The press displaces the skin as much as the prototype's indenter does: their Cramér-Rao bounds agree (see
+    It displaces the skin as much as the prototype's indenter does: the two Cramér-Rao bounds agree (see
     PROTOTYPE).
     """
     press = random_press(rng, layout, depth)
@@ -294,7 +294,7 @@ COVERAGE: Final = (
 
 
 def _random_scene(rng: np.random.Generator, layout: PatchLayout) -> tuple[Press, ...]:
-    """Return one sharp or blunt body or, in three scenes out of ten, two bodies in different halves."""
+    """Return one sharp or blunt body or, in three scenes out of ten, one body in each half of the patch."""
     depth = rng.uniform(0.05, 0.3, 2)
     if rng.random() >= 0.3:
         if rng.random() < 0.5:
@@ -316,7 +316,7 @@ def coverage(scenes: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Solve random scenes.
 
     Returns:
-        One row per layout, noise and method, with forces if there are any; and the posterior's errors in all
+        One row per layout, noise and method, with forces for the posterior; and the posterior's errors in all
         scenes, grouped by the prior's fraction of the variance.
     """
     rows, parts = [], Parts()

@@ -22,9 +22,9 @@ LIMITS_US: Final = {"exact": 500.0, "posterior, full frame": 5000.0, f"posterior
 
 
 class Cycle:
-    """A press down and up again, solved frame by frame.
+    """A press and its release, solved frame by frame.
 
-    Every call solves all frames of the cycle, so that no turn covers only cheap frames.
+    Every call solves all frames of the cycle, so that no call times only cheap frames.
 
     Args:
         solver: Solver to measure.
@@ -49,7 +49,7 @@ class Cycle:
 
 
 def _frames(skin: Skin, press: Press, sigma: float) -> Float:
-    """Return a press that deepens from half to full depth."""
+    """Return a press that goes from half to full depth."""
     shares = np.linspace(0.5, 1.0, FRAMES)
     return stream(skin, (press,), shares, Converter(sigma=sigma), np.random.default_rng(5)).frames_ohm
 

@@ -8,8 +8,8 @@
  6 noise and code widths                     13 the wrong model
  7 open, shorted, missing, saturated
 
-A case consists of the patch as the solver knows it, the options that an informed user would set, and, for
-every seed, a stream of frames with its truth.
+A case consists of the patch as the solver knows it, the options that an informed user would set and, for
+every seed, a stream of frames with the truth.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ PATHS: Final = ("path gauss_newton", "path levenberg_marquardt", "path dogleg", 
 TRACKERS: Final = ("exact", "posterior", "auto")
 PITCH_M: Final = 4e-3
 FINE: Final = Converter(sigma=1e-5)
-"""Noise roughly equal to that of a 16-bit converter."""
+"""Converter with roughly the noise of a 16-bit converter."""
 STRIDE: Final = 4
 """Number of path samples per tracker frame."""
 DRIFT: Final = 0.02
 MODEL_ERROR: Final = 0.05
-"""Relative error in the change in R predicted by the wrong models of case 13. Measured on a 30 % press,
+"""Relative error of the wrong models of case 13 in predicting the change in R. Measured on a 30 % press,
 staggered, h = 0.5: ‖ΔR‖ is off by 2.2 to 5 %; for a single pair of wires, the change is off by 1 to 5 % in
 the median and by 7 % at worst."""
 
@@ -52,11 +52,11 @@ class Case:
     stride: int = 1
     """Number of stream frames per tracker frame; a path uses all frames."""
     model_error: float = 0.0
-    """Relative error in the change in R that the user expects from the model."""
+    """Relative error that the user expects the model to make in predicting the change in R."""
 
 
 def preset(name: str, height: float) -> PatchLayout:
-    """Return a preset of 10 × 10 electrodes; ``height`` in pitches."""
+    """Return a preset of 10 × 10 electrodes with a height of ``height`` pitches."""
     return PatchLayout.preset(name, pitch_m=PITCH_M, height_m=height * PITCH_M)
 
 
@@ -87,9 +87,10 @@ def pressing(  # noqa: PLR0913 - one argument per way to change a stream
         depth: Depth of the press in heights.
         converter: Converter that reads the resistances.
         shares: Fractions (T,) of the depth, one per frame.
-        spoil: Returns a modified stream.
-        gain: Returns factors that scale the resistances, (T, U, K) or broadcastable to that shape.
-        presses: Returns the presses that replace the single random press.
+        spoil: Function that returns a modified stream.
+        gain: Function that returns factors that scale the resistances, (T, U, K) or broadcastable to that
+            shape.
+        presses: Function that returns the presses that replace the single random press.
     """
 
     def make(rng: np.random.Generator) -> Stream:
@@ -232,7 +233,7 @@ def _open_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
 
 
 def _shorted_lower(rng: np.random.Generator, taken: Stream, skin: Skin) -> Stream:
-    """Short a lower wire to 0 ohm without marking it invalid."""
+    """Short a lower wire to 0 ohm without marking its resistances invalid."""
     frames, k = taken.frames_ohm.copy(), rng.integers(skin.layout.shape[1])
     frames[2:5, :, k] = 0.0
     return _spoilt(taken, frames, taken.valid)
@@ -448,7 +449,7 @@ def _shapes() -> Iterator[Case]:
 
     yield Case(12, "fingertip, 30%", tip, pressing(tip, 0.3, FINE, shares, presses=on_tip))
     for lower, depth in ((3, 0.1), (6, 0.3)):
-        # with one electrode per wire there is no pitch along the wire, so the patch is a narrow line
+        # with one electrode per wire there is no pitch along the wire: the patch is a narrow line
         layout = PatchLayout.preset("staggered", upper_electrodes=1, lower_wires=lower)
         skin = Skin(layout)
 

@@ -1,8 +1,8 @@
-"""Dense kernels compared with LAPACK, in a process in which LAPACK, like our kernels, uses one thread.
+"""Dense kernels compared with LAPACK, in a process that limits LAPACK to one thread: our kernels use one.
 
 LAPACK's worker threads keep spinning for a while after each call. If they share a core with the next
-candidate, that candidate takes up to three times as long, and the threads wait for each other while the
-machine is busy.
+candidate, that candidate takes up to three times as long; on a busy machine the threads also wait for each
+other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ONE_THREAD: Final = {
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Return the rows of the benchmark, µs per call."""
+    """Return the rows of the benchmark, with times in µs per call."""
     command = [sys.executable, "-m", "skinnode.bench.dense_kernels", str(rounds)]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, check=True)
     rows: list[dict[str, Any]] = json.loads(done.stdout)
@@ -36,7 +36,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
 def dense_pairs() -> dict[str, dict[str, Callable[[], object]]]:
     """Return the dense kernels and their LAPACK peers, for the 300 unknowns of ten wires of ten electrodes.
 
-    Each uses its own axis order and works in place on buffers that are refilled before every call.
+    Each candidate uses its own axis order and works in place on buffers that are refilled before every call.
     """
     from scipy.linalg import blas, lapack
 

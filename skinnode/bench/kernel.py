@@ -1,7 +1,7 @@
 """The compiled kernels compared with NumPy and LAPACK.
 
-The benchmark measures F + J and one step of each operator, for one wire of the reference patch, and the dense
-kernels at the size of the patch's posterior.
+The benchmark measures F + J and one step of each operator for one wire of the reference patch, and the dense
+kernels at the size used by the patch's posterior.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skinnode.solve.operators.work import LIMIT, Work, workspace
 from skinnode.solve.wires.problem import PatchProblem
 
 SHORT: Final = 1e-3
-"""Trust radius, pitches per coordinate: far below a Newton step, so that every operator must search."""
+"""Trust radius, pitches per coordinate: far smaller than a Newton step, so every operator must search."""
 
 
 class NumpyWire:
@@ -133,7 +133,7 @@ def compiled_steps(  # noqa: PLR0913 - a kernel takes its buffers
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Return the figures of the benchmark: µs per wire (dense kernels: per call) and ratios to ours."""
+    """Run the benchmark and return µs per wire (dense kernels: per call) and ratios to our kernels."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     rng = np.random.default_rng(1)

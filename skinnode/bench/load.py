@@ -3,7 +3,7 @@
 The nodes are those of ``skinnode node``, measuring the simulator's patches. In simulated time their frames
 cross a bus with CAN arbitration: whenever the bus is free, the waiting frame with the lowest identifier is
 sent and occupies the bus for the duration of its bits, stuff bits included. This file may import the
-simulator, as the demo may, because frames made with the solver's own assumptions would prove nothing.
+simulator, as the demo may, because frames generated from the solver's own assumptions would prove nothing.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from vcan_sim.scene import Scene
 from vcan_sim.sensor import SimulatedPatch
 
 TICK_S: Final = 0.25e-3
-"""Interval between turns of the sender; on a full bus, it sends two frames per turn, like a USB adapter."""
+"""Polling interval of the sender; on a full bus two frames are then sent at a time, as by a USB adapter."""
 LEAD_S: Final = 0.5
 """Time from :meth:`Generator.begin` to the first frame."""
 _BEAT_S: Final = 0.1
@@ -51,11 +51,11 @@ class Sent:
     """Figures of a replay."""
 
     frames: dict[str, int]
-    """Number of frames sent per bus, excluding the heartbeats before the start."""
+    """Number of frames sent on each bus, excluding the heartbeats before the start."""
     bus_load: dict[str, float]
     """Fraction of the time for which frames occupied the simulated bus."""
     late_p99_ms: float
-    """Delay of the frames relative to their times on the simulated bus, caused by the generator itself."""
+    """Delay of the frames behind their times on the simulated bus, caused by the generator itself."""
     late_max_ms: float
     cpu_s: float
 
@@ -80,7 +80,7 @@ class Generator:
         self._receive()
 
     def send_heartbeats(self, buses: Sequence[str]) -> None:
-        """Send the heartbeats of the patches on ``buses`` from now on, so that a host finds the patches."""
+        """Start sending the heartbeats of the patches on ``buses``, so that a host finds the patches."""
         self._pipe.send(list(buses))
 
     def begin(self) -> int:
@@ -230,7 +230,7 @@ def _durations_ns(bus: BusConfig, frames: Sequence[_Queued]) -> list[int]:
 
 
 def _arbitrate(frames: Sequence[tuple[int, int, bytes, bool, int]], durations: Sequence[int]) -> Stream:
-    """Arbitrate the frames, which are sent one after the other.
+    """Arbitrate the frames, which share the bus one at a time.
 
     Frames of a node keep their order, as in the queue of its controller; of the frames at the heads of these
     queues, the frame with the lowest identifier is sent.
@@ -294,7 +294,7 @@ def _play(pipe: Connection, hand: HandConfig, loads: Sequence[tuple[BusConfig, S
 def _replay(
     sockets: Sequence[socket.socket], streams: Sequence[Stream], begin_ns: int, sent: list[int]
 ) -> list[int]:
-    """Send every frame at its time. Returns the delay of the first frame of each turn, ns."""
+    """Send every frame at its scheduled time. Returns the delay of the first frame of each burst, ns."""
     late_ns, clock = [], time.monotonic_ns
     at = [0] * len(streams)
     left = sum(len(stream.packets) for stream in streams)
@@ -326,7 +326,7 @@ def _connect(bus: BusConfig) -> socket.socket:
 
 
 def _send(sock: socket.socket, packet: bytes) -> int:
-    """Send a packet. Returns 1, or 0 if no receiver is open yet."""
+    """Send a packet. Returns the number of packets sent: 1, or 0 if no receiver is open yet."""
     while True:
         try:
             sock.send(packet)

@@ -1,4 +1,4 @@
-"""Solvers set up for a case as an informed user would; each turns a stream into one estimate per frame."""
+"""Solvers, set up for a case as an informed user would; each gives one estimate per frame of a stream."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def solver_of(case: Case, name: str) -> Tracker | Posterior:
 
 
 def _noise_for_exact(case: Case, stream: Stream) -> Float:
-    """Return drift and model errors as independent noise, the only kind that the exact inverse models."""
+    """Convert drift and model errors to independent noise, the only error that the exact inverse models."""
     change = np.nan_to_num(np.abs(stream.frames_ohm / case.skin.rest_ohm - 1.0), posinf=0.0)
     drift = 0.0 if case.drift == "none" else DRIFT
     return np.asarray(np.sqrt(stream.noise**2 + drift**2 + (case.model_error * change) ** 2))

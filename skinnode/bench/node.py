@@ -27,7 +27,7 @@ from skinnode.transport import CanPort
 
 NODE_ID: Final = 4
 FULL_BUS_HZ: Final = 8_000
-"""Rate of frames with eight data bytes that fills a bus at 1 Mbit/s, frames per second."""
+"""Number of frames with eight data bytes per second that fills a bus at 1 Mbit/s."""
 SCAN_PERIOD_S: Final = 0.1
 BEAT_MS: Final = 10
 _BURST_S: Final = 1e-3  # one burst per millisecond, because no thread can wake 8000 times a second
@@ -166,9 +166,9 @@ def _load(rig: _Rig, rate_hz: int, stop: threading.Event) -> None:
 
 
 def handlers() -> dict[str, Callable[[], object]]:
-    """Return one function per kind of frame, each of which makes a node without a bus handle a frame.
+    """Return one function per kind of frame; each makes a node without a bus handle one such frame.
 
-    Each also queries the next deadline, as the thread that drives a node does.
+    Each function also queries the next deadline, as the thread that runs a node does.
     """
     layout = PatchLayout.preset("staggered")
     node = PatchNode(NODE_ID, layout, _Still(layout), send=lambda _can_id, _data: None, pacing=EXACT)

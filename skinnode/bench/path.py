@@ -2,21 +2,22 @@
 
 Each experiment uses one upper wire of 10 electrodes (30 unknowns), without the other wires of the patch. A
 sphere with a radius of 6 to 12 mm presses on rubber (Hertz's closed form with friction) at a random point in
-the middle of the patch; the wire is the one nearest to that point. Of 1000 samples on the way down, n evenly
-spaced samples are used.
+the middle of the patch; the wire nearest to that point is solved. Of 1000 samples of the downward motion, n
+evenly spaced samples are used.
 
-Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 more calls
-than F alone. Here F and J together cost about as much as two evaluations of F; ×31 gives the cost with finite
-differences. Calls per step are means over all samples but the last, as in the paper. The accuracy is ‖X − X*‖
-/ ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order optimality is that of r =
-a F − 1, dimensionless with lengths in pitches; MATLAB would give that of F, which is larger by a factor of F²
-and depends on the unit of length, which the paper does not state.
+Counts. The paper counts function calls with finite-difference Jacobians, each of which costs 30 calls in
+addition to that of F itself. Here F and J together cost about as much as two evaluations of F; ×31 gives the
+cost with finite differences. Calls per step are means over all samples but the last, as in the paper. The
+accuracy is ‖X − X*‖ / ‖X* − X(0)‖ (RMS), averaged over the experiments that converged. The first-order
+optimality is that of r = a F − 1, dimensionless with lengths in pitches; MATLAB would give that of F, which
+is larger by a factor of F² and depends on the unit of length, which the paper does not state.
 
 Settings. Gauss-Newton never fails here at the paper's 10 %: on ``aligned``, h = 0.3, 0.4 … 1, it solves all
 10 experiments with any number of steps. The hardest ``aligned`` setting at that depth is therefore h = 1. At
 h = 0.7 and 30 %, Gauss-Newton fails as it did for the authors: in 6 of 10 experiments with 5 steps and in 2
 with 10 steps, but in none with 20 or more. This setting was found by searching h = 0.3 … 1 and presses of 15
-… 30 %; at h = 1 and 25 %, 5 and 3 experiments fail, but there levenberg_marquardt also fails with more steps.
+… 30 %; at h = 1 and 25 %, 5 and 3 experiments fail, respectively, but there levenberg_marquardt also fails
+with more steps.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def experiments(layout: PatchLayout, depth: float, count: int) -> list[Experimen
 
 
 def run(count: int) -> dict[str, Any]:
-    """Return all figures of the benchmark, with ``count`` experiments per setting."""
+    """Run the benchmark with ``count`` experiments per setting, and return all figures."""
     settings = []
     for name, height, depth in SETTINGS:
         layout = preset(name, height)
@@ -230,7 +231,7 @@ def _optimality(one: Experiment, samples: int, tolerance: float) -> list[float]:
 
 
 def _cycle(made: list[Experiment], samples: int, tolerance: float) -> float | None:
-    """Return the median cycle over the experiments that have a cycle, or None if there are none."""
+    """Return the median cycle of the experiments that have a cycle; None if no experiment has a cycle."""
     cycles = []
     for one in made:
         path = one.solve(Uniform(plain=True, intermediate_tolerance=tolerance), samples=samples)
@@ -255,7 +256,7 @@ def _iterations(made: list[Experiment], samples: int) -> dict[str, Any]:
 
 
 def _last_step(one: Experiment, periodic: bool) -> list[float]:
-    """Return figure 12: optimality at the start of the last of 50 samples and after each iteration."""
+    """Return figure 12: optimality at the start of the last of 50 samples and after its iterations."""
     cycle = one.solve(Periodic(plain=True), samples=50).cycle if periodic else None
 
     def schedule(most: int) -> Schedule:
@@ -274,13 +275,13 @@ def _last_step(one: Experiment, periodic: bool) -> list[float]:
 
 
 def optimality(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """Return ‖Jᵀr‖∞ of r = a F − 1 with lengths in pitches, from the reference model."""
+    """Return ‖Jᵀr‖∞ of r = a F − 1 with lengths in pitches, computed with the reference model."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(r @ slopes).max())
 
 
 def correction(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> float:
-    """Return the largest component of the next Newton step in magnitude, in pitches."""
+    """Return the largest magnitude of a component of the next Newton step, in pitches."""
     r, slopes = _linear(layout, upper_m, frame_ohm)
     return float(np.abs(np.linalg.solve(slopes, r)).max())
 
@@ -295,8 +296,8 @@ def _linear(layout: PatchLayout, upper_m: Float, frame_ohm: Float) -> tuple[Floa
 def _ten_steps() -> list[dict[str, Any]]:
     """Return the time and error of the ten-step path on ``staggered``.
 
-    The rows are one wire alone, with each operator and with our own step control, and one wire in a patch of
-    ten.
+    There are rows for one wire alone, with each operator and with our own step control, and for one wire in a
+    patch of ten.
     """
     layout = preset(*SETTINGS[0][:2])
     one = experiments(layout, SETTINGS[0][2], 1)[0]
@@ -328,7 +329,7 @@ def _ten_steps() -> list[dict[str, Any]]:
 
 
 def _surface() -> dict[str, Any]:
-    """Return figure 13: heights in µm of the whole patch at the hardest setting.
+    """Return figure 13: heights of the surface of the whole patch in µm, at the hardest setting.
 
     The patch is solved with 5 and 20 samples as in the paper, and with our step control.
     """
@@ -402,7 +403,7 @@ def _rows(setting: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _accuracy(row: dict[str, Any], count: int) -> str:
-    """Return the mean over the converged experiments and the number that did not converge."""
+    """Return the mean over the converged experiments, and the number of experiments that did not converge."""
     if row["failed"] == count:
         return f"failed {count}/{count}"
     text = f"{row['accuracy_percent']:.0e} %"

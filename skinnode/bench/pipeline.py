@@ -1,4 +1,4 @@
-"""Throughput and latency of a host, and CPU per thread group, by number of buses and patches.
+"""Throughput and latency of a host, and CPU time per thread group, by number of buses and patches.
 
 The host is that of ``skinnode host``, a guest on the bus of a robot whose master and nodes are replayed by
 another process (:mod:`skinnode.bench.load`). Frames arrive over UDP, through SocketCAN's reader (see
@@ -36,7 +36,7 @@ CLASSIC_MS: Final = 50
 """SYNC period of classic CAN: four patches of 101 frames give 8,080 frames/s plus SYNC and heartbeats."""
 FD_MS: Final = 25
 STAGGER_MS: Final = 3.0
-"""Offset in ms between the SYNCs of successive buses, if staggered; the four patches of one bus are then
+"""Offset in ms between the SYNCs of successive buses when staggered; the four patches of one bus are then
 solved before the next four are due."""
 SCENES: Final = (
     (False, True, 0.0),
@@ -48,7 +48,7 @@ SCENES: Final = (
 )
 """Whether CAN FD is used, whether the patches are touched, and the offset between SYNCs in ms."""
 DEADLINE_US: Final = 1000
-"""Deadline of a field. An exact inverse takes 200 µs, or 13 ms if the posterior has to check it."""
+"""Deadline of a field. An exact inverse takes 200 µs, or 13 ms if the posterior has to check the result."""
 RECEIVE_US: Final = 5.0
 LATENCY_MS: Final = 5.0
 SETTLE_S: Final = 5.0
@@ -73,7 +73,8 @@ def run(  # noqa: PLR0913 - the options of the command
         short: Whether to run only the rows that have a requirement.
         interface: ``udp`` or ``socketcan``.
         channel: Channel for socketcan.
-        all_cores: Whether host and load may use all cores; otherwise each is bound to one core.
+        all_cores: Whether host and load generator may use all cores; otherwise each is bound to a single
+            core.
         report: Called with each row when it is ready.
 
     Returns:
@@ -155,7 +156,7 @@ def _hand(  # noqa: PLR0913 - the properties in which hands differ
 
 
 def _part(hand: HandConfig, buses: int) -> HandConfig:
-    """Return the hand with only the first ``buses`` of its buses."""
+    """Return the hand reduced to its first ``buses`` buses."""
     kept = hand.buses[:buses]
     patches = tuple(patch for patch in hand.patches if patch.bus in {bus.name for bus in kept})
     return hand.model_copy(update={"buses": kept, "patches": patches})
@@ -215,7 +216,7 @@ def _spread(late_ms: list[float]) -> dict[str, float | None]:
 
 
 def lost(row: Row) -> int:
-    """Return the number of frames, chunks and scans that did not become fields."""
+    """Return the number of frames, chunks and scans lost between the load generator and the fields."""
     frames = row["sent"] - row["received"] + row["queue_dropped"]
     return int(frames + row["chunks_lost"] + row["scans_missed"] + row["scans"] - row["fields"])
 
@@ -229,7 +230,7 @@ def hand_name(row: Row) -> str:
 
 
 def _must(rows: list[Row]) -> list[Row]:
-    """Return the requirements on the fullest hands with touched patches, and whether they are met."""
+    """Return the requirements on the largest hands with touched patches, and whether they are met."""
     must = []
     for row in rows:
         if row["buses"] < 4 or not row["touched"]:
@@ -253,7 +254,7 @@ class _Reader:
         self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def since(self, begin_ns: int) -> tuple[list[float], list[float]]:
-        """Return ms from last frame to field and to field delivery, for scans ended after ``begin_ns``."""
+        """Return the ms from last frame to field and to its delivery, for scans ended after ``begin_ns``."""
         stamps = [(stamp, read_ns) for stamp, read_ns in self._stamps if stamp.t_receive_ns >= begin_ns]
         published = [(stamp.t_solved_ns - stamp.t_receive_ns) * 1e-6 for stamp, _ in stamps]
         return published, [(read_ns - stamp.t_receive_ns) * 1e-6 for stamp, read_ns in stamps]

@@ -17,7 +17,7 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float, PatchLayout
 
 OUTLIER_DEVIATIONS = 6.0
-"""Error, in reported standard deviations, that counts as a fault if exceeded. A run scores about 1e5
+"""Maximum error that does not count as a fault, in reported standard deviations. A run scores about 1e5
 coordinates; by chance alone, 2e-4 coordinates are expected beyond six standard deviations: one false alarm in
 5,000 runs."""
 
@@ -34,7 +34,7 @@ def bound_std_m(layout: PatchLayout, upper_m: Float, relative_std: Float) -> Flo
         relative_std: Relative standard deviations (U, K) of the resistances.
 
     Returns:
-        Inf for a wire whose Jacobian is singular.
+        The bound; inf for a wire whose Jacobian is singular.
     """
     potential = potential_per_m(layout, upper_m)
     slopes = jacobian(layout, upper_m).reshape(*layout.shape, layout.unknowns)
@@ -53,16 +53,16 @@ class Score:
 
     scans: int
     untrusted: int
-    """Scans in which a wire did not converge; the other figures exclude these scans."""
+    """Scans in which at least one wire did not converge; the other figures exclude these scans."""
     deepest_m: float
     """Largest true displacement of an electrode."""
     error_rms_m: float
     reported_rms_m: float
     bound_rms_m: float
-    """RMS of the bound set by the codes alone, without the converter's noise."""
+    """RMS of the bound due to the codes alone, without the converter's noise."""
     error_max_m: float
     relative_error: float
-    """‖X − X*‖ / ‖X* − X(0)‖ of the scan with the largest true displacement."""
+    """‖X − X*‖ / ‖X* − X(0)‖ in the scan with the largest true displacement."""
     coverage95: float
     """Fraction of coordinates whose error is within the reported 95 % interval."""
     worst_deviations: float

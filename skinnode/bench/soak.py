@@ -1,12 +1,12 @@
-"""Soak of a hand under random faults: does the host survive, do all patches recover, do all counts agree?
+"""Soak test of a hand under random faults: does the host survive, do patches recover, do the counts agree?
 
 Simulated nodes, with faults, and the host share this process and two virtual buses. A round injects one to
-three faults, including drops of frames of every kind, into one patch or into all. It then clears the faults
-and waits until every patch is operational and streaming again; meanwhile, subscribers come and go. In some
-rounds other processes occupy the processor. Memory is compared between two idle instants, one after a warm-up
-and one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a leak of
-one object per scan) and resident memory. This file may import the simulator, as the demo may, because it
-needs a source of faults.
+three faults, such as dropped frames of any kind, into one patch or into all patches. It then clears the
+faults and waits until every patch is operational and streaming again; meanwhile, subscribers come and go. In
+some rounds other processes occupy the processors. Memory use is compared at two idle instants, one after a
+warm-up and one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a
+leak of one object per scan) and resident memory. This file may import the simulator, as the demo may, because
+it needs a source of faults.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ from vcan_sim.fleet import Fleet
 from vcan_sim.sensor import REMEMBERED_READINGS
 
 WARM_UP: Final = 0.25
-"""Fraction of the run after which memory is measured for the first time."""
+"""Fraction of the run after which memory use is measured for the first time."""
 BLOCKS: Final = 2000
-"""Maximum growth in blocks. The number of blocks varies by a few hundred; a leak of one block per scan adds
-10,000 in three minutes."""
+"""Maximum growth in the number of blocks. The number of blocks varies by a few hundred; a leak of one block
+per scan adds 10,000 in three minutes."""
 RESIDENT_MB: Final = 8.0
 """Maximum growth of resident memory in MB; the C allocator may return freed memory late."""
 BACK_S: Final = 15.0
-"""Seconds after which a stream that has not resumed counts as lost. Recovery should take one second; a loaded
+"""Time after which a stream that has not resumed counts as lost, s. Recovery should take one second; a loaded
 machine may need more."""
 SLOW_S: Final = 1.0
-"""Seconds after which a round is reported as slow."""
+"""Duration above which the recovery in a round is reported as slow, s."""
 STARVED: Final = 0.1
-"""Fraction of the rounds in which other processes occupy the processor."""
+"""Fraction of rounds in which other processes occupy the processors."""
 STARVED_S: Final = 3.0
 TARED: Final = 0.2
 """Fraction of the rounds in which a patch is tared."""
@@ -124,7 +124,7 @@ _KINDS: Final[tuple[dict[str, Any], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class _Size:
-    """Sizes that must not grow."""
+    """Figures that must not grow."""
 
     blocks: int
     resident_mb: float
@@ -133,7 +133,7 @@ class _Size:
 
 
 def warm_up() -> None:
-    """Compile the kernels that a soak needs."""
+    """Compile the kernels that a soak test needs."""
     hand = _hand()
     load_kernels()
     for patch in hand.patches:
@@ -141,7 +141,7 @@ def warm_up() -> None:
 
 
 def run(minutes: float, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Soak a hand and return the figures. Raises as :meth:`Host.from_config`.
+    """Run a soak test of a hand and return its figures. Raises as :meth:`Host.from_config`.
 
     Args:
         minutes: Duration of the soak.
@@ -331,7 +331,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
     """Wait until every patch is operational and has published a field for a SYNC sent after the call.
 
     Returns:
-        The time in s, and the last patch waited for, with the reason.
+        The duration of the wait in s, and the last patch that was waited for, with the reason.
     """
     begin_ns, waited_for = time.monotonic_ns(), ""
 
@@ -351,7 +351,7 @@ def _wait_for_patches(host: Host, names: list[str]) -> tuple[float, str]:
 
 
 def _not_operational(host: Host) -> list[str]:
-    """Return one line per patch that is not operational, with the reason."""
+    """Return one line for each patch that is not operational, with the reason."""
     healths = (host.health(patch.name) for patch in host.hand.patches)
     return [f"{health.patch}, {health.condition}: {health.reason}" for health in healths if health.reason]
 

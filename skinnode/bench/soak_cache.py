@@ -1,4 +1,4 @@
-"""Damaged copy of the kernel cache with which a soak starts."""
+"""Damaged copy of the kernel cache, used at the start of a soak test."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Final
 
 CACHE_ENVIRONMENT: Final = "SKINNODE_CACHE_DIR"
 _DAMAGED: Final = 4
-"""Number of cache files to damage; each costs a recompilation of up to a few seconds."""
+"""Number of cache files to damage; recompiling each takes up to a few seconds."""
 _COMPILE_S: Final = 600.0
 """Maximum time to compile all kernels on a slow machine, s."""
 
 
 def fill(folder: Path) -> None:
-    """Fill a cache under ``folder`` with the kernels that a soak needs.
+    """Fill a cache under ``folder`` with the kernels that a soak test needs.
 
-    They are copied from the user's cache, or compiled in a child process if that cache is empty. The user's
-    cache is not changed.
+    The kernels are copied from the user's cache or, if that cache is empty, compiled in a child process. The
+    user's cache is not changed.
 
     Raises:
         subprocess.SubprocessError: The child process fails.
@@ -43,7 +43,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def damage(folder: Path, seed: int) -> list[str]:
-    """Damage cache files under ``folder``, alternately truncating one and filling one with random bytes.
+    """Damage cache files under ``folder``, alternately by truncation and by filling with random bytes.
 
     The same seed damages the same files. Returns one line per file.
     """

@@ -1,4 +1,4 @@
-"""Comparison, by kind, of a soak's counts of frames sent and dropped with the counts of the host."""
+"""Comparison of a soak test's counts of sent and dropped frames with the host's counts, by kind."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vcan_sim.tally import Kind, kind_of
 
 
 class FrameCounter:
-    """Counts the frames that a host receives and sends, by bus and kind.
+    """Counter of the frames that a host receives and sends, by bus and kind.
 
     Implements :class:`~skinnode.host.tap.HostTap`.
     """
@@ -57,7 +57,7 @@ class KindSums:
 
     kind: str
     wanted: int
-    """Frames to send, including those added by faults."""
+    """Frames to send, including frames added by faults."""
     dropped: int
     """Frames dropped in transit by a fault."""
     held_back: int
@@ -99,14 +99,14 @@ def of_host(fleet: Fleet) -> list[KindSums]:
 
 
 def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str, Counter[Kind]]) -> list[str]:
-    """Return one line per count of frames from nodes to host that does not match.
+    """Return one line for each mismatch in the counts of frames from the nodes to the host.
 
     Call while the nodes are silent.
 
     Args:
         fleet: Fleet of the nodes.
         counter: Counts made by the host.
-        before: Frames that each bus carried before the host opened it.
+        before: Numbers of frames that each bus carried before the host opened the bus.
     """
     found = []
     for bus in fleet.hand.buses:
@@ -123,7 +123,7 @@ def received_otherwise(fleet: Fleet, counter: FrameCounter, before: Mapping[str,
 
 
 def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
-    """Return one line per count of frames from host to nodes that does not match, in total and by node.
+    """Return one line for each mismatch in the counts of frames from the host, in total and by node.
 
     Call after the host has closed and the nodes have stopped.
     """
@@ -147,7 +147,7 @@ def sent_otherwise(fleet: Fleet, counter: FrameCounter) -> list[str]:
 
 
 def injected_otherwise(stats: HostStats, injected: Mapping[str, Injected]) -> list[str]:
-    """Return one line per host counter that does not match the number of faults injected."""
+    """Return one line for each host counter that does not match the number of injected faults."""
     found = [
         f"{name}: the host counted {stats.patches[name].frames} chunks and summaries, {each.pdos} were sent"
         for name, each in injected.items()

@@ -33,7 +33,7 @@ Solve = Callable[["Case", float], Float]
 
 
 class Case:
-    """One wire: r = a F − 1 and its Jacobian for any solver, with a start and the truth."""
+    """Residual r = a F − 1 of one wire and its Jacobian for any solver, with a start and the truth."""
 
     def __init__(self, problem: PatchProblem, wire: int, a: Float, start: Float, truth: Float) -> None:
         self.wire, self.a, self.start, self.truth = wire, a, start, truth
@@ -54,7 +54,7 @@ class Case:
         return np.asarray(self._jt * self.a)
 
     def residual_beside_jacobian(self) -> Float:
-        """Return r at the point of the last Jacobian; both were computed together."""
+        """Return r at the point of the last Jacobian, which was computed together with r."""
         return np.asarray(self.a * self._scratch - 1.0)
 
     def jacobian(self, x: Float) -> Float:
@@ -138,7 +138,7 @@ def peers(problem: PatchProblem) -> dict[str, Solve]:
 
 
 def ceres() -> Solve:
-    """Return Ceres as a solver with dense QR and traditional dogleg, without output."""
+    """Return Ceres as a solver with dense QR and traditional dogleg, which prints nothing."""
     pyceres = importlib.import_module("pyceres")
     options = pyceres.SolverOptions()
     options.trust_region_strategy_type = pyceres.TrustRegionStrategyType.DOGLEG
@@ -183,7 +183,7 @@ def _solve_all(solve: Solve, cases: list[Case], tolerance: float) -> None:
 
 
 def run(rounds: int) -> dict[str, Any]:
-    """Return the figures of the benchmark: µs per wire, ratio to our dogleg, error."""
+    """Run the benchmark and return µs per wire, ratio to our dogleg, and error."""
     layout = PatchLayout.preset("staggered", pitch_m=4e-3, height_m=2e-3)
     problem = PatchProblem.of(layout)
     cases = []

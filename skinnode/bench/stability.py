@@ -21,7 +21,7 @@ from skinnode.process.child_processes import starting_children
 from skinnode.text.json_values import plain
 
 TWIN_SEEDS: Final = 2
-"""Number of streams on which ``auto`` must equal another method bit for bit before ``auto`` is skipped."""
+"""Number of streams on which ``auto`` must match another method bit for bit before ``auto`` is skipped."""
 
 
 @contextlib.contextmanager
@@ -80,7 +80,7 @@ def run(
 
 
 def _numbered(seeds: int, only: Sequence[str] | None, number: int) -> list[dict[str, Any]]:
-    """Return the rows of the case with this number; the closures of a case cannot be sent to a process."""
+    """Return the rows of a case, given by number because the closures in a case cannot be pickled."""
     return _rows(all_cases()[number], only, seeds)
 
 
@@ -136,7 +136,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def share(value: float) -> str:
-    """Return a fraction as a percentage or, if that is unreadable, as a power of ten; a dash for NaN."""
+    """Return a fraction as a percentage, or as a power of ten if very small or large; a dash for NaN."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else "inf"
     if 1e-4 <= value < 1:

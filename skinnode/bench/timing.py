@@ -58,7 +58,7 @@ def _calls_in_a_turn(function: Callable[[], object]) -> int:
 
 
 def machine() -> dict[str, str]:
-    """Return the library versions and the processor with which the figures were measured."""
+    """Return the library versions and the processor used for the measurements."""
     import numba
     import numpy
     import scipy

@@ -1,9 +1,10 @@
-"""Truth for scoring the solvers in benchmarks, made without any of the solvers' assumptions.
+"""Ground truth for scoring the solvers in benchmarks, made without any of the solvers' assumptions.
 
-Displacements are closed forms of rigid spheres on rubber (:class:`skinnode.model.elastic.HertzContact`), so
-they have no grid and do not depend on a prior. Resistances come from :class:`Skin`, which can differ from the
-solver's model: electrodes of finite size, rubber whose resistivity depends on strain, a different thickness,
-a contact resistance in series. Converters add noise and quantise to codes, as real converters do.
+Displacements are closed-form solutions for rigid spheres on rubber
+(:class:`skinnode.model.elastic.HertzContact`), so they have no grid and do not depend on a prior. Resistances
+come from :class:`Skin`, which can differ from the solver's model: electrodes of finite size, rubber whose
+resistivity depends on strain, a different thickness, a contact resistance in series. Converters add noise and
+quantise readings to codes, as real converters do.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from skinnode.protocol.codes import CodeScale, decode, encode
 
 RUBBER: Final = Rubber()
 EXACT_NOISE: Final = 1e-9
-"""Relative noise passed to a tracker for noiseless data; it sets the tolerance of the solve."""
+"""Relative noise passed to a tracker for noiseless data; determines the tolerance of the solve."""
 RING: Final = 4
 """Number of points on the rim of a finite electrode, giving 16 distances per pair of electrodes."""
 
@@ -36,10 +37,10 @@ class Press:
     depth_m: float
     traction_ratio: tuple[float, float] = (0.0, 0.0)
     shear_only: bool = False
-    """Whether only the traction along the surface acts: contact with friction minus contact without."""
+    """Whether only the traction along the surface acts: contact with friction minus frictionless contact."""
 
     def contacts(self, share: float) -> tuple[tuple[int, HertzContact], ...]:
-        """Return the closed forms, each with its sign."""
+        """Return the closed-form solutions, each with its sign."""
         depth = share * self.depth_m
         full = HertzContact(RUBBER, self.radius_m, depth, self.center_m, self.traction_ratio)
         if not self.shear_only:
@@ -68,7 +69,7 @@ class Skin:
     Args:
         layout: Layout passed to the solver.
         height: True height of the upper layer, as a fraction of the layout's.
-        electrode: Radius of every electrode, pitches; 0 is the point that the solver assumes.
+        electrode: Radius of every electrode, pitches; 0 for point electrodes, as the solver assumes.
         strain: β in ρ d (1 + β (d/d₀ − 1)), where d₀ is the distance at rest.
         series: Contact resistance in series with each pair of wires, as a fraction of its R₀.
         points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
@@ -212,7 +213,7 @@ class Converter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """Input of a solver, with the truth."""
+    """Input of a solver, with the corresponding truth."""
 
     frames_ohm: Float
     """(T, U, K), ohm; not finite where not valid."""
@@ -246,7 +247,7 @@ def stream(  # noqa: PLR0913 - the parts of a stream
     rng: np.random.Generator,
     gain: Float | None = None,
 ) -> Stream:
-    """Return the stream of presses at fractions of their depth.
+    """Return a stream of presses that have the given fractions of their full depth.
 
     Args:
         skin: Patch that is pressed.
@@ -284,8 +285,8 @@ def random_press(  # noqa: PLR0913 - keyword arguments, each a range
         radius: Range of the sphere's radius, pitches.
         shear: Maximum friction.
         margin: Distance from the centre to the border of the patch, pitches.
-        where: ``inside``; ``edge``, with the centre on the border in x; or ``half off``, half a contact
-            radius outside it.
+        where: ``inside``; ``edge``, with the centre on the border in x; or ``half off``, with the centre half
+            a contact radius outside the border.
     """
     pitch = layout.pitch_m
     points = layout.upper_m[..., :2].reshape(-1, 2)

@@ -7,9 +7,9 @@ accurate   if it is CONVERGED and every coordinate is within the reported uncert
 wrong      if it is CONVERGED and an error is too large, or if it is not finite, whatever its status
 
 With noise, an error may reach 5 reported standard deviations; chance alone puts 6e-7 of all coordinates
-beyond this limit. A long run must not fail by chance, nor a fault pass as chance, so two conditions must hold
-in each row. For errors that are Gaussian with the reported standard deviation, each condition fails with a
-probability of 1e-4:
+beyond this limit. A long run must not fail by chance, and a fault must not pass as chance, so each row must
+meet two conditions. For errors that are Gaussian with the reported standard deviation, each condition fails
+with a probability of 1e-4:
 
 - no coordinate is beyond z(n) or 5, whichever is larger, where any of n independent coordinates exceeds z(n)
   standard deviations with probability 1e-4. z is 5.7 for 9,000 coordinates and 6.4 for 1e6 (Bonferroni's
@@ -18,8 +18,9 @@ probability of 1e-4:
   probability is the expected number of such coordinates per seed (again a bound); seeds are independent even
   though coordinates are not
 
-If the second condition fails, every wire beyond 5 is wrong. With exact data, chance plays no part: the limit
-is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is larger.
+If the second condition fails, every wire with an error beyond 5 is wrong. With exact data, chance plays no
+part: the limit is 5 reported standard deviations or 1e-6 of the wire's largest displacement, whichever is
+larger.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ class Tally:
     def _shares(self, error: Float, std: Float, truth: Float) -> None:
         """Add the relative error and standard deviation of the converged wires in the deepest frame.
 
-        Both are relative to the displacement. The worst error is that of any frame, relative to the
+        Both are relative to the displacement. The worst error is the largest in any frame, relative to the
         displacement in the deepest frame.
         """
         deepest = int(np.argmax(np.linalg.norm(truth.reshape(len(truth), -1), axis=1)))
@@ -170,7 +171,7 @@ class Tally:
 
 
 def named(row: Mapping[str, Any]) -> str:
-    """Describe a wrong row in one line: the case, the size of the error, and how to reproduce it."""
+    """Describe a wrong row in one line: the case, the size of the error, and how to reproduce the error."""
     worst = row["worst"]
     far = "not finite" if worst["deviations"] is None else f"{worst['deviations']:.3g} standard deviations"
     return (

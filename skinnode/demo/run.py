@@ -1,4 +1,4 @@
-"""The run of ``skinnode demo``: plays the scene, collects the fields and scores them against the truth."""
+"""Run of ``skinnode demo``: plays the scene, collects the fields and scores them against the truth."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ BITRATE_BPS: Final = 1_000_000
 _REDRAW_S: Final = 0.2
 _LINE_S: Final = 1.0
 _LULL_S: Final = 0.004
-"""Time without a new field, s, that counts as the gap between the scans of two SYNCs."""
+"""Time without a new field, s, that is taken as the gap between the scans of two SYNCs."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchReport:
-    """One patch's row of the report."""
+    """Row of the report for one patch."""
 
     patch: str
     node_id: int
@@ -70,7 +70,7 @@ class Report:
     bus_load: float
     """Fraction of a 1 Mbit/s bus that all frames of the scan phase would have used, including stuff bits."""
     faults: tuple[str, ...]
-    """Reasons for exit status 1; empty if all is well."""
+    """Reasons for exit status 1; empty if there are none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ def _depth_std_m(frame: FieldFrame) -> float:
 
 
 class _Progress:
-    """Shows the run: a live view on a terminal, one line per second elsewhere."""
+    """Shows the run, as a live view on a terminal or as one line per second elsewhere."""
 
     def __init__(self, console: Console, hand: HandConfig, watches: Sequence[_Watch], seconds: float) -> None:
         self._console, self._watches, self._seconds = console, watches, seconds
@@ -279,7 +279,7 @@ def _bits(host: Host) -> int:
 
 
 def _losses(host: Host) -> int:
-    """Return the number of losses counted by the host: frames dropped by its queue, and missing chunks."""
+    """Return the number of losses counted by the host: frames dropped from its queue, and missing chunks."""
     stats = host.stats()
     dropped = sum(bus.dropped for bus in stats.buses.values())
     return dropped + sum(stream.assembler.chunks_lost for stream in stats.patches.values())

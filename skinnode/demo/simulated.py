@@ -18,7 +18,7 @@ from skinnode.process.child_processes import starting_children
 
 
 def on_simulated_buses(hand: HandConfig) -> HandConfig:
-    """Return a copy of the hand on unused buses that connect processes on this machine.
+    """Return a copy of the hand on unused virtual buses between processes on this machine.
 
     Simulated nodes must not appear on a bus with real nodes.
     """

@@ -1,4 +1,4 @@
-"""Lock file that names its owner, cannot become stale, and is removed on release."""
+"""Lock file that contains its owner's process ID, cannot become stale, and is removed on release."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 _TRIES: Final = 100
-"""Maximum locking attempts; one fails only if the previous owner removes the file after we open it."""
+"""Maximum locking attempts; an attempt fails only if the previous owner removes the file after we open it."""
 
 
 class FileInUse(BlockingIOError):

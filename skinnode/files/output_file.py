@@ -11,7 +11,7 @@ from skinnode.files.whole_file import replace_file
 
 
 def require_writable(option: str, file: Path) -> None:
-    """Check that a file can be written, before doing the work that produces its content.
+    """Check that a file can be written, before its content is computed.
 
     Args:
         option: Option that named the file, for errors.
@@ -43,7 +43,7 @@ def write_bytes(option: str, file: Path, data: bytes) -> None:
     """Write ``data`` to ``file``, the value of ``option``.
 
     A regular file is replaced only when all data has been written, and keeps its permissions. Any other
-    target, such as a pipe, is written in place.
+    target, such as a pipe, is written to directly.
 
     Raises:
         ConfigError: The data could not be written completely; a regular file then keeps its old content.

@@ -2,7 +2,7 @@
 
 The new content is written to a file with a random name in the same folder. This file is created exclusively,
 never through a symbolic link, and renamed once it is complete. Readers always see either the old or the new
-content; after an error the old content remains.
+content, complete; after an error the old content remains.
 """
 
 from __future__ import annotations

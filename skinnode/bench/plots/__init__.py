@@ -1,4 +1,4 @@
-"""Plots of benchmarks. ``ratios`` serves ``kernel`` and ``solve``; the rest are named after their benchmark.
+"""Plots of benchmarks, which need matplotlib.
 
-They need matplotlib.
+``ratios`` serves ``kernel`` and ``solve``; the other modules are named after their benchmarks.
 """

@@ -73,7 +73,7 @@ def _draw_iterations(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) 
 
 
 def _draw_table(axes: Any, setting: dict[str, Any], paper: dict[str, Any]) -> None:
-    """Draw the time per path against the number of steps, next to the paper's."""
+    """Draw the time per path against the number of steps, next to the paper's times."""
     table = paper["table4_dogleg"]
     axes.loglog(table["steps"], table["runtime_s"], "s-", color="0.5", label="paper (dogleg)")
     for colour, key, label in (

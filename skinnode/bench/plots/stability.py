@@ -50,7 +50,7 @@ def draw(file: Path, figures: dict[str, Any]) -> None:
 
 
 def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
-    """Draw a bar per case and method with the fraction of each verdict; the ``wrong`` part is enlarged."""
+    """Draw the fractions of the verdicts, one bar per case and method; the ``wrong`` part is enlarged."""
     place = {name: number for number, name in enumerate(names)}
     column = {method: number for number, (_, method) in enumerate(COLUMNS)}
     for row in rows:

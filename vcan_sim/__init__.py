@@ -5,5 +5,5 @@
     scene (true deformation) -> sensor (resistances, wire faults) -> faulty_node (the real node)
         -> faulty_scans (scan faults) -> fleet (all nodes on their buses) -> command (vcan-sim)
 
-``faults`` declares the faults, ``injector`` draws and counts them, ``tally`` counts frames by kind.
+``faults`` declares the faults, ``injector`` draws and counts faults, ``tally`` counts frames by kind.
 """

@@ -44,7 +44,7 @@ def simulate(
 ) -> None:
     """Simulate a hand's patches as CANopen nodes on a bus; a sphere presses each patch and slides over it.
 
-    Bring them up by running `skinnode host` with the same file in another terminal.
+    Bring the nodes up by running `skinnode host` with the same file in another terminal.
     """
     from skinnode.config import load_hand
     from skinnode.process.garbage_collection import without_long_collections

@@ -86,13 +86,13 @@ class Faults:
     """The scan stops after its first half, without a summary, and the next scan has the same counter."""
     summary_lost: float = 0.0
     reset: float = 0.0
-    """The node resets itself after half of the chunks, as a watchdog would."""
+    """The node is reset after half of its chunks, as by a watchdog."""
     displaced: float = 0.0
-    """A chunk has the counter of the next scan, whose own chunk with that index is lost."""
+    """A chunk carries the counter of the next scan, whose own chunk with that index is lost."""
     understated: float = 0.0
-    """A chunk is lost; the summary claims that only changed chunks were sent, and counts one chunk fewer. Its
-    check, if any, is correct for that summary. A scan in which the node really sends only changed chunks just
-    loses the chunk."""
+    """A chunk is lost; the summary claims that only changed chunks were sent, and counts one chunk fewer. The
+    check, if the summary carries one, is correct for that summary. If the node really sends only changed
+    chunks in this scan, the chunk is simply lost."""
     unchecked: float = 0.0
     """The summary carries no check, as in revision 1.0."""
     struck: int | None = None
@@ -150,7 +150,7 @@ class Faults:
     restart_every_s: float = 0.0
     """Seconds between spontaneous resets of the node; 0 for never."""
     emcy_per_s: float = 0.0
-    """Emergency messages per second; when they stop, one more message reports *error reset*."""
+    """Emergency messages per second; after the last of them, one more message reports *error reset*."""
     babble_per_s: float = 0.0
     """Frames per second with COB-ID 0x3F0, which no device uses."""
 
@@ -172,7 +172,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Injected:
-    """Number of times each fault was injected into one node."""
+    """Number of times that each fault was injected into one node."""
 
     lost: int = 0
     duplicated: int = 0
@@ -189,7 +189,7 @@ class Injected:
     """Resets in the middle of a scan."""
     corrupted: int = 0
     displaced: int = 0
-    """Scans that lost a chunk to the next scan."""
+    """Scans of which a chunk was sent with the counter of the next scan."""
     understated: int = 0
     unchecked: int = 0
     sync_lost: int = 0
@@ -221,7 +221,7 @@ class Injected:
     scans_spoilt: int = 0
     """Scans with missing or wrong chunks: lost, late, short, remote, miscounted or corrupted."""
     pdos: int = 0
-    """Data frames on the COB-IDs of chunks and summaries that were put on the bus."""
+    """Data frames put on the bus with the COB-ID of a chunk or summary."""
 
 
 NO_FAULTS: Final = Faults()
@@ -231,8 +231,8 @@ def faults_of(texts: Sequence[str], patches: Sequence[str]) -> dict[str, Faults]
     """Return the faults of each patch from the values of ``--fault``.
 
     Args:
-        texts: ``lost=0.01,silent`` applies to all patches, ``palm:open_upper=3`` to one. Later values add to
-            earlier ones.
+        texts: ``lost=0.01,silent`` applies to all patches, ``palm:open_upper=3`` to one. Later texts add to
+            or override earlier texts.
         patches: Names of the hand's patches.
 
     Raises:

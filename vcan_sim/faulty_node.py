@@ -26,14 +26,13 @@ from vcan_sim.tally import Kind, Tally, kind_of
 BABBLE_COB_ID: Final = 0x3F0
 SIMULATED: Final = Pacing(slack_ns=THRIFTY.slack_ns, catch_up_ns=40_000_000)
 """Pacing of a simulated node. The node may stall for half a SYNC period of the reference hand and still
-finish its scan in time, so that load on the machine that runs the simulation does not appear as a fault of
-the node. Four nodes then send bursts of up to 270 frames, which fit the default receive buffer of a
-socket."""
+finish its scan in time, so that load on the machine does not appear as a fault of the node. Four nodes then
+send bursts of up to 270 frames, which fit into a socket's default receive buffer."""
 
 _STORM: Final = bytes.fromhex("0fff810000000000")
 """EMCY 0xFF0F with the generic and manufacturer-specific bits of the error register set."""
 _MOST_AT_ONCE: Final = 32
-"""Maximum number of periodic events of one kind per turn; further events are dropped."""
+"""Maximum number of overdue periodic events of one kind that are caught up; further events are dropped."""
 
 
 class Emit(Protocol):
@@ -152,7 +151,7 @@ class FaultyNode(PatchNode):
         self._do_due_events(t_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when to call :meth:`on_timer` next, or None if nothing is due before the next frame."""
+        """Return when :meth:`on_timer` must be called next; None if nothing is due before the next frame."""
         faults = self.faults
         if faults.unplugged != self._unplugged:
             return 0
@@ -241,7 +240,7 @@ class FaultyNode(PatchNode):
         return self._put(can_id, data)
 
     def _imposture(self, can_id: int, data: bytes) -> bytes:
-        """Return the response to an upload, falsified if a fault requires a wrong identity or layout."""
+        """Return the response to an SDO upload, falsified if a fault requires a wrong identity or layout."""
         faults = self.faults
         if not (faults.wrong_identity or faults.wrong_layout) or can_id != od.sdo_response_cob_id(
             self.node_id
@@ -275,7 +274,7 @@ class FaultyNode(PatchNode):
 
     @property
     def _is_cut_off(self) -> bool:
-        """Whether no frame of the node reaches the bus."""
+        """Whether the node is cut off, so that none of its frames reaches the bus."""
         return self.faults.silent or self._unplugged or self._faulty_scans.reset_due
 
 

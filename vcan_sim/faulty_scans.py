@@ -1,4 +1,4 @@
-"""Faults of scans and of their chunks and summaries on the way from a node to its bus."""
+"""Faults of scans, and of their chunks and summaries on the way from a node to its bus."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class FaultyScans:
         swapped, self._swapped = self._swapped, None
         try:
             self._suffer_chunk(fault, changed)
-        finally:  # the bus may refuse one frame and accept the other
+        finally:  # the bus may refuse one of the frames and accept the other
             self._release([] if swapped is None else [swapped])
 
     def send_summary(self, data: bytes) -> None:
@@ -247,7 +247,7 @@ class FaultyScans:
         return True
 
     def _release(self, chunks: Sequence[bytes]) -> None:
-        """Send queued chunks, even after the bus refuses one. Raises BusError if the bus refused any."""
+        """Send all queued chunks, even if the bus refuses one. Raises BusError if a chunk was refused."""
         failure: BusError | None = None
         for data in chunks:
             self._injector.tally.waiting[Kind.CHUNK] -= 1

@@ -33,7 +33,7 @@ class NodeReport:
     nmt_state: NmtState
     frames_sent: int
     pdos_sent: int
-    """Frames that carried process data (chunks and summaries)."""
+    """Number of frames with process data (chunks and summaries)."""
     scans_sent: int
     """Scans sent completely."""
     overruns: int
@@ -45,9 +45,9 @@ class NodeReport:
 class Fleet:
     """A hand's patches as CANopen nodes, each with its own scene.
 
-    A scene begins when its node has sent its first scan, so bring-up may take any time, and a tare at
-    power-on sees an untouched patch. :meth:`start` opens the buses and powers the nodes on. :meth:`stop` sets
-    the nodes to pre-operational and closes the buses. A ``with`` block does both.
+    A scene begins when its node has sent its first scan, so bring-up may take any length of time, and a tare
+    at power-on sees an untouched patch. :meth:`start` opens the buses and powers the nodes on. :meth:`stop`
+    sets the nodes to pre-operational and closes the buses. A ``with`` block does both.
 
     Args:
         hand: Buses, patches and scene.
@@ -115,7 +115,7 @@ class Fleet:
 
     @property
     def failed(self) -> bool:
-        """Whether a bus has ended early; :meth:`stop` raises the error."""
+        """Whether the thread of a bus has ended early; :meth:`stop` raises the error."""
         return any(runner.failed for runner in self._runners)
 
     @property
@@ -156,7 +156,7 @@ class Fleet:
     def bus_off(self, bus: str, *, off: bool) -> None:
         """Put the controller of the nodes on a bus into bus-off, or reconnect it.
 
-        The nodes exit if bus-off lasts longer than :data:`skinnode.node.runner.PATIENCE_S`.
+        The nodes exit if they are bus-off for longer than :data:`skinnode.node.runner.PATIENCE_S`.
         """
         self._ports[bus].off = off
 
@@ -198,7 +198,7 @@ class Passed:
 
 
 class FaultyPort(CanPort):
-    """A port whose controller may go bus-off; it then sends nothing and misses every frame."""
+    """A port whose controller may go bus-off; the port then sends nothing and misses every frame."""
 
     off = False
 

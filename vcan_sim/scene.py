@@ -26,10 +26,10 @@ LEAD_S: Final = 0.8
 """Duration of rest before the first press, s; leaves time to measure the baseline and to open a viewer."""
 
 PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
-"""Fractions of a cycle; the skin is at rest for the remainder. In a 4 s cycle a press takes 1.4 s."""
+"""Fractions of a cycle; the skin is at rest for the rest of the cycle. In a 4 s cycle a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
-"""Fraction of a slide in which the sphere accelerates; it decelerates in an equal fraction at the end."""
+"""Fraction of a slide during which the sphere accelerates; it decelerates for the same fraction at the end."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -72,10 +72,10 @@ class Scene:
 
     Args:
         layout: The patch at rest. Its electrodes lie on the surface of the rubber; a curved skin is treated
-            as its projection onto the plane of x and y.
+            as its projection onto the x-y plane.
         simulation: Seed, sphere, depth, friction, speed and timing.
         number: Number of the patch in the hand. Each patch has its own strokes and phase.
-        rubber: Material of the skin. Displacement does not depend on its Young's modulus, but force does.
+        rubber: Material of the skin. The force depends on its Young's modulus, the displacement does not.
     """
 
     layout: PatchLayout
@@ -123,7 +123,7 @@ class Scene:
         return () if contact is None else (contact,)
 
     def upper_m(self, t_s: float) -> Float:
-        """Return the electrodes (U, N, 3) at scene time ``t_s``, metres; ``layout.upper_m`` if at rest."""
+        """Return the electrodes (U, N, 3) at scene time ``t_s``, metres; ``layout.upper_m`` while at rest."""
         contacts = self.contacts(t_s)
         if not contacts:
             return self.layout.upper_m

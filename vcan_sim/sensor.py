@@ -17,7 +17,7 @@ from vcan_sim.injector import Injector
 from vcan_sim.scene import Scene
 
 REMEMBERED_READINGS: Final = 4096
-"""Number of readings whose time is kept: more than five minutes of scans at 12.5 per second."""
+"""Number of readings whose times are kept: more than five minutes of scans at 12.5 per second."""
 
 WIRE_NOISE: Final = 3e-3
 """Relative standard deviation of a resistance measured through a bad contact."""
@@ -28,7 +28,7 @@ converter sees instead; inf means an open pair of wires, 0 a shorted pair."""
 
 
 class SimulatedPatch:
-    """Resistances of a patch in a scene, as read by a converter with noise.
+    """Resistances of a patch in a scene, as read by a noisy converter.
 
     Implements :class:`skinnode.node.ResistanceSource`. The skin stays at rest until :meth:`start` sets the
     scene's time origin, so that readings at power-on (a tare) see an untouched patch. The truth is a pure
@@ -166,8 +166,8 @@ def simulated(layout: PatchLayout) -> SimulatedPatch:
 class _Forward:
     """Computes the resistances of a patch by direct summation.
 
-    It shares no code with the solver's kernels, so that truth and solver cannot share a bug. It is six times
-    as fast as the reference model because it allocates no (…, 3) temporaries.
+    It shares no code with the solver's kernels, so truth and solver cannot have a bug in common. It is six
+    times as fast as the reference model because it allocates no (…, 3) temporaries.
     """
 
     def __init__(self, layout: PatchLayout) -> None:

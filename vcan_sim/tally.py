@@ -1,4 +1,4 @@
-"""Counts of frames by kind, for comparing the frames that simulated nodes sent with those a host received."""
+"""Counts of frames by kind, to compare what simulated nodes sent with what a host received."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Tally:
         self.refused: Counter[Kind] = Counter()
         """Frames that the bus refused."""
         self.waiting: Counter[Kind] = Counter()
-        """Frames held back to be sent later: late chunks and chunks that swap places."""
+        """Frames held back to be sent later: late chunks, and chunks that swap places with a frame."""
         self.heard: Counter[Kind] = Counter()
         """Frames that reached the node's controller."""
         self.taken: Counter[Kind] = Counter()
@@ -94,7 +94,7 @@ class Tally:
         """Frames missed while the node was deaf or unplugged."""
 
     def discrepancies(self) -> list[str]:
-        """Return one line for each kind of frame whose counts do not add up. Call when the node is idle."""
+        """Return one line for each kind of frame with inconsistent counts. Call when the node is idle."""
         out = self.emitted + self.lost + self.silenced + self.refused + self.waiting
         into = self.taken + self.lost_in + self.unheard
         found = [

@@ -28,8 +28,7 @@ from skinnode.monitor.widgets import Canvas, Dialog
 PERIOD_S: Final = 0.1
 """Minimum interval between pictures."""
 SHARE: Final = 0.2
-"""Maximum fraction of one processor's time spent on drawing; pictures that take longer are drawn less
-often."""
+"""Maximum fraction of one processor's time spent on drawing; slow pictures are drawn less often."""
 SLOWEST_S: Final = 0.5
 
 _LOG_LINES: Final = 500
@@ -107,7 +106,7 @@ class MonitorApp(App[None]):
         self._scale = Scale()
         self._view: View | None = None
         self._tares: queue.SimpleQueue[tuple[str, Level]] = queue.SimpleQueue()
-        """Result of each tare, with a severity."""
+        """Result of each tare, with its severity."""
         self._begun_s = time.monotonic()
         self._cpu_s = 0.0
         self._wall_minus_mono_ns = time.time_ns() - time.monotonic_ns()
@@ -165,7 +164,7 @@ class MonitorApp(App[None]):
         self.faults.update(view, time.monotonic_ns())
         for event in self._source.events():
             begins = event.what == "operational" and time.monotonic() - self._begun_s < _BEGIN_S
-            if not begins:  # at start-up, all patches become operational
+            if not begins:  # omitted at start-up, when all patches become operational
                 self._lines.append(log_line(event, self._wall_minus_mono_ns))
         self._settle_tares()
         if not self._paused:

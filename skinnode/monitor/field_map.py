@@ -2,7 +2,7 @@
 
 The x axis, along the upper wires, points right; the y axis, across them, points up. Each character shows two
 pixels, one above the other, so a pixel is roughly square. Without colours, each character represents the mean
-of its two pixels; denser characters mean deeper skin.
+of its two pixels; denser characters mean a deeper press.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ _STEPS_M: Final = tuple(
 _LEAST_M: Final = 5e-5
 """Minimum full scale, m, so that noise does not look like a touch."""
 _MEMORY_NS: Final = 6_000_000_000
-"""Duration for which a deep press continues to determine the scale, ns."""
+"""Time for which a deep press determines the scale, ns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Part of a displacement field that a map shows. Arrays are (U, N), upper wire 0 first, in metres."""
+    """Quantities of a field that a map shows. Arrays are (U, N), upper wire 0 first, in metres."""
 
     depth_m: Float
     """Positive where the skin is pressed inwards."""
@@ -67,7 +67,7 @@ class Surface:
     unknown: NDArray[np.bool_]
     """Electrodes without a measurement."""
     aspect: float
-    """Width of the patch divided by its height."""
+    """Ratio of the patch's width to its height."""
 
     @property
     def deepest_m(self) -> float:
@@ -76,7 +76,7 @@ class Surface:
 
 
 def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
-    """Return the part of a field that a map shows.
+    """Return the quantities of a field that a map shows.
 
     Args:
         field: Newest field of the patch.
@@ -94,7 +94,7 @@ def surface_of(field: FieldFrame, upper_m: Float) -> Surface:
 
 
 def aspect_of(upper_m: Float) -> float:
-    """Return the width of a patch divided by its height; each electrode represents one cell."""
+    """Return the ratio of a patch's width to its height; each electrode represents one cell."""
     wires, electrodes = upper_m.shape[:2]
     width, height = np.ptp(upper_m[..., :2].reshape(-1, 2), axis=0)
     width, height = width / max(electrodes - 1, 1) * electrodes, height / max(wires - 1, 1) * wires
@@ -102,7 +102,7 @@ def aspect_of(upper_m: Float) -> float:
 
 
 def fit(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """Return width and height of the largest map that fits a box; characters are twice as high as wide."""
+    """Return the size of the largest map that fits a box; characters are twice as high as wide."""
     across = min(width, round(2 * height * aspect))
     return max(2, across), max(1, min(height, round(across / (2 * aspect))))
 
@@ -140,7 +140,7 @@ def mean_shear_m(surface: Surface) -> tuple[float, float]:
 
 
 class Scale:
-    """Depth drawn at full brightness: the smallest round number above the deepest recent press.
+    """Depth drawn at full brightness: the smallest round number above the depth of the deepest recent press.
 
     All patches share this scale, so that their maps are comparable.
     """
@@ -170,7 +170,7 @@ class MapStyle:
 
     @property
     def full_shear_m(self) -> float:
-        """Shear drawn at full brightness, m; rubber moves less along the surface than into it."""
+        """Shear drawn at full brightness, m; rubber moves less along its surface than perpendicular to it."""
         return 0.25 * self.full_m
 
 
@@ -212,9 +212,10 @@ def _arrows_on(surface: Surface, style: MapStyle, width: int, height: int) -> di
 
 
 def paint_shear(surface: Surface, style: MapStyle, width: int, height: int) -> list[Line]:
-    """Draw shear as arrows; larger shear is brighter.
+    """Draw shear as arrows; the stronger the shear, the brighter the arrow.
 
-    If there is room, each electrode has an arrow; with more room there are also arrows between electrodes.
+    Each electrode has an arrow if there is room; if there is more room, arrows are also drawn between
+    electrodes.
     """
     colours = style.colours
     wires, electrodes = surface.depth_m.shape

@@ -19,9 +19,9 @@ from skinnode.monitor.view_model import PatchView
 GONE: Final = ("lost", "never seen", "stale", "refused", "restarting", "booting", "starting")
 """Conditions of a patch whose newest field is out of date."""
 _AROUND: Final = 3
-"""Lines of a tile besides its map."""
+"""Number of lines of a tile excluding its map."""
 _LEAST_OUTLINED: Final = (8, 5)
-"""Minimum size of a box for a map with an outline, in characters and lines."""
+"""Minimum size of a box whose map has an outline, in characters and lines."""
 _LABEL: Final = 10
 """Width of the column of figure names, characters."""
 
@@ -65,7 +65,7 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
     """Draw the height map centred in its box.
 
     The map has an outline because untouched skin is as dark as the screen. If a patch stops sending data, its
-    last map loses its colours and has the condition written across it, so that it cannot be mistaken for live
+    last map is drawn without colours and with the condition across it, so that it cannot be mistaken for live
     data.
     """
     theme = paint.theme
@@ -96,7 +96,7 @@ def _map(patch: PatchView, paint: Paint, width: int, height: int, *, arrows: boo
 
 
 def _fit(width: int, height: int, aspect: float) -> tuple[int, int, int]:
-    """Return width and height of the largest map in a box, and the number of characters its outline takes.
+    """Return the width and height of the largest map in a box, and the number of characters for its outline.
 
     A small box has no outline.
     """
@@ -127,7 +127,7 @@ def _figures(patch: PatchView, theme: Theme, width: int) -> Line:
 
 
 def _health(patch: PatchView, theme: Theme, width: int) -> Line:
-    """Draw the condition with the first fault or, if there is no fault, with the rate."""
+    """Draw the condition, followed by the first fault or, if there is none, by the rate."""
     style = theme.of(patch.level)
     if patch.words:
         return pad([Segment(f" {patch.condition}: {patch.words[0]}", style)], width, theme)

@@ -1,4 +1,4 @@
-"""Reports the faults of a session when it ends, and the view as JSON for programs."""
+"""Reports the faults of a session at its end, and the view as JSON for programs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FaultBook:
 
         Args:
             view: Current view of the hand.
-            real_ns: Monotonic time of the monitor, ns, rather than that of a recording.
+            real_ns: Monotonic time of the monitor, ns, also when it replays a recording.
             ending: Whether the session is ending, so that patches not yet operational count as faults.
         """
         if self._begun_ns is None:
@@ -66,7 +66,7 @@ class FaultBook:
 
 
 def _lasting(health: PatchHealth) -> list[tuple[str, str]]:
-    """Return the faults other than the condition, each as an identifying key and its text."""
+    """Return the faults other than the condition, each with a key that identifies it and its text."""
     wires = [f"{fault.side} wire {fault.number} {fault.state}" for fault in health.wires]
     found = [(text, text) for text in wires]
     if health.duplicate_id:

@@ -73,7 +73,7 @@ class Source(Protocol):
 
     @property
     def flaws(self) -> list[str]:
-        """Missing or unreadable parts of a recording, in the part replayed so far."""
+        """Descriptions of missing or unreadable data in a recording, as far as it has been replayed."""
 
     def tare(self, patch: str) -> None:
         """Tare a patch, as :meth:`Host.tare` does."""

@@ -1,4 +1,4 @@
-"""Terminal output that never blocks, even if the terminal disappears, or stalls as on a slow line."""
+"""Terminal output that never blocks, even if the terminal disappears or stalls."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _MAX_QUEUED: Final = 30
 """Maximum number of writes queued for the terminal: a few pictures."""
 
 _END_S: Final = 1.0
-"""Maximum wait at the end for the terminal to accept queued output, s."""
+"""Maximum time to wait at the end for the terminal to accept queued output, s."""
 
 
 class _Writer(threading.Thread):
     """Writes text to a file descriptor on a daemon thread.
 
-    This thread does not use Python's own standard output, which would hold a lock while the terminal stalls;
-    the interpreter would wait for that lock at exit.
+    The thread does not use Python's own standard output, which holds a lock while the terminal stalls: the
+    interpreter would wait for that lock at exit.
     """
 
     def __init__(self, descriptor: int, gone: threading.Event) -> None:
@@ -77,7 +77,7 @@ class PatientDriver(LinuxDriver):
 
     @property
     def busy(self) -> bool:
-        """Whether output is still queued; a new picture would only wait behind it."""
+        """Whether output is still queued, so that a new picture would only be queued behind it."""
         return self._writer is not None and self._writer.queue.qsize() > 0
 
     @property

@@ -81,7 +81,7 @@ def theme_for(colours: Colours) -> Theme:
 
 @dataclass(frozen=True, slots=True)
 class UiState:
-    """User's selections, and the message in the key bar."""
+    """The user's selections, and the message in the key bar."""
 
     title: str
     selected: str
@@ -134,7 +134,7 @@ def width_of(line: Line) -> int:
 
 
 def spread(left: Line, right: Line, width: int, theme: Theme, style: Style | None = None) -> Line:
-    """Align ``right`` with the right end of a line; cut ``left`` if there is no room for both."""
+    """Align ``right`` with the end of a line that starts with ``left``; cut ``left`` if both do not fit."""
     room = max(0, width - width_of(right))
     return pad([*pad(left, room, theme, style), *right], width, theme, style)
 

@@ -11,11 +11,11 @@ from skinnode.model.frames import FieldFrame
 from skinnode.model.layout import Float
 
 TOUCH: Final = 0.35
-"""Minimum depth at which skin counts as touched, as a fraction of the maximum depth, if contacts are found by
-depth alone. Under Hertzian pressure the rim of a contact is half as deep as its centre."""
+"""Minimum depth of skin that counts as touched, relative to the maximum, when contacts are found by depth.
+Under Hertzian pressure the rim of a contact is half as deep as its centre."""
 SURE: Final = 6.0
-"""Minimum depth of a touch, in standard deviations: noise on 100 electrodes exceeds this depth once in 10
-million fields."""
+"""Minimum depth of a touch, in standard deviations, which noise on 100 electrodes exceeds once in 10 million
+fields."""
 LEAST_TOUCH_M: Final = 1e-5
 
 

@@ -45,7 +45,7 @@ class PatchView:
     rate_hz: float
     """Fields per second."""
     latency_s: float | None
-    """Median time from a scan's last frame to its field, over recently shown fields, s."""
+    """Median time from a scan's last frame to its field, over the fields shown recently, s."""
     latency_max_s: float | None
     scan: int | None
     trusted: bool
@@ -69,7 +69,7 @@ class BusView:
     level: Level
     words: tuple[str, ...]
     load: float
-    """Fraction of the last second occupied by frames."""
+    """Fraction of the last second during which frames occupied the bus."""
     frames_hz: float
     lost: int
     """Number of frames dropped by the kernel or the host."""
@@ -83,7 +83,7 @@ class View:
     patches: tuple[PatchView, ...]
     buses: tuple[BusView, ...]
     scans_hz: float
-    """Fields per second of the fastest patch; equals the SYNC rate if all is well."""
+    """Fields per second of the fastest patch; equals the SYNC rate when no scan is lost."""
     fields_hz: float
     """Fields per second, summed over all patches."""
     latency_s: float | None
@@ -223,7 +223,7 @@ def judge_patch(
     missed = stream.assembler.scans_missed - before.assembler.scans_missed
     lossy = [f"{count} {what} lost" for count, what in ((losses, "chunks"), (missed, "scans")) if count > 0]
     if condition is not Condition.OPERATIONAL:
-        lossy = []  # a missing patch loses every frame
+        lossy = []  # every frame of a missing patch is lost
     level: Level = "good"
     if lossy or words:
         level = "note"
@@ -293,7 +293,7 @@ def _bus_view(
 
 
 def log_line(event: HealthEvent, wall_minus_mono_ns: int) -> LogLine:
-    """Return an event as a line of the log."""
+    """Return an event as a line of the event log."""
     level: Level = "bad"
     if event.what in ("operational", "well", "back", "rejoins", "baselines"):
         level = "good"

@@ -21,7 +21,7 @@ Painter = Callable[[int, int], list[Line]]
 
 
 class Canvas(Widget):
-    """Shows the lines of a painter; only lines that changed go to the terminal.
+    """Shows the lines of a painter; only changed lines are sent to the terminal.
 
     Textual's own widgets do not compare lines, and would redraw the whole picture each time.
     """

@@ -1,12 +1,13 @@
 """Compare the results of two commits bit by bit: ``python -m tools.compare OLD [NEW]``.
 
-NEW is the working tree by default. The old commit makes the inputs: streams of resistances on five layouts,
-with two noise levels, with and without faults, and recordings of simulated hands. Both commits then process
-them: forward model, every method of the tracker, path following with every operator, systems of equations,
-replay of the recordings, generated files. The report gives, for each part, a hash of all its arrays in each
-commit and, for each array that differs, the largest relative difference.
+NEW is the working tree by default. The old commit generates the inputs: streams of resistances on five
+layouts, with two noise levels, with and without faults, and recordings of simulated hands. Both commits then
+process the inputs: forward model, every method of the tracker, path following with every operator, systems of
+equations, replay of the recordings, generated files. The report gives, for each part, a hash of all its
+arrays in each commit and, for each array that differs, the largest relative difference.
 
-Exit status 0 if all arrays are equal, or are float arrays that differ by at most ``--rtol``; otherwise 1.
+Exit status 0 if every array is equal in both commits or, for a float array, differs by at most ``--rtol``;
+otherwise 1.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def tree_of(commit: str | None, folder: Path) -> Path:
 
 
 def run_in(tree: Path, script: str, *arguments: str) -> None:
-    """Run a script of this folder with the packages in ``tree``."""
+    """Run a script in this folder with the packages in ``tree``."""
     code = (
         f"import runpy, sys, skinnode; assert skinnode.__file__.startswith({str(tree)!r}), 'another tree'; "
         f"sys.argv = {[script, *arguments]!r}; runpy.run_path({str(HERE / script)!r}, run_name='__main__')"
@@ -50,8 +51,8 @@ def run_in(tree: Path, script: str, *arguments: str) -> None:
 def relative_difference(old: Any, new: Any) -> float:
     """Return the largest difference between arrays, relative to the largest finite value of the old array.
 
-    Returns inf if shape, type or the positions of NaN and infinity differ, and for arrays of types other than
-    float.
+    Returns inf if shape, type or the positions of NaN and infinity differ, or if the arrays are not float
+    arrays.
     """
     if old.shape != new.shape or old.dtype != new.dtype or old.dtype.kind != "f":
         return np.inf
@@ -64,7 +65,7 @@ def relative_difference(old: Any, new: Any) -> float:
 
 
 def report(old: Any, new: Any, rtol: float) -> Iterable[tuple[str, bool]]:
-    """Yield the lines of the report, each with True if the result that it reports is allowed."""
+    """Yield the lines of the report, each with whether the difference that it reports is allowed."""
     names = dict.fromkeys([*old.files, *new.files])
     for part in dict.fromkeys(name.partition(":")[0] for name in names):
         mine = [name for name in names if name.startswith(f"{part}:")]

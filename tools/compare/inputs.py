@@ -98,7 +98,7 @@ def displacements(layout: sk.PatchLayout) -> Float:
 
 
 def streams() -> dict[str, Float]:
-    """Return ``LAYOUT/NOISE/ohm`` (T, U, K) and ``…/faulty``, the same with invalid and false resistances."""
+    """Return ``LAYOUT/NOISE/ohm`` (T, U, K), and ``…/faulty`` with invalid and false resistances."""
     made: dict[str, Float] = {}
     for number, (name, layout) in enumerate(layouts().items()):
         exact = np.array([sk.resistance_ohm(layout, layout.upper_m + d) for d in displacements(layout)])

@@ -1,8 +1,8 @@
-"""Time a benchmark of two commits in turn on one machine: ``python -m tools.compare.speed OLD [NEW]``.
+"""Time a benchmark in two commits by turns on one machine: ``python -m tools.compare.speed OLD [NEW]``.
 
 NEW is the working tree by default. Each round runs the benchmark once in each tree; the order alternates, so
-that a change in the speed of the machine affects both trees. The report gives the shortest time of each row
-in each commit, and their ratio. Rows of NumPy and LAPACK show the timing noise of the machine.
+that a change in the machine's speed affects both trees equally. The report gives the shortest time of each
+row in each commit, and their ratio. The rows for NumPy and LAPACK show the timing noise of the machine.
 
 Exit status 0 if no row takes more than ``--limit`` times its old time, otherwise 1.
 """
@@ -22,7 +22,7 @@ from tools.compare.__main__ import tree_of
 
 
 def rows_of(report: Any) -> dict[str, float]:
-    """Return every time in the JSON report of a benchmark, by the name of its row and key."""
+    """Return every time in the JSON report of a benchmark, by the names of its row and key."""
     found: dict[str, float] = {}
     for index, row in enumerate(report["rows"]):
         label = " ".join(str(value) for value in row.values() if isinstance(value, str)) or f"row {index}"

@@ -1,5 +1,5 @@
-"""Documentation hooks, which replace a line `<!-- generated: NAME -->` with the table NAME, made from the
-code when the site is built. A name without a table, or a table that no page uses, aborts the build."""
+"""Documentation hooks, which replace a line `<!-- generated: NAME -->` with the table NAME, generated from
+the code when the site is built. A name without a table, or a table that no page uses, aborts the build."""
 
 from __future__ import annotations
 

@@ -28,7 +28,8 @@ PROFILE: Final = REFERENCE_PROFILES[0]
 NODE_ID: Final = 4
 _BITRATE_BPS, _DATA_BITRATE_BPS = 1_000_000, 5_000_000
 _HIGHEST: Final = highest(0, 0).name
-"""Name of sub-index 0 of nearly every object; left out, because the rows below it give the same number."""
+"""Name of sub-index 0 of nearly every object, which is left out because the rows below give the same
+number."""
 _PLUS_NODE_ID: Final = " + node\u2011ID"
 _FEW: Final = 3
 """Maximum number of equal entries that are listed individually."""
@@ -99,7 +100,7 @@ def formats() -> str:
 
 
 def example_scan() -> str:
-    """Show the frames of one press as bytes, encoded by the codec."""
+    """Show the frames of one press as the bytes that the codec produces."""
     scale, scan = CodeScale(16), 7
     resistance = np.full((PROFILE.rows, PROFILE.columns), 1500.0)
     baseline = resistance.copy()
@@ -181,7 +182,7 @@ def emergencies() -> str:
         for code in EmcyCode
         if code
     )
-    return md.table(("code", "meaning", "bit of 0x1001, besides bit 0"), rows)
+    return md.table(("code", "meaning", "bit of 0x1001, in addition to bit 0"), rows)
 
 
 def aborts() -> str:

@@ -24,7 +24,7 @@ _NOT_TUNED: Final = {
 
 
 def constants() -> str:
-    """Return one row per numeric constant, or accuracy, that has a docstring."""
+    """Return the table of all documented constants that are numbers or accuracies."""
     rows = [
         (md.code(f"{module.__name__.removeprefix('skinnode.solve.')}.{name}"), value, text)
         for module in _modules()

@@ -59,7 +59,7 @@ class Mutant:
     after: str
     """Lines that the change adds."""
     nth: int
-    """Number of earlier mutants in this file with the same fields."""
+    """Number of earlier mutants in this file whose other fields are the same."""
 
     @property
     def name(self) -> str:
@@ -144,7 +144,7 @@ def _behaviour(source: str) -> str | None:
 
 
 def _functions(source: str) -> dict[int, str]:
-    """Return the qualified name of the innermost function or class for each line inside one."""
+    """Return, for each line in a function or class, the qualified name of the innermost function or class."""
     names: dict[int, str] = {}
 
     def walk(node: ast.AST, prefix: str) -> None:
@@ -193,7 +193,7 @@ def _changed_lines(source: str, other: str) -> tuple[str, str]:
 
 
 def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
-    """Return a mutation as an identified mutant, with the number of equal mutations before it."""
+    """Return a mutation as an identified mutant, with the number of equal mutations that precede it."""
     functions = _functions(source)
     function = functions.get(wanted.line, "<module>")
     before, after = _changed_lines(source, mutated(source, wanted.operator, wanted.occurrence))
@@ -209,7 +209,7 @@ def _name(file: str, source: str, wanted: _Candidate) -> Mutant:
 
 
 def find(mutant: Mutant, source: str) -> str:
-    """Return ``source`` with ``mutant`` applied. Raises LookupError if the code to change has gone."""
+    """Return ``source`` with ``mutant`` applied. Raises LookupError if the code to change is missing."""
     functions = _functions(source)
     nth = 0
     for each in _candidates(source, {mutant.operator: _operators()[mutant.operator]}):

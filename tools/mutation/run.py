@@ -5,7 +5,7 @@ until its first failure. A failure of a real-time test counts only if the test a
 stage that exceeds its time limit also kills the mutant. Verdicts are written to ``results.json`` immediately;
 the next run skips the mutants listed there, except survivors with ``--again``.
 
-One process imports the libraries and forks for every pytest run, because importing takes longer than most
+One process imports the libraries and forks for every pytest run, because the imports take longer than most
 tests.
 """
 
@@ -61,7 +61,7 @@ class Outcome:
     status: int | None
     """Exit status, or None if the run was stopped at its time limit."""
     failed: tuple[str, ...]
-    """Names of the tests that failed."""
+    """Names of the failed tests."""
     took_s: float
 
 
@@ -360,7 +360,7 @@ def _equivalent() -> dict[str, str]:
 
 
 def show(mutant: Mutant) -> str:
-    """Return a description of a mutant in a few lines."""
+    """Describe a mutant in a few lines."""
     before, after = mutant.before.replace("\n", "\n  - "), mutant.after.replace("\n", "\n  + ")
     return f"{mutant.name} {mutant.file}, {mutant.function}\n  - {before}\n  + {after}"
 

@@ -29,7 +29,7 @@ PRESS, SLIDE, LIFT = 0.36, 0.40, 0.14
 """Fractions of a cycle; the skin is at rest for the rest of the cycle. In a 4 s cycle a press takes 1.4 s."""
 
 _RAMP: Final = 0.2
-"""Fraction of a slide during which the sphere accelerates; it decelerates for the same fraction at the end."""
+"""Fraction of a slide in which the sphere accelerates, equal to the fraction in which it decelerates."""
 
 _GOLDEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 

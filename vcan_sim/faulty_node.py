@@ -227,7 +227,7 @@ class FaultyNode(PatchNode):
         self._on_sent(can_id)
 
     def _put_or_lose(self, can_id: int, data: bytes) -> bool:
-        """Send or drop a frame other than a PDO. Returns whether it was sent."""
+        """Send or drop a frame other than a PDO. Returns whether the frame was sent."""
         kind = kind_of(can_id, data)
         self.tally.handed[kind] += 1
         if not self._is_cut_off and self._injector.loses(LOST_OUT.get(kind)):

@@ -35,7 +35,7 @@ class FaultyScans:
         node_id: Node-ID.
         profile: Protocol of the node.
         put: Puts a frame on the bus.
-        counter_overflow: Returns the SYNC counter overflow value (0x1019) of the node.
+        counter_overflow: Function that returns the node's SYNC counter overflow value (0x1019).
     """
 
     def __init__(

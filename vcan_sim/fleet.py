@@ -54,7 +54,8 @@ class Fleet:
         interface: python-can interface that overrides the hand file's.
         channel: Channel that overrides the hand file's.
         faults: Initial faults of every node; see also :meth:`inject`.
-        wire_up: Returns the source that a patch's converter reads; default: the simulated patch itself.
+        wire_up: Function that returns the source that a patch's converter reads; default: the simulated patch
+            itself.
         unchecked: Names of patches with protocol revision 1.0, whose summaries carry no check.
 
     Raises:
@@ -154,7 +155,7 @@ class Fleet:
         return self._ports[bus].passed
 
     def bus_off(self, bus: str, *, off: bool) -> None:
-        """Put the controller of the nodes on a bus into bus-off, or reconnect it.
+        """Put the controller of the nodes on a bus into bus-off, or reconnect the controller.
 
         The nodes exit if they are bus-off for longer than :data:`skinnode.node.runner.PATIENCE_S`.
         """

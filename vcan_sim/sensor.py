@@ -117,7 +117,7 @@ class FaultyConverter:
     Args:
         source: Resistances that an intact converter would measure.
         injector: The node's faults, random generator and counts.
-        booting: Returns whether the node is booting.
+        booting: Function that returns whether the node is booting.
     """
 
     def __init__(self, source: ResistanceSource, injector: Injector, *, booting: Callable[[], bool]) -> None:

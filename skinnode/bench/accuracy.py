@@ -1,4 +1,4 @@
-"""Accuracy, speed and calibration of the reported uncertainty: every figure next to its requirement."""
+"""Accuracy, speed and calibration of the reported uncertainty, each figure next to its requirement."""
 
 from __future__ import annotations
 

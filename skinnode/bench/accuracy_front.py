@@ -1,10 +1,10 @@
 """Error against time for a few wires: our solvers next to their peers on the same compiled F and J.
 
-The most deeply pressed wires of the patch are used; the samples of the press contain no noise. Every solver
-starts from rest. It solves either the last sample alone or, as in the paper, all samples in turn, each from
-the solution of the previous sample. Each solver runs at several tolerances and gives one point per tolerance.
-The time of ``solve_path`` includes work that the bare operators omit: setting up the patch, following the
-branch, estimating the error.
+Only the most deeply pressed wires of the patch are solved; the samples of the press contain no noise. Every
+solver starts from rest. It solves either the last sample alone or, as in the paper, all samples in turn, each
+from the solution of the previous sample. Each solver runs at several tolerances and gives one point per
+tolerance. The time of ``solve_path`` includes work that the bare operators omit: setting up the patch,
+following the branch, estimating the error.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LONG_S: Final = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A few upper wires and the samples of a press on them."""
+    """A few upper wires, and the samples of a press on these wires."""
 
     name: str
     layout: PatchLayout

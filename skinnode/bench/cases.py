@@ -311,7 +311,7 @@ def _wrong_roots() -> Iterator[Case]:
 
 
 def _swap(rng: np.random.Generator, layout: PatchLayout, share: float) -> Float:
-    """Rotate two neighbours on a wire by 180° about their midpoint, which restores the initial F."""
+    """Rotate two adjacent electrodes of a wire by 180° about their midpoint, which restores the initial F."""
     wire, first = rng.integers(layout.shape[0]), rng.integers(layout.upper_m.shape[1] - 1)
     middle = 0.5 * (layout.upper_m[wire, first] + layout.upper_m[wire, first + 1])
     angle = np.pi * share

@@ -2,7 +2,7 @@
 
 A frame's time is the time at which the node passes it to its interface, on the monotonic clock that also
 stamps SYNC. SYNC and load come from another endpoint in another thread of the same process, so the
-interpreter lock affects the result. Other work on the machine affects the result even more; ``chrt -f 20
+interpreter lock affects the result. Other processes on the machine affect the result even more; ``chrt -f 20
 skinnode bench node`` gives the figures of an idle machine.
 """
 

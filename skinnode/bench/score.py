@@ -121,7 +121,7 @@ class Scorer:
         return rms
 
     def score(self) -> Score:
-        """Return the figures so far."""
+        """Return the figures for the scans added so far."""
         count = self._scans or float("nan")
         at_rest = potential_per_m(self.layout, self.layout.upper_m)
         bounds = [

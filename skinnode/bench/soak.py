@@ -2,7 +2,7 @@
 
 Simulated nodes, with faults, and the host share this process and two virtual buses. A round injects one to
 three faults, such as dropped frames of any kind, into one patch or into all patches. It then clears the
-faults and waits until every patch is operational and streaming again; meanwhile, subscribers come and go. In
+faults and waits until every patch is operational and streaming again, while subscribers come and go. In
 some rounds other processes occupy the processors. Memory use is compared at two idle instants, one after a
 warm-up and one at the end: blocks allocated by Python (:func:`sys.getallocatedblocks`, which would reveal a
 leak of one object per scan) and resident memory. This file may import the simulator, as the demo may, because

@@ -51,7 +51,8 @@ def run(
         seeds: Number of streams per case.
         cases: Cases to solve; default: all.
         only: Methods to use; default: all methods of each case.
-        jobs: Number of processes that solve cases in parallel; it does not affect the streams or the rows.
+        jobs: Number of processes that solve cases in parallel; the number does not affect the streams or the
+            rows.
         report: Called with each row when it is ready.
 
     Returns:

@@ -71,7 +71,7 @@ class Skin:
         height: True height of the upper layer, as a fraction of the layout's.
         electrode: Radius of every electrode, pitches; 0 for point electrodes, as the solver assumes.
         strain: β in ρ d (1 + β (d/d₀ − 1)), where d₀ is the distance at rest.
-        series: Contact resistance in series with each pair of wires, as a fraction of its R₀.
+        series: Contact resistance in series with each pair of wires, as a fraction of the pair's R₀.
         points_m: Positions (U, N, 2) of the electrodes along the surface, if it is not flat.
         axes: Axes (U, N, 3, 3) along, across and out of the surface (rows) at each electrode.
     """

@@ -372,6 +372,6 @@ def print_report(console: Console, report: Report) -> None:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the report as plain data, with None for missing figures."""
+    """Return the report as plain data, with None for missing values."""
     result: dict[str, Any] = plain(dataclasses.asdict(report))
     return result

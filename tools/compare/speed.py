@@ -1,4 +1,4 @@
-"""Time a benchmark in two commits by turns on one machine: ``python -m tools.compare.speed OLD [NEW]``.
+"""Time a benchmark of two commits alternately on one machine: ``python -m tools.compare.speed OLD [NEW]``.
 
 NEW is the working tree by default. Each round runs the benchmark once in each tree; the order alternates, so
 that a change in the machine's speed affects both trees equally. The report gives the shortest time of each

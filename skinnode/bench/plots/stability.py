@@ -81,7 +81,7 @@ def _verdicts(axes: Any, rows: list[dict[str, Any]], names: list[str]) -> None:
 
 
 def _scatter(axes: Any, rows: list[dict[str, Any]]) -> None:
-    """Draw each row's median error against its median standard deviation, relative to the displacement."""
+    """Draw each row's median error and median standard deviation, both relative to the displacement."""
     for kind, colour in COLOURS.items():
         points = [
             (max(row["reported"], LEAST), max(row["median_error"], LEAST), row["wrong"] > 0)
